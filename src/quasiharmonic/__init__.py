@@ -1,0 +1,1 @@
+"""Maps of triangle meshes into the plane with no inverted triangle, certified exactly."""

@@ -1,0 +1,197 @@
+"""Functionals of the tensor field that vanish exactly at injective maps (§7.3).
+
+========  ==============================================================  =====================
+name      value, summed over u and v                                      solves beyond (u, v)
+========  ==============================================================  =====================
+neumann   V₁ = ½ ‖L w − g‖²                                               1
+sobolev   V₂ = ½ ‖L w − g‖² in the norm of L†                             1, with another factor
+dirichlet V₃ = ½ wᴴ L w − area                                            0
+poisson   V₄ = ½ gᴴ L† g − area                                           1, with another factor
+========  ==============================================================  =====================
+
+Here ``L = Gᵀ A G``, ``w = u + i v`` is the quasi-harmonic map, and ``g = g_u + i g_v = −i D w`` the
+Neumann data that an injective map onto the target must have (eq. 17). ``V₂ = V₃ + V₄``.
+
+Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh, and is handed
+on as the gradient in the Beltrami coefficient μ.
+
+V₄ sees the target through ``C b`` only: it is blind to interior pins, and to a boundary loop's position
+relative to the others. Alone it serves one loop, or loops kept concentric, and no pins. Nor is it bounded
+below by zero, as its continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual,
+so at a rough tensor field V₄ may be negative. The others are sums of squares.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .laplacian import Laplacian
+from .mesh.reference import Derivatives, ReferenceMesh
+from .problem import Problem
+from .tensor import TensorField
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+class Functional(ABC):
+    """A functional V of the tensor field, for one problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    mesh : ReferenceMesh
+    laplacian : Laplacian
+        Of the problem's free vertices, factored for the field that `evaluate` is given.
+    """
+
+    name: str
+    #: Whether a value of zero implies the given positions of pins and of every loop.
+    sees_positions = True
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh, laplacian: Laplacian) -> None:
+        self.problem = problem
+        self.mesh = mesh
+        self.laplacian = laplacian
+
+    @abstractmethod
+    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
+        """Value and gradient.
+
+        Parameters
+        ----------
+        field : TensorField
+        w : (n,) complex128
+            The quasi-harmonic map of ``field``, in the problem's frame.
+        dw : Derivatives
+            Its derivatives.
+
+        Returns
+        -------
+        value : float
+        gradient : (f,) complex128
+            ``∂V/∂Re μ + i ∂V/∂Im μ``.
+        """
+
+
+class Dirichlet(Functional):
+    """V₃, the weighted Dirichlet energy (eq. 27): the default.
+
+    Written as the energy of the Beltrami residual it has no cancellation and is its own adjoint:
+
+        V₃ = Σ 2m |q − μp|² / (1 − |μ|²),     dV₃/dμ = −4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²
+    """
+
+    name = "dirichlet"
+
+    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
+        return beltrami_energy(self.mesh, field, dw), beltrami_gradient(self.mesh, field, dw)
+
+
+class Neumann(Functional):
+    """V₁, the plain norm of the Neumann residual (eq. 24, 25).
+
+    Its residual includes the pins, where an injective map's flux is zero.
+    """
+
+    name = "neumann"
+
+    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
+        residual = neumann_residual(self.problem, self.laplacian, w)
+        spread = self.mesh.derivatives(self.laplacian.extend(residual))
+        gradient = field.pull_twist(*twist(self.mesh, dw, spread))
+        return 0.5 * float(np.vdot(residual, residual).real), gradient
+
+
+class Poisson(Functional):
+    """V₄, the Poisson functional (eq. 29, 44), dual to V₃.
+
+    ``L†`` is applied by solving with one vertex held: L is singular only in the constants, and the
+    Neumann data sum to zero.
+    """
+
+    name = "poisson"
+    sees_positions = False
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh, laplacian: Laplacian) -> None:
+        super().__init__(problem, mesh, laplacian)
+        self._held = Laplacian(problem.F, problem.n, problem.fixed[:1], laplacian.solver.name)
+
+    def response(self, field: TensorField, w: ComplexArray) -> ComplexArray:
+        """``L† g`` up to a constant: the map that the target's Neumann data alone would bring about."""
+        self._held.factor(self.mesh.edge_stiffness(field.entries()))
+        return self._held.respond(neumann_target(self.problem, w))
+
+    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
+        response = self.response(field, w)
+        d = self.mesh.derivatives(response)
+        work = float(np.vdot(neumann_target(self.problem, w), response - w).real)
+        return 0.5 * work, -0.5 * field.pull_twist(*twist(self.mesh, d, d))
+
+
+class Sobolev(Poisson):
+    """V₂ = V₃ + V₄, the Neumann residual in the norm of L† (eq. 26): the energy of the difference of the maps
+    that the Dirichlet and the Neumann data bring about.
+    """
+
+    name = "sobolev"
+    sees_positions = True
+
+    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
+        response = self.response(field, w)
+        d = self.mesh.derivatives(response)
+        residual = neumann_residual(self.problem, self.laplacian, w)
+        value = 0.5 * float(np.vdot(residual, w - response).real)
+        gradient = beltrami_gradient(self.mesh, field, dw) - 0.5 * field.pull_twist(*twist(self.mesh, d, d))
+        return value, gradient
+
+
+FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson)}
+
+
+def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
+    """V₃ of any map, ``Σ 2m |q − μp|² / (1 − |μ|²)``: its A-Dirichlet energy less its signed area."""
+    residual = dw.q - field.mu * dw.p
+    return 2.0 * float(np.dot(mesh.m, (residual.real**2 + residual.imag**2) / field.defect))
+
+
+def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> ComplexArray:
+    """Gradient of `beltrami_energy` in μ with the map held; at the quasi-harmonic map also the whole one."""
+    residual = dw.q - field.mu * dw.p
+    return -4.0 * (mesh.m / field.defect**2) * residual * (dw.p.conj() - field.mu * dw.q.conj())
+
+
+def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatArray, ComplexArray]:
+    """Derivative of ``Re xᴴ L y`` by the tensor ``c·I − [[Re w, Im w], [Im w, −Re w]]`` of each triangle.
+
+    Equal to ``sp(Gx)ᵀ G y`` summed over both coordinates, in other entries.
+
+    Returns
+    -------
+    by_c : (f,) float64
+    by_w : (f,) complex128
+        ``∂/∂Re w + i ∂/∂Im w``.
+    """
+    by_c = 2.0 * mesh.m * (dx.p * dy.p.conj() + dx.q * dy.q.conj()).real
+    by_w = -2.0 * mesh.m * (dx.p.conj() * dy.q + dy.p.conj() * dx.q)
+    return by_c, by_w
+
+
+def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
+    """``R (g_u + i g_v)`` with ``g_u = C b_v`` and ``g_v = −C b_u`` (Theorem 6.4); (n,) complex128."""
+    g = np.zeros(problem.n, dtype=np.complex128)
+    for loop in problem.loops:
+        b = w[loop]
+        g[loop] = -0.5j * (np.roll(b, -1) - np.roll(b, 1))
+    return g
+
+
+def neumann_residual(problem: Problem, laplacian: Laplacian, w: ComplexArray) -> ComplexArray:
+    """``L w − R g`` at the fixed vertices, zero elsewhere; (n,) complex128."""
+    residual = np.zeros(problem.n, dtype=np.complex128)
+    fixed = problem.fixed
+    residual[fixed] = (laplacian.flux(w) - neumann_target(problem, w))[fixed]
+    return residual

@@ -1,0 +1,222 @@
+"""From a problem to a map without inverted triangles: the strategy (§9.2).
+
+``injective_map`` is the one-shot call and ``solve`` the same for a `Problem` at hand. The search stops at
+the first map whose every triangle is strictly positive, decided exactly on the coordinates that are
+handed back.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .certificate import certify, flipped_triangles
+from .linsolve import NotPositiveDefinite
+from .mesh.reference import Reference
+from .objective import Iterate, Objective
+from .optimize import Stop
+from .optimize.vector_adam import vector_adam
+from .problem import Problem
+from .result import MapResult, Stage, Status, Step
+from .strategy import Descent, default_strategy
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# A stage has settled when within this many iterations no triangle was righted and the energy did not fall
+# by this fraction.
+PATIENCE, PROGRESS = 300, 1e-3
+
+
+def injective_map(
+    V: ArrayLike,
+    F: ArrayLike,
+    fixed: ArrayLike,
+    target: ArrayLike,
+    *,
+    reference: Reference | None = None,
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> MapResult:
+    """Map a triangle mesh into the plane with no triangle inverted.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions of a planar or curved mesh, disk-like or with holes.
+    F : (f, 3) array of int
+        Triangles, consistently oriented.
+    fixed : (k,) array of int
+        Vertices with given positions: the whole boundary and any pinned interior vertices.
+    target : (k, 2) array
+        Where they go.
+    reference : {"equilateral", "rest", "corrected"}, optional
+        Shape of the triangles in which gradients are taken (§9.3). By default equilateral ones, which
+        are as fast as any and indifferent to slivers.
+    max_iterations : int
+        Linear solves to spend at most.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every iteration.
+
+    Returns
+    -------
+    MapResult
+        With the certified map, or with the best map found and a status that says why it is not
+        injective. Failure to find a map is not an exception. Ctrl-C ends the search and returns the best
+        map so far.
+
+    Raises
+    ------
+    ValueError
+        When the input is malformed; see `Problem`.
+
+    Examples
+    --------
+    A square annulus whose hole is turned by a quarter:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import injective_map
+    >>> from quasiharmonic.surfaces import annulus
+    >>> from quasiharmonic.mesh.topology import boundary_loops
+    >>> V, F = annulus()
+    >>> outer, inner = sorted(boundary_loops(F, len(V)), key=len, reverse=True)
+    >>> target = np.concatenate([V[outer], V[inner] @ [[0, 1], [-1, 0]]])
+    >>> result = injective_map(V, F, np.concatenate([outer, inner]), target)
+    >>> result.injective, bool(result.certificate.bijective)
+    (True, True)
+    """
+    began = time.perf_counter()
+    problem = Problem(V, F, fixed, target, reference=reference)
+    return solve(
+        problem, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback, _began=began
+    )
+
+
+def solve(
+    problem: Problem,
+    *,
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+    _began: float | None = None,
+) -> MapResult:
+    """Solve a problem at hand; parameters and result as `injective_map` has them."""
+    began = time.perf_counter() if _began is None else _began
+    search = _Search(problem, linear_solver, callback, max_iterations)
+    status = search.run(default_strategy(problem))
+    uv = search.positions(search.best_map)
+    certificate = certify(problem.F, uv)
+    return MapResult(
+        uv=uv,
+        status=Status.INJECTIVE if certificate.injective else status,
+        certificate=certificate,
+        stages=search.stages,
+        history=search.history,
+        linear_solver=search.linear_solver,
+        seconds=time.perf_counter() - began,
+        xi=search.best_xi,
+    )
+
+
+class _Search:
+    """Runs stages one after another, keeps the best map and writes down what happened."""
+
+    def __init__(
+        self, problem: Problem, linear_solver: str, callback: Callable[[Step], object] | None, budget: int
+    ) -> None:
+        self.problem = problem
+        self.linear_solver = linear_solver
+        self.callback = callback
+        self.budget = budget
+        self.history: list[Step] = []
+        self.stages: list[Stage] = []
+        # Should nothing at all be computed, every free vertex lies at the middle of the target.
+        self.best_map = np.zeros(problem.n, dtype=np.complex128)
+        self.best_xi: ComplexArray | None = None
+        self.best = len(problem.F), np.inf
+        self._rounded = False
+        self._mark = self.best
+        self._marked = 0
+
+    def run(self, stages: Sequence[Descent]) -> Status:
+        """Run stages until one finds an injective map; the status of the last one that ran."""
+        status = Status.OUT_OF_ITERATIONS
+        try:
+            for stage in stages:
+                status = self._descend(stage)
+                if status is Status.INJECTIVE or self._left <= 0:
+                    break
+        except KeyboardInterrupt:
+            return Status.INTERRUPTED
+        return Status.ROUNDED if self._rounded and status is not Status.INJECTIVE else status
+
+    def positions(self, w: ComplexArray) -> FloatArray:
+        """A map of the frame as the caller gets it, the fixed vertices to the last bit."""
+        uv = self.problem.frame.outward(w)
+        uv[self.problem.fixed] = self.problem.target
+        return uv
+
+    @property
+    def _left(self) -> int:
+        """Iterations left; the first evaluation of all is the start and costs none."""
+        return self.budget + 1 - len(self.history)
+
+    def _descend(self, stage: Descent) -> Status:
+        """Run one stage from ξ = 0."""
+        before, done, began = self.best, max(len(self.history), 1), time.perf_counter()
+        self._mark, self._marked = (len(self.problem.F) + 1, np.inf), len(self.history)
+        try:
+            objective = Objective(
+                self.problem, stage.functional, stage.parameterization, stage.reference, self.linear_solver
+            )
+            self.linear_solver = objective.laplacian.solver.name
+            start = objective.evaluate(np.zeros(len(self.problem.F), dtype=np.complex128))
+            self._visit(start)
+            steps = min(stage.iterations, self._left)
+            vector_adam(objective, start, self._visit, iterations=steps, schedule=stage.schedule)
+            status = Status.OUT_OF_ITERATIONS
+        except Stop as stop:
+            status = stop.status
+        except NotPositiveDefinite:
+            status = Status.UNSOLVABLE
+        finally:
+            self.stages.append(
+                Stage(
+                    name=stage.name,
+                    iterations=max(len(self.history) - done, 0),
+                    seconds=time.perf_counter() - began,
+                    flipped=(before[0], self.best[0]),
+                    energy=(before[1], self.best[1]),
+                    kept=self.best != before,
+                )
+            )
+        return status
+
+    def _visit(self, here: Iterate) -> None:
+        """Take note of an iterate; stop at an injective one and where nothing moves any more."""
+        flipped = here.flipped
+        if flipped == 0:
+            # Decided on the coordinates that are handed back, not on the solver's own.
+            flipped = flipped_triangles(self.problem.F, self.positions(here.w)).size
+            self._rounded |= flipped > 0
+        step = Step(len(self.history), flipped, here.energy)
+        self.history.append(step)
+        if (flipped, step.energy) < self.best:
+            self.best = flipped, step.energy
+            self.best_map, self.best_xi = here.w, here.xi
+        if self.callback is not None:
+            self.callback(step)
+        if flipped == 0:
+            raise Stop(Status.INJECTIVE)
+        flips, energy = self._mark
+        if flipped < flips or step.energy < (1 - PROGRESS) * energy:
+            self._mark = min(flipped, flips), min(step.energy, energy)
+            self._marked = len(self.history)
+        elif len(self.history) - self._marked > PATIENCE:
+            raise Stop(Status.SETTLED)

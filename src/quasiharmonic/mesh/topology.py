@@ -1,0 +1,146 @@
+"""How the triangles of a mesh are joined: edges, boundary loops, components.
+
+Everything is read off one sort of the half-edges. A half-edge ``i → j`` is packed into a single
+integer that holds its undirected edge and its direction, so the sorted integers say at once which
+edges are shared by two triangles, which lie on the boundary, and which are not a surface's at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The edges of a triangle mesh, by the part they play.
+
+    Attributes
+    ----------
+    interior : (e, 2) int64
+        Edges between two triangles that traverse them in opposite directions, smaller index first.
+    boundary : (k, 2) int64
+        Half-edges ``i → j`` without an opposite, directed so that their triangle lies to the left.
+    inconsistent : (c, 2) int64
+        Edges between two triangles that traverse them in the same direction (mixed winding).
+    nonmanifold : (d, 2) int64
+        Edges of three or more triangles.
+    """
+
+    interior: IntArray
+    boundary: IntArray
+    inconsistent: IntArray
+    nonmanifold: IntArray
+
+
+def edges(F: NDArray[np.integer], n: int) -> Edges:
+    """Sort the half-edges of ``F`` and tell the kinds of edges apart.
+
+    Parameters
+    ----------
+    F : (f, 3) int
+        Triangles; every index in ``0 … n - 1``.
+    n : int
+        Number of vertices, below 2³¹.
+
+    Returns
+    -------
+    Edges
+        Each kind in ascending order of its undirected edge.
+    """
+    F = np.asarray(F, dtype=np.int64)
+    tail = F.ravel()
+    head = F[:, (1, 2, 0)].ravel()
+    backward = tail > head
+    key = (np.minimum(tail, head) * n + np.maximum(tail, head)) * 2 + backward
+    key.sort()
+    edge = key >> 1
+    first = np.flatnonzero(np.concatenate(([True], edge[1:] != edge[:-1]))) if edge.size else edge
+    count = np.diff(first, append=edge.size)
+    direction = key & 1
+
+    def unpack(start: IntArray) -> IntArray:
+        lo, hi = np.divmod(edge[start], max(n, 1))
+        return np.stack([lo, hi], axis=1)
+
+    pair = first[count == 2]
+    opposed = direction[pair] != direction[np.minimum(pair + 1, max(edge.size - 1, 0))]
+    single = first[count == 1]
+    boundary = unpack(single)
+    flip = direction[single] == 1
+    boundary[flip] = boundary[flip, ::-1]
+    return Edges(unpack(pair[opposed]), boundary, unpack(pair[~opposed]), unpack(first[count > 2]))
+
+
+def boundary_edges(F: NDArray[np.integer], n: int) -> IntArray:
+    """Half-edges ``i → j`` on the boundary, their triangle to the left; (k, 2) int64."""
+    return edges(F, n).boundary
+
+
+def boundary_loops(F: NDArray[np.integer], n: int) -> list[IntArray]:
+    """Boundary vertices, loop by loop; see `trace_loops`."""
+    return trace_loops(boundary_edges(F, n))
+
+
+def trace_loops(boundary: IntArray) -> list[IntArray]:
+    """Order directed boundary edges into loops.
+
+    Parameters
+    ----------
+    boundary : (k, 2) int64
+        Half-edges ``i → j`` as `Edges.boundary` has them.
+
+    Returns
+    -------
+    list of (l,) int64
+        Each loop in order with the surface to its left: counterclockwise around the outside of a
+        planar mesh, clockwise around its holes (the sense of eq. 15). Loops start at their smallest
+        vertex and are listed by it.
+
+    Raises
+    ------
+    ValueError
+        When the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
+        not a consistently oriented surface.
+    """
+    tails, times = np.unique(boundary[:, 0], return_counts=True)
+    if np.any(times > 1):
+        shared = tails[times > 1]
+        raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', shared)}")
+    unpaired = np.setxor1d(tails, boundary[:, 1])
+    if unpaired.size:
+        raise ValueError(f"the boundary does not close at {named('vertex', 'vertices', unpaired)}")
+    following = dict(zip(boundary[:, 0].tolist(), boundary[:, 1].tolist(), strict=True))
+    loops = []
+    for start in tails.tolist():
+        if start not in following:
+            continue
+        loop, here = [start], following.pop(start)
+        while here != start:
+            loop.append(here)
+            here = following.pop(here)
+        loops.append(np.array(loop, dtype=np.int64))
+    return loops
+
+
+def components(F: NDArray[np.integer], n: int) -> IntArray:
+    """Label of the connected component of every vertex, (n,) int64; a vertex without triangle is its own."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    F = np.asarray(F)
+    # Two edges of a triangle connect its three vertices.
+    tail, head = F[:, (0, 1)].ravel(), F[:, (1, 2)].ravel()
+    graph = csr_array((np.ones(tail.size, dtype=np.int8), (tail, head)), shape=(n, n))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:
+    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``."""
+    listed = ", ".join(str(int(i)) for i in indices[:most])
+    rest = f", … ({len(indices)} in all)" if len(indices) > most else ""
+    return f"{one if len(indices) == 1 else many} {listed}{rest}"

@@ -1,0 +1,278 @@
+"""The question: a mesh, and where its boundary and its pins go. Every check on what a user gives."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .laplacian import Laplacian
+from .mesh.reference import Reference, ReferenceMesh, rest_frames
+from .mesh.topology import Edges, components, edges, named, trace_loops
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+
+
+class Problem:
+    """A mesh with positions in the plane for its boundary and any pinned interior vertices.
+
+    What is malformed raises; what is merely hard or hopeless (a target that crosses itself, is wound
+    the wrong way or admits no map) is accepted and ends in a result that says so.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions, planar or curved; any real dtype.
+    F : (f, 3) array of int
+        Triangles, 0-based and consistently oriented. Never reordered. A planar target is wound as the
+        mesh is: counterclockwise around a mesh whose triangles are counterclockwise.
+    fixed : (k,) array of int
+        Vertices with given positions: at least the whole boundary, and any interior vertices.
+    target : (k, 2) array
+        Their positions, in the order of ``fixed``; any real dtype.
+    reference : {"equilateral", "rest", "corrected"}, optional
+        Shape of the triangles in which gradients are taken (see `ReferenceMesh`), whatever the strategy
+        would choose.
+
+    Raises
+    ------
+    ValueError
+        With the first offending elements: wrong shapes or dtypes, indices out of range, numbers that
+        are not finite, repeated or non-manifold elements, mixed winding, several components, isolated
+        vertices, a closed surface, boundary vertices without a position, a vertex fixed twice, and
+        triangles of zero area in the rest mesh. Those last are accepted when the reference is
+        ``"equilateral"`` or ``"corrected"`` by the caller's own word: that says that their shapes, and
+        the distortion that nobody could measure, do not matter.
+
+    Attributes
+    ----------
+    V, F, fixed, target : arrays
+        As given, as float64 and int64.
+    loops : list of (l,) int64
+        Boundary loops, the surface to their left.
+    """
+
+    def __init__(
+        self,
+        V: ArrayLike,
+        F: ArrayLike,
+        fixed: ArrayLike,
+        target: ArrayLike,
+        *,
+        reference: Reference | None = None,
+    ) -> None:
+        self.V = _vertices(V)
+        self.F = _triangles(F, len(self.V))
+        self.edges = _surface(self.F, len(self.V))
+        self.loops = trace_loops(self.edges.boundary)
+        self.reference = reference
+        if reference is None or reference == "rest":
+            _positive_areas(self.V, self.F)
+        self.fixed = _fixed(fixed, len(self.V), self.edges)
+        self.target = _target(target, len(self.fixed))
+        self._laplacians: dict[str, Laplacian] = {}
+        self._meshes: dict[Reference, ReferenceMesh] = {}
+
+    def moved(self, target: ArrayLike) -> Problem:
+        """The same problem with its fixed vertices elsewhere.
+
+        Topology, pattern and symbolic factorisation are shared with this one.
+
+        Parameters
+        ----------
+        target : (k, 2) array
+            New positions of ``fixed``.
+        """
+        other = object.__new__(Problem)
+        other.__dict__.update(self.__dict__)
+        other.__dict__.pop("frame", None)
+        other.target = _target(target, len(self.fixed))
+        return other
+
+    def laplacian(self, linear_solver: str = "auto") -> Laplacian:
+        """The Laplacian of this mesh and these fixed vertices, analysed once and kept."""
+        if linear_solver not in self._laplacians:
+            self._laplacians[linear_solver] = Laplacian(self.F, self.n, self.fixed, linear_solver)
+        return self._laplacians[linear_solver]
+
+    def mesh(self, kind: Reference) -> ReferenceMesh:
+        """The mesh with reference triangles of some kind, built once and kept."""
+        if kind not in self._meshes:
+            self._meshes[kind] = ReferenceMesh(self.V, self.F, kind)
+        return self._meshes[kind]
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The coordinates in which the problem is solved."""
+        return Frame(self.target)
+
+    @property
+    def pins(self) -> IntArray:
+        """Fixed vertices that are not on the boundary, ascending."""
+        return np.setdiff1d(self.fixed, self.edges.boundary)
+
+    @property
+    def n(self) -> int:
+        """Number of vertices."""
+        return len(self.V)
+
+
+class Frame:
+    """Coordinates of unit size around the target, and back.
+
+    The scale is a power of two, so going there and back costs no digits; positions at the fixed
+    vertices are put back as they were given, to the last bit.
+
+    Parameters
+    ----------
+    target : (k, 2) float64
+        Positions of the fixed vertices.
+    """
+
+    def __init__(self, target: FloatArray) -> None:
+        # Halved first: the extent of numbers near the largest double must not overflow.
+        low, high = target.min(axis=0) / 2, target.max(axis=0) / 2
+        self.centre = low + high
+        extent = float(np.max(high - low))
+        exponent = int(np.frexp(extent)[1]) if extent > 0 else 0
+        self._half_inverse = float(np.ldexp(1.0, -exponent // 2)), float(np.ldexp(1.0, -exponent - (-exponent // 2)))
+        self._half_scale = 1.0 / self._half_inverse[0], 1.0 / self._half_inverse[1]
+
+    def inward(self, uv: FloatArray) -> ComplexArray:
+        """Positions (n, 2) as complex numbers in the frame; (n,) complex128."""
+        unit = (uv - self.centre) * self._half_inverse[0] * self._half_inverse[1]
+        return np.ascontiguousarray(unit).view(np.complex128).ravel()
+
+    def outward(self, w: ComplexArray) -> FloatArray:
+        """Complex numbers of the frame (n,) as positions; (n, 2) float64."""
+        unit = np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
+        return unit * self._half_scale[0] * self._half_scale[1] + self.centre
+
+
+def _real(name: str, values: ArrayLike) -> FloatArray:
+    array = np.asarray(values)
+    if array.dtype.kind not in "iufb":
+        raise ValueError(f"{name} must hold real numbers, not {array.dtype}")
+    return np.array(array, dtype=np.float64, order="C")
+
+
+def _indices(name: str, values: ArrayLike) -> IntArray:
+    array = np.asarray(values)
+    if array.size == 0:
+        array = array.astype(np.int64)
+    if array.dtype.kind not in "iu":
+        raise ValueError(f"{name} must hold integer vertex indices, not {array.dtype}")
+    return np.array(array, dtype=np.int64, order="C")
+
+
+def _finite(name: str, one: str, values: FloatArray) -> None:
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if bad.size:
+        raise ValueError(f"{name} is not finite at {named(one, one[:-2] + 'ices' if one == 'vertex' else one + 's', bad)}")
+
+
+def _in_range(name: str, indices: IntArray, n: int) -> None:
+    bad = np.unique(indices[(indices < 0) | (indices >= n)])
+    if bad.size:
+        raise ValueError(f"{name} refers to {named('vertex', 'vertices', bad)}, but there are only {n} (0 … {n - 1})")
+
+
+def _vertices(V: ArrayLike) -> FloatArray:
+    array = _real("V", V)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {array.shape}")
+    _finite("V", "vertex", array)
+    return array
+
+
+def _triangles(F: ArrayLike, n: int) -> IntArray:
+    array = _indices("F", F)
+    if array.size == 0:
+        raise ValueError("the mesh has no triangles")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"F must have shape (f, 3), triangles only, not {array.shape}")
+    _in_range("F", array, n)
+    return array
+
+
+def _surface(F: IntArray, n: int) -> Edges:
+    collapsed = np.flatnonzero((F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0]))
+    if collapsed.size:
+        raise ValueError(f"{named('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
+    used = np.zeros(n, dtype=bool)
+    used[F] = True
+    if not used.all():
+        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(~used))}: no triangle uses them; remove them")
+    found = edges(F, n)
+    if found.nonmanifold.size or found.inconsistent.size:
+        _repeated(F)
+    if found.nonmanifold.size:
+        raise ValueError(f"{_named_edges(found.nonmanifold)} in more than two triangles: not a surface")
+    if found.inconsistent.size:
+        raise ValueError(
+            f"mixed winding: {_named_edges(found.inconsistent)} traversed in the same direction by both triangles; "
+            "orient all triangles alike"
+        )
+    if not found.boundary.size:
+        raise ValueError("the surface is closed: it has no boundary to place; cut it open first")
+    labels = components(F, n)
+    if labels.max() > 0:
+        first = np.unique(labels, return_index=True)[1]
+        raise ValueError(
+            f"the mesh has {labels.max() + 1} components, the first ones around {named('vertex', 'vertices', first)}: "
+            "map them one at a time"
+        )
+    return found
+
+
+def _repeated(F: IntArray) -> None:
+    corners = np.sort(F, axis=1)
+    order = np.lexsort(corners.T)
+    same = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
+    if same.any():
+        repeats = np.sort(order[1:][same])
+        raise ValueError(f"{named('triangle', 'triangles', repeats)} repeated: the same three vertices occur before")
+
+
+def _positive_areas(V: FloatArray, F: IntArray) -> None:
+    z1, z2 = rest_frames(V, F)
+    flat = np.flatnonzero((z1 == 0) | (z2.imag == 0))
+    if flat.size:
+        raise ValueError(
+            f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh; "
+            "pass reference='equilateral' to map it all the same"
+        )
+
+
+def _fixed(fixed: ArrayLike, n: int, found: Edges) -> IntArray:
+    array = _indices("fixed", fixed)
+    if array.ndim != 1:
+        raise ValueError(f"fixed must have shape (k,), not {array.shape}")
+    _in_range("fixed", array, n)
+    times = np.bincount(array, minlength=n)
+    if times.max(initial=0) > 1:
+        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
+    boundary = np.unique(found.boundary)
+    missing = boundary[times[boundary] == 0]
+    if missing.size:
+        raise ValueError(
+            f"the boundary {named('vertex', 'vertices', missing)} not in fixed: every boundary vertex needs a position"
+        )
+    return array
+
+
+def _target(target: ArrayLike, k: int) -> FloatArray:
+    array = _real("target", target)
+    if array.shape != (k, 2):
+        raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
+    _finite("target", "row", array)
+    return array
+
+
+def _named_edges(pairs: IntArray, most: int = 5) -> str:
+    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
+    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
+    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"

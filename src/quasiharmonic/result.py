@@ -1,0 +1,148 @@
+"""What a solver hands back: the map, the verdict on it, and what was done to get there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .certificate import Certificate
+
+
+class Status(Enum):
+    """What happened, and what to do next; the value is a sentence for the user."""
+
+    INJECTIVE = "Every triangle is strictly positive, decided exactly."
+    SETTLED = (
+        "Some triangles stay inverted and the energy has settled at a positive value: "
+        "no map was found, and perhaps this mesh and this target admit none."
+    )
+    OUT_OF_ITERATIONS = (
+        "Some triangles were still inverted after the last iteration. "
+        "The energy was still falling: allow more iterations."
+    )
+    INTERRUPTED = "Interrupted; this is the best map so far."
+    ROUNDED = (
+        "The map is injective in the solver's own coordinates, but its smallest triangles invert when the "
+        "positions are rounded to doubles at the target's offset: move the target nearer to the origin."
+    )
+    UNSOLVABLE = (
+        "No linear solver could factor the system any more; this is the best map so far. "
+        "Another linear solver or reference triangle may help."
+    )
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One thing that ran, and what it brought.
+
+    Attributes
+    ----------
+    name : str
+        What ran, in words a log can show.
+    iterations : int
+        Evaluations of the objective, the first one included only in the first stage.
+    seconds : float
+    flipped : tuple of int
+        Triangles not strictly positive before and after.
+    energy : tuple of float
+        V₃ over the target's area before and after (dimensionless).
+    kept : bool
+        Whether its result was taken on; what makes a map worse is discarded.
+    """
+
+    name: str
+    iterations: int
+    seconds: float
+    flipped: tuple[int, int]
+    energy: tuple[float, float]
+    kept: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "flipped": list(self.flipped),
+            "energy": list(self.energy),
+            "kept": self.kept,
+        }
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the history: the state of the map at one iteration.
+
+    Attributes
+    ----------
+    iteration : int
+    flipped : int
+        Triangles whose area, in floating point, is not positive.
+    energy : float
+        V₃ over the target's area: dimensionless, 0 only at injective maps, and the smaller the nearer.
+    """
+
+    iteration: int
+    flipped: int
+    energy: float
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """A map of the mesh into the plane.
+
+    Attributes
+    ----------
+    uv : (n, 2) float64
+        Positions, the fixed vertices exactly at their target.
+    status : Status
+        What happened and what to do next.
+    certificate : Certificate
+        The exact verdict on ``uv``.
+    stages : list of Stage
+        What ran, how long, what it brought.
+    history : list of Step
+        Flips and energy at every iteration.
+    linear_solver : str
+        The backend that solved the linear systems.
+    seconds : float
+        Wall time from the call to the verdict.
+    xi : (f,) complex128 or None
+        The anisotropy behind the map, a start for the next solve of a similar problem.
+    """
+
+    uv: NDArray[np.float64]
+    status: Status
+    certificate: Certificate
+    stages: list[Stage] = field(default_factory=list)
+    history: list[Step] = field(default_factory=list)
+    linear_solver: str = ""
+    seconds: float = 0.0
+    xi: NDArray[np.complex128] | None = None
+
+    @property
+    def injective(self) -> bool:
+        """Whether every triangle is strictly positive (certified)."""
+        return self.certificate.injective
+
+    @property
+    def iterations(self) -> int:
+        """Iterations over all stages."""
+        return sum(stage.iterations for stage in self.stages)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report of ``--json``: everything but the map itself, in plain Python types."""
+        return {
+            "injective": self.injective,
+            "status": self.status.name.lower(),
+            "message": self.status.value,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "linear_solver": self.linear_solver,
+            "stages": [stage.to_dict() for stage in self.stages],
+            "certificate": self.certificate.to_dict(),
+        }

@@ -1,0 +1,123 @@
+"""One complex number a triangle to an elliptic tensor of unit determinant, and back down (§8).
+
+    ξ ──r──▶ μ = r(|ξ|) ξ/|ξ|  ──eq. 33──▶  𝒜 = c·I − [[Re w, Im w], [Im w, −Re w]]
+
+with ``c = (1 + |μ|²)/(1 − |μ|²)`` and ``w = 2μ/(1 − |μ|²)``. Any ξ gives a positive definite tensor, so
+the search over ξ has no constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Parameterization:
+    """The sigmoid ``r`` that carries ξ to the Beltrami coefficient μ (§8.2).
+
+    Attributes
+    ----------
+    name : str
+        How a user calls it.
+    bound : float
+        Largest ``|ξ|`` at which the tensor, rounded to doubles, is still safely positive definite.
+    radial : callable
+        ``ρ ↦ (r/ρ, 1 − r², r')`` elementwise, each in its limit at ρ = 0.
+    """
+
+    name: str
+    bound: float
+    radial: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+
+    def field(self, xi: ComplexArray) -> TensorField:
+        """The tensor field of ``xi`` (f,) complex128."""
+        rho = np.sqrt(xi.real**2 + xi.imag**2)
+        ratio, defect, slope = self.radial(rho)
+        return TensorField(xi, rho, ratio * xi, ratio, defect, slope)
+
+
+@dataclass(frozen=True)
+class TensorField:
+    """𝒜 on every triangle, with what is needed to differentiate it.
+
+    Attributes
+    ----------
+    xi, mu : (f,) complex128
+        The variable and the Beltrami coefficient.
+    rho, ratio, defect, slope : (f,) float64
+        ``|ξ|``, ``r/ρ``, ``1 − |μ|²`` (accurate where ``|μ|`` rounds to 1) and ``r'``.
+    """
+
+    xi: ComplexArray
+    rho: FloatArray
+    mu: ComplexArray
+    ratio: FloatArray
+    defect: FloatArray
+    slope: FloatArray
+
+    def entries(self) -> FloatArray:
+        """Rows a11, a12, a22 of 𝒜 (eq. 33), without the area factor; (3, f) float64."""
+        a = np.empty((3, self.mu.size))
+        double = 2.0 / self.defect
+        real = double * self.mu.real
+        np.subtract(double, 1.0, out=a[2])
+        np.subtract(a[2], real, out=a[0])
+        a[2] += real
+        np.multiply(double, -self.mu.imag, out=a[1])
+        return a
+
+    def pull_twist(self, by_c: FloatArray, by_w: ComplexArray) -> ComplexArray:
+        """Gradient in μ from the derivatives by c and w: the transpose of d(c, w)/dμ.
+
+        Parameters
+        ----------
+        by_c : (f,) float64
+        by_w : (f,) complex128
+            ``∂/∂Re w + i ∂/∂Im w``.
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂/∂Re μ + i ∂/∂Im μ``.
+        """
+        # c = 2/D − 1 and w = 2μ/D with D = 1 − |μ|², so dD = −2 Re(μ̄ dμ).
+        double = 2.0 / self.defect
+        inner = by_c + (np.conj(self.mu) * by_w).real
+        return double * (by_w + double * inner * self.mu)
+
+    def pull(self, grad: ComplexArray) -> ComplexArray:
+        """Gradient in ξ from the gradient in μ: the transpose of dμ/dξ, which is symmetric."""
+        safe = np.where(self.rho > 0, self.rho, 1.0)
+        unit = self.xi / safe
+        radial = (self.slope - self.ratio) * (np.conj(unit) * grad).real
+        return self.ratio * grad + radial * unit
+
+
+def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    decay = np.exp(-2.0 * rho)
+    defect = 4.0 * decay / (1.0 + decay) ** 2
+    safe = np.where(rho > 0, rho, 1.0)
+    ratio = np.where(rho > 0, np.tanh(rho) / safe, 1.0)
+    return ratio, defect, defect
+
+
+def _si_log(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    log = np.log1p(rho)
+    omega = 1.0 / (1.0 + log)
+    safe = np.where(rho > 0, rho, 1.0)
+    ratio = np.where(rho > 0, log * omega / safe, 1.0)
+    return ratio, omega * (2.0 - omega), omega**2 / (1.0 + rho)
+
+
+# The eigenvalues of 𝒜 are e^{±2ρ} for tanh, and its entries are rounded at e^{2ρ} · 1e-16: beyond ρ = 9 the
+# smaller eigenvalue drowns. si-log comes nowhere near; its bound keeps |ξ|² finite.
+TANH = Parameterization("tanh", 8.8, _tanh)
+SI_LOG = Parameterization("si-log", 1e150, _si_log)
+PARAMETERIZATIONS = {p.name: p for p in (TANH, SI_LOG)}

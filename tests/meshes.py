@@ -1,0 +1,52 @@
+"""Small problems that the tests share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.surfaces import annulus, random_delaunay
+
+
+def bend(points):
+    """A smooth injective map of the unit disk's neighbourhood: a quadratic shear after a turn and a stretch."""
+    x, y = points[:, 0], points[:, 1]
+    turn = np.exp(0.4j)
+    z = (x + 1j * y) * turn
+    u, v = 1.6 * z.real, 0.7 * z.imag
+    return np.stack([u + 0.3 * v**2, v + 0.25 * (u + 0.3 * v**2) ** 2], axis=1)
+
+
+def lift(points):
+    """A curved surface over a planar mesh."""
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([x, y, 0.8 * np.exp(-2 * x**2 - y**2) + 0.3 * x * y], axis=1)
+
+
+def surfaces():
+    """(name, V, F): planar and curved, with one loop and with two."""
+    disk, disk_faces = random_delaunay(150, seed=3)
+    ring, ring_faces = annulus(8)
+    return [
+        ("disk", disk, disk_faces),
+        ("bowl", lift(disk), disk_faces),
+        ("annulus", ring, ring_faces),
+        ("curved annulus", lift(ring), ring_faces),
+    ]
+
+
+def boundary_of(F):
+    """Boundary vertices, ascending."""
+    return np.unique(boundary_edges(F, int(F.max()) + 1))
+
+
+def signed_areas(F, uv):
+    """Twice the signed areas, by the formula nobody gets wrong."""
+    a, b, c = uv[F[:, 0]], uv[F[:, 1]], uv[F[:, 2]]
+    return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+
+
+def random_xi(F, scale=0.7, seed=0):
+    """A random ξ per triangle."""
+    rng = np.random.default_rng(seed)
+    return scale * (rng.standard_normal(len(F)) + 1j * rng.standard_normal(len(F)))

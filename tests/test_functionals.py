@@ -1,0 +1,202 @@
+"""V₁ … V₄ against the paper's matrices, against differences, and against its theorems."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from meshes import bend, boundary_of, random_xi, signed_areas, surfaces
+
+from quasiharmonic.functionals import FUNCTIONALS, neumann_target
+from quasiharmonic.mesh.operators import operators
+from quasiharmonic.objective import Objective
+from quasiharmonic.problem import Problem
+from quasiharmonic.surfaces import annulus, random_delaunay
+from quasiharmonic.tensor import TANH
+
+MESHES = surfaces()
+IDS = [name for name, _, _ in MESHES]
+NAMES = list(FUNCTIONALS)
+
+
+def posed(V, F, pins=0, noise=0.0, seed=0):
+    """Boundary (and pins) where `bend` puts them, disturbed by some noise."""
+    boundary = boundary_of(F)
+    rng = np.random.default_rng(seed)
+    inner = np.setdiff1d(np.arange(len(V)), boundary)
+    fixed = np.concatenate([boundary, rng.choice(inner, pins, replace=False)])
+    target = bend(V[fixed, :2])
+    return Problem(V, F, fixed, target + noise * rng.standard_normal(target.shape))
+
+
+def matrices(problem, iterate, reference="equilateral"):
+    """L, D, pseudo-inverse and Neumann data of an iterate, dense, by the paper's definitions."""
+    op = operators(problem.V, problem.F, reference)
+    L = op.laplacian(iterate.field.entries().T).toarray()
+    return L, op.D.toarray(), np.linalg.pinv(L, hermitian=True)
+
+
+def inverse_field(mesh, w):
+    """The μ of eq. 39 for an injective map: 𝒜 = det J (JᵀJ)⁻¹ is the tensor whose μ is q/p."""
+    p, q, _ = mesh.derivatives(w)
+    return q / p
+
+
+@pytest.mark.parametrize(("name", "V", "F"), MESHES, ids=IDS)
+class TestValues:
+    def test_are_the_papers(self, name, V, F):
+        problem = posed(V, F, noise=0.05)
+        for functional in NAMES:
+            iterate = Objective(problem, functional).evaluate(random_xi(F))
+            L, D, pinv = matrices(problem, iterate)
+            w = iterate.w
+            g = -1j * (D @ w)
+            np.testing.assert_allclose(neumann_target(problem, w), g, atol=1e-14)
+            residual = L @ w - g
+            on_boundary = np.zeros(len(V), dtype=complex)
+            on_boundary[problem.fixed] = residual[problem.fixed]
+            expected = {
+                "neumann": np.vdot(residual, residual).real / 2,
+                "sobolev": (residual.conj() @ pinv @ residual).real / 2,
+                "dirichlet": (w.conj() @ L @ w).real / 2 - w.real @ D @ w.imag,
+                "poisson": (g.conj() @ pinv @ g).real / 2 - w.real @ D @ w.imag,
+            }[functional]
+            assert iterate.value == pytest.approx(expected, rel=1e-8)
+            if functional != "poisson":
+                assert iterate.value > 0
+
+    def test_v2_is_v3_plus_v4(self, name, V, F):
+        problem = posed(V, F, noise=0.05)
+        xi = random_xi(F)
+        v2, v3, v4 = (Objective(problem, n).evaluate(xi) for n in ("sobolev", "dirichlet", "poisson"))
+        assert v2.value == pytest.approx(v3.value + v4.value, rel=1e-10)
+        np.testing.assert_allclose(v2.gradient, v3.gradient + v4.gradient, rtol=1e-8, atol=1e-10)
+        assert v4.value >= -v3.value
+
+    def test_sandwich(self, name, V, F):
+        """Eq. 42: Dirichlet energy ≥ unsigned area ≥ signed area."""
+        problem = posed(V, F, noise=0.2)
+        iterate = Objective(problem).evaluate(random_xi(F, 2.0))
+        signed = iterate.dw.area.sum()
+        unsigned = np.abs(iterate.dw.area).sum()
+        assert iterate.value + signed >= unsigned >= signed
+        assert iterate.flipped > 0
+
+    def test_are_frame_and_similarity_invariant(self, name, V, F):
+        """Turning each triangle's corners turns its frame: ξ turns by twice the angle and nothing else happens."""
+        problem = posed(V, F, noise=0.05)
+        turned = Problem(V, np.roll(F, -1, axis=1), problem.fixed, problem.target)
+        # Scaling by a power of two and half a turn are exact, so the solver's frame is the same one mirrored.
+        moved = Problem(V, F, problem.fixed, -4 * problem.target)
+        xi = random_xi(F)
+        for functional in NAMES:
+            a = Objective(problem, functional).evaluate(xi)
+            # In an equilateral triangle the next side lies at 120°.
+            b = Objective(turned, functional).evaluate(xi * np.exp(-2j * np.deg2rad(120)))
+            c = Objective(moved, functional).evaluate(xi)
+            assert b.value == pytest.approx(a.value, rel=1e-10)
+            assert c.value == pytest.approx(a.value, rel=1e-10)
+            np.testing.assert_allclose(np.abs(b.gradient), np.abs(a.gradient), rtol=1e-7, atol=1e-10)
+            np.testing.assert_allclose(c.gradient, a.gradient, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("functional", NAMES)
+@pytest.mark.parametrize("parameterization", ["tanh", "si-log"])
+@pytest.mark.parametrize("reference", ["equilateral", "rest"])
+@pytest.mark.parametrize("pins", [0, 4])
+@pytest.mark.parametrize("mesh", [1, 2], ids=["bowl", "annulus"])
+def test_gradients_against_differences(functional, parameterization, reference, pins, mesh):
+    _, V, F = MESHES[mesh]
+    objective = Objective(posed(V, F, pins, noise=0.05), functional, parameterization, reference)
+    xi = random_xi(F)
+    rng = np.random.default_rng(1)
+    h = 1e-5
+    gradient = objective.evaluate(xi).gradient
+    for _ in range(3):
+        direction = rng.standard_normal(len(F)) + 1j * rng.standard_normal(len(F))
+        slope = (objective.evaluate(xi + h * direction).value - objective.evaluate(xi - h * direction).value) / (2 * h)
+        assert np.vdot(gradient, direction).real == pytest.approx(slope, rel=1e-6)
+
+
+@pytest.mark.parametrize(("name", "V", "F"), MESHES, ids=IDS)
+class TestTheorems:
+    @pytest.mark.parametrize("pins", [0, 5])
+    def test_completeness(self, name, V, F, pins):
+        """Theorem 6.4 and Proposition B.2: any injective map is reproduced from its own A, and all of V₁ … V₄ vanish there."""
+        problem = posed(V, F, pins)
+        uv = bend(V[:, :2])
+        assert signed_areas(F, uv).min() > 0
+        w = problem.frame.inward(uv)
+        # A random injective map of the mesh is not needed: every interior position is arbitrary already.
+        inner = np.setdiff1d(np.arange(len(V)), problem.fixed)
+        w[inner] += 0.02 * np.random.default_rng(4).standard_normal((inner.size, 2)).view(complex).ravel() * 0.2
+        assert signed_areas(F, problem.frame.outward(w)).min() > 0
+        mu = inverse_field(problem.mesh("equilateral"), w)
+        xi = np.arctanh(np.abs(mu)) * np.exp(1j * np.angle(mu))
+        for functional in NAMES:
+            iterate = Objective(problem, functional).evaluate(xi)
+            np.testing.assert_allclose(iterate.w, w, atol=1e-9)
+            assert abs(iterate.value) < 1e-12
+            assert np.abs(iterate.gradient).max() < 1e-6
+
+    def test_positive_semidefinite(self, name, V, F):
+        """Proposition A.1: GᵀAG + iD ⪰ 0 for determinant 1 and above; the A of an injective map is the tight case."""
+        op = operators(V, F, "equilateral")
+        problem = posed(V, F)
+        mu = inverse_field(problem.mesh("equilateral"), problem.frame.inward(bend(V[:, :2])))
+        tight = np.arctanh(np.abs(mu)) * np.exp(1j * np.angle(mu))
+        for xi, factor, holds in ((random_xi(F), 1, True), (tight, 1.3, True), (tight, 1, True), (tight, 0.9, False)):
+            a = TANH.field(xi).entries()
+            H = factor * op.laplacian(a.T).toarray() + 1j * op.D.toarray()
+            lowest = np.linalg.eigvalsh(H).min()
+            assert (lowest > -1e-12) if holds else (lowest < -1e-3)
+
+    def test_sufficiency(self, name, V, F):
+        """Theorem 6.4 the other way: where the Neumann data do not fit, V₃ exceeds twice the inverted area."""
+        problem = posed(V, F, noise=0.2)
+        iterate = Objective(problem).evaluate(random_xi(F))
+        inverted = -iterate.dw.area[iterate.dw.area < 0].sum()
+        assert inverted > 0
+        assert iterate.value >= 2 * inverted
+
+
+def test_v4_can_be_negative():
+    """The paper's V₄ ≥ 0 (§7.3.4) holds in the continuous case only.
+
+    There V₄ = V₃ on a disk. Linear elements raise a Dirichlet energy and lower its dual, so on a coarse
+    mesh with a rough tensor V₄ drops below zero. V₂ = V₃ + V₄ ≥ 0 still bounds it from below.
+    """
+    V, F = random_delaunay(150, seed=3)
+    problem = posed(V, F, noise=0.05)
+    assert Objective(problem, "poisson").evaluate(random_xi(F)).value < -0.1
+
+
+class TestPoissonIsBlind:
+    def test_to_a_loop_moved_against_the_others(self):
+        """V₄ sees C b only: an inner loop carried right out of the outer one changes nothing."""
+        V, F = annulus(8)
+        boundary = boundary_of(F)
+        target = V[boundary].copy()
+        inner = np.abs(target).max(axis=1) < 0.75
+        xi = np.zeros(len(F), dtype=complex)
+        here = Problem(V, F, boundary, target, reference="rest")
+        target[inner] += [0.25, 0.0]
+        there = Problem(V, F, boundary, target, reference="rest")
+        assert Objective(there, "poisson").evaluate(xi).value == pytest.approx(
+            Objective(here, "poisson").evaluate(xi).value, abs=1e-12
+        )
+        assert Objective(there, "dirichlet").evaluate(xi).value > 1e-2
+
+    def test_to_pins(self):
+        V, F = random_delaunay(150, seed=3)
+        free = Problem(V, F, boundary_of(F), V[boundary_of(F)], reference="rest")
+        middle = int(np.argmin((V**2).sum(axis=1)))
+        fixed = np.append(boundary_of(F), middle)
+        pinned = Problem(V, F, fixed, np.vstack([V[boundary_of(F)], [[0.5, 0.0]]]), reference="rest")
+        xi = np.zeros(len(F), dtype=complex)
+        assert Objective(pinned, "poisson").evaluate(xi).value == pytest.approx(0, abs=1e-12)
+        assert Objective(free, "dirichlet").evaluate(xi).value == pytest.approx(0, abs=1e-12)
+        for sighted in ("neumann", "sobolev", "dirichlet"):
+            assert Objective(pinned, sighted).evaluate(xi).value > 1e-2
+
+    def test_is_declared(self):
+        assert [n for n in NAMES if not FUNCTIONALS[n].sees_positions] == ["poisson"]
