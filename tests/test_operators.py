@@ -118,7 +118,10 @@ def test_corrected_triangles():
     assert np.all(np.isfinite(mesh.gamma))
     # |γᵢ| is the opposite side over 2m; the angles follow from the sides.
     lengths = np.abs(mesh.gamma) * 2 * mesh.m
-    cosines = [(lengths[i - 1] ** 2 + lengths[i - 2] ** 2 - lengths[i] ** 2) / (2 * lengths[i - 1] * lengths[i - 2]) for i in range(3)]
+    cosines = [
+        (lengths[i - 1] ** 2 + lengths[i - 2] ** 2 - lengths[i] ** 2) / (2 * lengths[i - 1] * lengths[i - 2])
+        for i in range(3)
+    ]
     angles = np.arccos(cosines)
     assert angles.min() >= np.pi / 8 - 1e-12
     np.testing.assert_allclose(np.sort(angles[:, 0]), np.array([1, 1, 6]) * np.pi / 8, atol=1e-7)

@@ -1,1 +1,60 @@
-"""Maps of triangle meshes into the plane with no inverted triangle, certified exactly."""
+"""Maps of triangle meshes into the plane with no inverted triangle, certified exactly.
+
+The public names are imported when they are first used, so that ``import quasiharmonic`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .certificate import Certificate, certify, flipped_triangles, is_injective
+    from .inject import injective_map, solve
+    from .problem import Problem
+    from .result import MapResult, Stage, Status, Step
+    from .strategy import Descent
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Certificate": "certificate",
+    "Descent": "strategy",
+    "MapResult": "result",
+    "Problem": "problem",
+    "Stage": "result",
+    "Status": "result",
+    "Step": "result",
+    "certify": "certificate",
+    "flipped_triangles": "certificate",
+    "injective_map": "inject",
+    "is_injective": "certificate",
+    "solve": "inject",
+}
+
+__all__ = [
+    "Certificate",
+    "Descent",
+    "MapResult",
+    "Problem",
+    "Stage",
+    "Status",
+    "Step",
+    "certify",
+    "flipped_triangles",
+    "injective_map",
+    "is_injective",
+    "solve",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -28,10 +28,10 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from .laplacian import Laplacian
-from .mesh.reference import Derivatives, ReferenceMesh
-from .problem import Problem
-from .tensor import TensorField
+from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.mesh.reference import Derivatives, ReferenceMesh
+from quasiharmonic.problem import Problem
+from quasiharmonic.tensor import TensorField
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -13,15 +13,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .certificate import certify, flipped_triangles
-from .linsolve import NotPositiveDefinite
-from .mesh.reference import Reference
-from .objective import Iterate, Objective
-from .optimize import Stop
-from .optimize.vector_adam import vector_adam
-from .problem import Problem
-from .result import MapResult, Stage, Status, Step
-from .strategy import Descent, default_strategy
+from quasiharmonic.certificate import certify, flipped_triangles
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.optimize import Stop
+from quasiharmonic.optimize.alternating import alternating, own_tensor
+from quasiharmonic.optimize.lbfgs import lbfgs
+from quasiharmonic.optimize.newton import newton
+from quasiharmonic.optimize.vector_adam import vector_adam
+from quasiharmonic.problem import Problem
+from quasiharmonic.result import MapResult, Stage, Status, Step
+from quasiharmonic.strategy import Descent, stages_of
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -38,6 +41,7 @@ def injective_map(
     target: ArrayLike,
     *,
     reference: Reference | None = None,
+    strategy: str | Sequence[Descent] = "speed",
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -55,8 +59,9 @@ def injective_map(
     target : (k, 2) array
         Where they go.
     reference : {"equilateral", "rest", "corrected"}, optional
-        Shape of the triangles in which gradients are taken (§9.3). By default equilateral ones, which
-        are as fast as any and indifferent to slivers.
+        Shape of the triangles in which gradients are taken (§9.3), whatever the strategy would choose.
+    strategy : {"speed", "quality"} or sequence of Descent
+        ``"speed"`` finds a map soonest; ``"quality"`` takes longer and keeps angles; or stages of one's own.
     max_iterations : int
         Linear solves to spend at most.
     linear_solver : str
@@ -94,13 +99,19 @@ def injective_map(
     began = time.perf_counter()
     problem = Problem(V, F, fixed, target, reference=reference)
     return solve(
-        problem, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback, _began=began
+        problem,
+        strategy=strategy,
+        max_iterations=max_iterations,
+        linear_solver=linear_solver,
+        callback=callback,
+        _began=began,
     )
 
 
 def solve(
     problem: Problem,
     *,
+    strategy: str | Sequence[Descent] = "speed",
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -109,7 +120,7 @@ def solve(
     """Solve a problem at hand; parameters and result as `injective_map` has them."""
     began = time.perf_counter() if _began is None else _began
     search = _Search(problem, linear_solver, callback, max_iterations)
-    status = search.run(default_strategy(problem))
+    status = search.run(stages_of(strategy, problem))
     uv = search.positions(search.best_map)
     certificate = certify(problem.F, uv)
     return MapResult(
@@ -122,6 +133,17 @@ def solve(
         seconds=time.perf_counter() - began,
         xi=search.best_xi,
     )
+
+
+_Visit = Callable[[Iterate], None]
+_METHODS: dict[str, Callable[[Objective, Iterate, _Visit, Descent, int], None]] = {
+    "vector-adam": lambda o, start, visit, stage, n: vector_adam(
+        o, start, visit, iterations=n, schedule=stage.steps
+    ),
+    "l-bfgs": lambda o, start, visit, stage, n: lbfgs(o, start, visit, iterations=n),
+    "newton": lambda o, start, visit, stage, n: newton(o, start, visit, iterations=n),
+    "alternating": lambda o, start, visit, stage, n: alternating(o, start, visit, iterations=n),
+}
 
 
 class _Search:
@@ -139,6 +161,7 @@ class _Search:
         # Should nothing at all be computed, every free vertex lies at the middle of the target.
         self.best_map = np.zeros(problem.n, dtype=np.complex128)
         self.best_xi: ComplexArray | None = None
+        self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
         self._rounded = False
         self._mark = self.best
@@ -168,7 +191,7 @@ class _Search:
         return self.budget + 1 - len(self.history)
 
     def _descend(self, stage: Descent) -> Status:
-        """Run one stage from ξ = 0."""
+        """Run one stage."""
         before, done, began = self.best, max(len(self.history), 1), time.perf_counter()
         self._mark, self._marked = (len(self.problem.F) + 1, np.inf), len(self.history)
         try:
@@ -176,10 +199,9 @@ class _Search:
                 self.problem, stage.functional, stage.parameterization, stage.reference, self.linear_solver
             )
             self.linear_solver = objective.laplacian.solver.name
-            start = objective.evaluate(np.zeros(len(self.problem.F), dtype=np.complex128))
+            start = objective.evaluate(self._start(objective, stage.resume))
             self._visit(start)
-            steps = min(stage.iterations, self._left)
-            vector_adam(objective, start, self._visit, iterations=steps, schedule=stage.schedule)
+            _METHODS[stage.optimizer](objective, start, self._visit, stage, min(stage.iterations, self._left))
             status = Status.OUT_OF_ITERATIONS
         except Stop as stop:
             status = stop.status
@@ -198,6 +220,20 @@ class _Search:
             )
         return status
 
+    def _start(self, objective: Objective, resume: bool) -> ComplexArray:
+        """Where a stage begins: at ξ = 0, or at the tensors of the lowest energy so far.
+
+        Not at those of the fewest flips, which may have been passed by early on, far from any solution.
+        """
+        best = self.deepest
+        if not resume or best is None:
+            return np.zeros(len(self.problem.F), dtype=np.complex128)
+        if best.objective.mesh is objective.mesh:
+            mu = best.field.mu
+        else:
+            mu = own_tensor(objective.mesh.derivatives(best.w))
+        return objective.bounded(objective.parameterization.invert(mu))
+
     def _visit(self, here: Iterate) -> None:
         """Take note of an iterate; stop at an injective one and where nothing moves any more."""
         flipped = here.flipped
@@ -210,6 +246,8 @@ class _Search:
         if (flipped, step.energy) < self.best:
             self.best = flipped, step.energy
             self.best_map, self.best_xi = here.w, here.xi
+        if self.deepest is None or here.energy < self.deepest.energy:
+            self.deepest = here
         if self.callback is not None:
             self.callback(step)
         if flipped == 0:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .linsolve import make_solver
+from quasiharmonic.linsolve import make_solver
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

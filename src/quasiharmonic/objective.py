@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .functionals import FUNCTIONALS, Functional, beltrami_energy
-from .linsolve import NotPositiveDefinite
-from .mesh.reference import Derivatives, Reference
-from .problem import Problem
-from .tensor import PARAMETERIZATIONS, TensorField
+from quasiharmonic.functionals import FUNCTIONALS, Functional, beltrami_energy
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.mesh.reference import Derivatives, Reference
+from quasiharmonic.problem import Problem
+from quasiharmonic.tensor import PARAMETERIZATIONS, TensorField
 
 ComplexArray = NDArray[np.complex128]
 
@@ -124,12 +124,17 @@ class Iterate:
         return int(np.count_nonzero(~(self.dw.area > 0)))
 
     @cached_property
+    def dirichlet(self) -> float:
+        """V₃, whatever the objective's functional."""
+        return beltrami_energy(self.objective.mesh, self.field, self.dw)
+
+    @cached_property
     def energy(self) -> float:
         """V₃ over the map's signed area (over the sum of unsigned areas where that is not positive)."""
         area = float(self.dw.area.sum())
         if not area > 0:
             area = float(np.abs(self.dw.area).sum())
-        return beltrami_energy(self.objective.mesh, self.field, self.dw) / area if area > 0 else np.inf
+        return self.dirichlet / area if area > 0 else np.inf
 
     @property
     def value(self) -> float:

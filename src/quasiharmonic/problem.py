@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .laplacian import Laplacian
-from .mesh.reference import Reference, ReferenceMesh, rest_frames
-from .mesh.topology import Edges, components, edges, named, trace_loops
+from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.mesh.reference import Reference, ReferenceMesh, rest_frames
+from quasiharmonic.mesh.topology import Edges, components, edges, named, trace_loops
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -68,6 +69,8 @@ class Problem:
         self.F = _triangles(F, len(self.V))
         self.edges = _surface(self.F, len(self.V))
         self.loops = trace_loops(self.edges.boundary)
+        if reference is not None and reference not in get_args(Reference):
+            raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
         self.reference = reference
         if reference is None or reference == "rest":
             _positive_areas(self.V, self.F)
@@ -136,20 +139,15 @@ class Frame:
         # Halved first: the extent of numbers near the largest double must not overflow.
         low, high = target.min(axis=0) / 2, target.max(axis=0) / 2
         self.centre = low + high
-        extent = float(np.max(high - low))
-        exponent = int(np.frexp(extent)[1]) if extent > 0 else 0
-        self._half_inverse = float(np.ldexp(1.0, -exponent // 2)), float(np.ldexp(1.0, -exponent - (-exponent // 2)))
-        self._half_scale = 1.0 / self._half_inverse[0], 1.0 / self._half_inverse[1]
+        self._exponent = int(np.frexp(np.max(high - low))[1])
 
     def inward(self, uv: FloatArray) -> ComplexArray:
         """Positions (n, 2) as complex numbers in the frame; (n,) complex128."""
-        unit = (uv - self.centre) * self._half_inverse[0] * self._half_inverse[1]
-        return np.ascontiguousarray(unit).view(np.complex128).ravel()
+        return np.ldexp(uv - self.centre, -self._exponent).view(np.complex128).ravel()
 
     def outward(self, w: ComplexArray) -> FloatArray:
         """Complex numbers of the frame (n,) as positions; (n, 2) float64."""
-        unit = np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
-        return unit * self._half_scale[0] * self._half_scale[1] + self.centre
+        return np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent) + self.centre
 
 
 def _real(name: str, values: ArrayLike) -> FloatArray:

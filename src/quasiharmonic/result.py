@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .certificate import Certificate
+from quasiharmonic.certificate import Certificate
 
 
 class Status(Enum):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args, get_type_hints
 
-from .mesh.reference import Reference
-from .problem import Problem
+from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.problem import Problem
 
 # Long steps unfold a map in few iterations, short ones get through where it is tight. Chosen on letters and
 # on random pairs of surface and outline.
@@ -21,6 +22,8 @@ class Descent:
 
     Attributes
     ----------
+    optimizer : {"vector-adam", "l-bfgs", "newton", "alternating"}
+        The last two descend V₃ whatever the functional (§9.2, §F.2).
     parameterization : {"tanh", "si-log"}
         How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
     functional : {"dirichlet", "neumann", "sobolev", "poisson"}
@@ -30,27 +33,90 @@ class Descent:
     iterations : int
         Steps to take at most.
     schedule : sequence of (int, float)
-        Step lengths at given iterations, linear in between and constant after the last.
+        VectorAdam's step lengths at given iterations, linear in between and constant after the last. Empty
+        for those that suit the parameterisation.
+    resume : bool
+        Start from the best map so far instead of ξ = 0.
+
+    Raises
+    ------
+    ValueError
+        When a word is none of those above.
     """
 
-    parameterization: str = "tanh"
-    functional: str = "dirichlet"
+    optimizer: Literal["vector-adam", "l-bfgs", "newton", "alternating"] = "vector-adam"
+    parameterization: Literal["tanh", "si-log"] = "tanh"
+    functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
     reference: Reference = "equilateral"
     iterations: int = 1000
-    schedule: Sequence[tuple[int, float]] = TANH_STEPS
+    schedule: Sequence[tuple[int, float]] = ()
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        for name, hint in get_type_hints(Descent).items():
+            words, given = get_args(hint), getattr(self, name)
+            if words and all(isinstance(word, str) for word in words) and given not in words:
+                raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
+        if self.iterations < 1:
+            raise ValueError(f"iterations must be at least 1, not {self.iterations}")
 
     @property
     def name(self) -> str:
         """How reports call it."""
-        return f"vector-adam, {self.functional}, {self.parameterization}"
+        words = [self.optimizer, self.parameterization]
+        if self.optimizer in ("vector-adam", "l-bfgs"):
+            words.append(self.functional)
+        return ", ".join(words)
+
+    @property
+    def steps(self) -> Sequence[tuple[int, float]]:
+        """VectorAdam's step lengths."""
+        return self.schedule or (TANH_STEPS if self.parameterization == "tanh" else SI_LOG_STEPS)
 
 
-def default_strategy(problem: Problem) -> list[Descent]:
-    """The stages for a problem, the first of which usually suffices.
+def speed(problem: Problem) -> list[Descent]:
+    """The stages that find a map soonest, the first of which usually suffices.
 
     Boundaries alone want tanh, pins want si-log: the spike that a pinned point draws needs distortion that
-    grows slowly towards it, and tanh never gets there.
+    grows slowly towards it, and tanh never gets there. Newton rights the last few triangles where short Adam
+    steps would take hundreds.
     """
-    tanh = Descent("tanh", schedule=TANH_STEPS)
-    si_log = Descent("si-log", schedule=SI_LOG_STEPS)
-    return [si_log, tanh] if problem.pins.size else [tanh, si_log]
+    tanh = [
+        Descent(iterations=100),
+        Descent("newton", iterations=60, resume=True),
+        Descent(schedule=((0, 0.05), (200, 0.01)), resume=True),
+    ]
+    si_log = [
+        Descent(parameterization="si-log", iterations=1000),
+        Descent("newton", parameterization="si-log", iterations=60, resume=True),
+    ]
+    return si_log + tanh if problem.pins.size else tanh + si_log
+
+
+def quality(problem: Problem) -> list[Descent]:
+    """The stages that keep angles: si-log on the rest mesh's own triangles, then whatever finds a map (§10.1)."""
+    return [
+        Descent(parameterization="si-log", reference="corrected", iterations=1000),
+        Descent("newton", parameterization="si-log", reference="corrected", iterations=60, resume=True),
+        *speed(problem),
+    ]
+
+
+STRATEGIES = {"speed": speed, "quality": quality}
+
+
+def stages_of(strategy: str | Sequence[Descent], problem: Problem) -> Sequence[Descent]:
+    """The stages that a strategy's name, or the user's own list, stands for.
+
+    Raises
+    ------
+    ValueError
+        When there is no such strategy.
+    """
+    if isinstance(strategy, str):
+        if strategy not in STRATEGIES:
+            raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+        return STRATEGIES[strategy](problem)
+    if not strategy:
+        raise ValueError("the strategy has no stages")
+    return strategy

@@ -30,17 +30,30 @@ class Parameterization:
         Largest ``|ξ|`` at which the tensor, rounded to doubles, is still safely positive definite.
     radial : callable
         ``ρ ↦ (r/ρ, 1 − r², r')`` elementwise, each in its limit at ρ = 0.
+    inverse : callable
+        ``r ↦ ρ`` elementwise.
+    bend : callable
+        ``ρ ↦ r''`` elementwise.
     """
 
     name: str
     bound: float
     radial: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+    inverse: Callable[[FloatArray], FloatArray]
+    bend: Callable[[FloatArray], FloatArray]
 
     def field(self, xi: ComplexArray) -> TensorField:
         """The tensor field of ``xi`` (f,) complex128."""
         rho = np.sqrt(xi.real**2 + xi.imag**2)
         ratio, defect, slope = self.radial(rho)
         return TensorField(xi, rho, ratio * xi, ratio, defect, slope)
+
+    def invert(self, mu: ComplexArray) -> ComplexArray:
+        """The ξ of Beltrami coefficients, clipped where ``|μ| ≥ 1`` or ξ would exceed the bound; (f,) complex128."""
+        modulus = np.sqrt(mu.real**2 + mu.imag**2)
+        safe = np.where(modulus > 0, modulus, 1.0)
+        rho = self.inverse(np.minimum(modulus, np.nextafter(1.0, 0.0)))
+        return np.minimum(rho, self.bound) / safe * mu
 
 
 @dataclass(frozen=True)
@@ -116,8 +129,23 @@ def _si_log(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return ratio, omega * (2.0 - omega), omega**2 / (1.0 + rho)
 
 
+def _bend_tanh(rho: FloatArray) -> FloatArray:
+    return -2.0 * np.tanh(rho) * _tanh(rho)[1]
+
+
+def _bend_si_log(rho: FloatArray) -> FloatArray:
+    omega = 1.0 / (1.0 + np.log1p(rho))
+    return -((omega / (1.0 + rho)) ** 2) * (1.0 + 2.0 * omega)
+
+
+def _invert_si_log(r: FloatArray) -> FloatArray:
+    # The largest r below 1 would ask for a ρ of e^(2⁵³).
+    with np.errstate(over="ignore"):
+        return np.expm1(r / (1.0 - r))
+
+
 # The eigenvalues of 𝒜 are e^{±2ρ} for tanh, and its entries are rounded at e^{2ρ} · 1e-16: beyond ρ = 9 the
 # smaller eigenvalue drowns. si-log comes nowhere near; its bound keeps |ξ|² finite.
-TANH = Parameterization("tanh", 8.8, _tanh)
-SI_LOG = Parameterization("si-log", 1e150, _si_log)
+TANH = Parameterization("tanh", 8.8, _tanh, np.arctanh, _bend_tanh)
+SI_LOG = Parameterization("si-log", 1e150, _si_log, _invert_si_log, _bend_si_log)
 PARAMETERIZATIONS = {p.name: p for p in (TANH, SI_LOG)}

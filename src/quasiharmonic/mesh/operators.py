@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, vstack
 
-from .reference import Reference, ReferenceMesh
-from .topology import boundary_edges
+from quasiharmonic.mesh.reference import Reference, ReferenceMesh
+from quasiharmonic.mesh.topology import boundary_edges
 
 FloatArray = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ arrives at, ``start`` excepted, until it has done its iterations or ``visit`` ra
 
 from __future__ import annotations
 
-from ..result import Status
+from quasiharmonic.result import Status
 
 
 class Stop(Exception):  # noqa: N818 - a signal, not an error

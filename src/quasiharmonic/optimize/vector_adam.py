@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..objective import Iterate, Objective
+from quasiharmonic.objective import Iterate, Objective
 
 # Less momentum than Adam's usual 0.9 / 0.999 is the largest single gain: the landscape changes as fast as
 # the map unfolds, and old gradients point to where the folds were.

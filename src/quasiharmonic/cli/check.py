@@ -1,0 +1,53 @@
+"""``qhm check``: judge any map in a file, exactly."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "check",
+        help="judge a map: every triangle positive? no overlap?",
+        description="Judge a planar map exactly: the texture coordinates (vt) of an OBJ file whose faces refer to "
+        "them, else the first two coordinates of its vertices.",
+        epilog="Exit status: 0 injective (every triangle strictly positive); 1 not; 2 the file cannot be judged.",
+    )
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ or OFF file")
+    parser.add_argument(
+        "--as", dest="precision", choices=("float64", "float32"), default="float64",
+        help="judge the positions as a reader in this precision sees them (default: float64)",
+    )
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, judge, report."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.certificate import certify
+
+    from . import report
+
+    if report.is_file(options.json):
+        io.check_writable(options.json)
+    mesh = io.read_mesh(options.input)
+    uv = io.map_of(mesh)
+    if options.precision == "float32":
+        with np.errstate(over="ignore"):
+            uv = uv.astype(np.float32)
+    certificate = certify(mesh.F, uv)
+    facts = {**report.verdict(certificate), "input": str(options.input), "precision": options.precision,
+             "triangles": len(mesh.F)}
+    report.emit(facts, options.json, f"{options.input}: {certificate.summary()}")
+    return 0 if certificate.injective else 1

@@ -1,0 +1,288 @@
+"""`injective_map` from end to end: its verdicts, its promises, and what it does when there is no map."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from meshes import bend, boundary_of, lift, signed_areas
+
+import quasiharmonic
+import quasiharmonic.linsolve
+from quasiharmonic import Descent, Problem, Status, injective_map, solve
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+
+
+def inverted(F, uv):
+    """An independent count, in rational numbers."""
+    count = 0
+    for i, j, k in F:
+        (ax, ay), (bx, by), (cx, cy) = ((Fraction(x), Fraction(y)) for x, y in uv[[i, j, k]])
+        count += (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) <= 0
+    return count
+
+
+def star_problem(depth=0.55, points=5, n=300, seed=0):
+    """An irregular disk onto a star, whose Tutte embedding has flips."""
+    V, F = random_delaunay(n, seed=seed)
+    (loop,) = boundary_loops(F, len(V))
+    angle = np.linspace(0, 2 * np.pi, len(loop), endpoint=False)
+    corner = np.abs((angle * points / np.pi) % 2 - 1)
+    radius = depth + (1 - depth) * corner
+    return lift(V), F, loop, radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def turned_ring(degrees, cells=12):
+    """A square annulus whose hole is turned, Figure 6."""
+    V, F = annulus(cells)
+    fixed = boundary_of(F)
+    target = V[fixed].copy()
+    inner = np.abs(target).max(axis=1) < 0.75
+    target[inner] = (target[inner].view(complex) * np.exp(1j * np.deg2rad(degrees))).view(float).reshape(-1, 2)
+    return V, F, fixed, target
+
+
+class TestFinds:
+    def test_star(self):
+        V, F, fixed, target = star_problem()
+        result = injective_map(V, F, fixed, target)
+        assert result.status is Status.INJECTIVE
+        assert result.injective
+        assert result.certificate.bijective
+        assert inverted(F, result.uv) == 0
+        np.testing.assert_array_equal(result.uv[fixed], target)
+        assert result.history[0].flipped > 0
+        assert result.history[-1].flipped == 0
+        assert result.iterations == len(result.history) - 1 == sum(s.iterations for s in result.stages)
+        assert result.linear_solver in quasiharmonic.linsolve.available()
+
+    @pytest.mark.parametrize("degrees", [90, 180, -135])
+    def test_turned_rings(self, degrees):
+        V, F, fixed, target = turned_ring(degrees)
+        result = injective_map(V, F, fixed, target)
+        assert result.injective
+        assert result.certificate.bijective
+        assert inverted(F, result.uv) == 0
+
+    def test_two_pins_swapped(self):
+        """Figure 17: without being told which parameterisation to take."""
+        V, F = grid(20, 20)
+        pins = [int(np.argmin(((V - p) ** 2).sum(axis=1))) for p in ((1 / 3, 0.5), (2 / 3, 0.5))]
+        fixed = np.append(boundary_of(F), pins)
+        target = np.vstack([V[boundary_of(F)], V[pins[::-1]]])
+        result = injective_map(V, F, fixed, target)
+        assert result.injective
+        np.testing.assert_array_equal(result.uv[pins], V[pins[::-1]])
+        assert inverted(F, result.uv) == 0
+
+    def test_locally_injective_where_the_target_crosses_itself(self):
+        """A spiral strip that overlaps itself: every triangle positive, not bijective."""
+        V, F = grid(60, 3)
+        angle, radius = 2 * np.pi * 1.4 * V[:, 0], 2 - 0.8 * V[:, 1]
+        spiral = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        fixed = boundary_of(F)
+        result = injective_map(V, F, fixed, spiral[fixed])
+        assert result.injective
+        assert result.certificate.bijective is False
+
+    def test_feasible_by_construction(self):
+        for seed in range(3):
+            V, F = random_delaunay(200, seed=seed)
+            fixed = boundary_of(F)
+            assert injective_map(lift(V), F, fixed, bend(V[fixed])).injective
+
+
+class TestTheory:
+    def test_tutte_needs_no_iteration(self):
+        """Equilateral triangles onto a convex target: positive weights, Tutte's theorem."""
+        V, F = disk(8)
+        fixed = boundary_of(F)
+        target = V[fixed] / np.abs(V[fixed]).sum(axis=1, keepdims=True)
+        turned = np.vstack([target, target])[: len(target)]
+        result = injective_map(lift(V), F, fixed, turned * [3.0, 0.5])
+        assert result.injective
+        assert result.iterations == 0
+
+    def test_own_boundary_gives_the_identity(self):
+        V, F = random_delaunay(300, seed=1)
+        fixed = boundary_of(F)
+        result = injective_map(V, F, fixed, V[fixed], reference="rest")
+        assert result.iterations == 0
+        np.testing.assert_allclose(result.uv, V, atol=1e-13)
+
+    def test_energy_falls_to_nothing_only_at_injective_maps(self):
+        result = injective_map(*star_problem())
+        energies = [step.energy for step in result.history]
+        assert 0 < energies[-1] < energies[0]
+
+
+class TestPromises:
+    def test_deterministic(self):
+        first, second = (injective_map(*star_problem()) for _ in range(2))
+        np.testing.assert_array_equal(first.uv, second.uv)
+        assert [s.energy for s in first.history] == [s.energy for s in second.history]
+
+    def test_same_from_other_dtypes_and_layouts(self):
+        V, F, fixed, target = star_problem()
+        V, target = V.astype(np.float32), target.astype(np.float32)
+        plain = injective_map(V.astype(float), F, fixed, target.astype(float))
+        strided = np.zeros((2 * len(V), 4), np.float32)
+        strided[::2, 1:] = V
+        other = injective_map(strided[::2, 1:], F.astype(np.uint32), fixed.astype(np.int32), np.asfortranarray(target))
+        np.testing.assert_array_equal(plain.uv, other.uv)
+
+    @pytest.mark.parametrize("scale", [1e-150, 1e-12, 1e12, 1e150])
+    @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
+    def test_scale_of_rest_and_target_do_not_matter(self, scale, reference):
+        V, F, fixed, target = star_problem()
+        plain = injective_map(V, F, fixed, target, reference=reference)
+        for rest, place in ((V * scale, target), (V, target * scale), (V / scale, target * scale)):
+            result = injective_map(rest, F, fixed, place, reference=reference)
+            assert result.injective
+            assert abs(result.iterations - plain.iterations) <= 2
+            np.testing.assert_array_equal(result.uv[fixed], place)
+
+    def test_vertex_order_of_fixed_does_not_matter(self, rng):
+        V, F, fixed, target = star_problem()
+        order = rng.permutation(len(fixed))
+        a, b = injective_map(V, F, fixed, target), injective_map(V, F, fixed[order], target[order])
+        assert abs(a.iterations - b.iterations) <= 1
+        np.testing.assert_allclose(a.uv, b.uv, atol=1e-6)
+
+    def test_tiny_meshes(self):
+        one = injective_map(np.eye(3), [[0, 1, 2]], [0, 1, 2], [[0, 0], [1, 0], [0, 1]])
+        assert one.injective
+        assert one.iterations == 0
+        hub = injective_map([[0, 0], [1, 0], [0, 1], [-1, -1]], [[0, 1, 2], [0, 2, 3], [0, 3, 1]], [1, 2, 3],
+                            [[1, 0], [0, 1], [-1, -1]])  # fmt: skip
+        assert hub.injective
+
+    def test_large_offset(self):
+        V, F, fixed, target = star_problem()
+        result = injective_map(V, F, fixed, target + 1e8)
+        assert result.injective
+        assert inverted(F, result.uv) == 0
+
+    def test_callback_sees_every_step_and_strategy_can_be_spelled_out(self):
+        seen = []
+        stages = [Descent("l-bfgs", "si-log", "neumann", "rest"), Descent("newton", resume=True)]
+        result = injective_map(*star_problem(), strategy=stages, callback=seen.append)
+        assert seen == result.history
+        assert result.injective
+        assert result.stages[0].name == "l-bfgs, si-log, neumann"
+
+
+class TestNoMap:
+    def test_wrong_winding(self):
+        V, F, fixed, target = star_problem(n=80)
+        result = injective_map(V, F, fixed, target * [1, -1], max_iterations=30)
+        assert not result.injective
+        assert result.status is not Status.INJECTIVE
+        assert np.all(np.isfinite(result.uv))
+        assert len(result.certificate.flipped) > 0
+        np.testing.assert_array_equal(result.uv[fixed], target * [1, -1])
+
+    def test_all_in_one_point(self):
+        V, F, fixed, target = star_problem(n=80)
+        result = injective_map(V, F, fixed, np.zeros_like(target), max_iterations=5)
+        assert result.certificate.degenerate.size == len(F)
+        assert not result.injective
+
+    def test_settles_at_a_positive_energy(self):
+        """Two pins of one triangle swapped so that it is inverted whatever the others do."""
+        V, F = random_delaunay(80, seed=3)
+        rim = boundary_of(F)
+        inner = next(t for t in F if not np.isin(t, rim).any())
+        result = injective_map(
+            V, F, np.append(rim, inner), np.vstack([V[rim], V[inner[[1, 0, 2]]]]), max_iterations=3000
+        )
+        assert result.status is Status.SETTLED
+        assert result.history[-1].energy > 1e-3
+        assert all(stage.kept or stage.flipped[0] == stage.flipped[1] for stage in result.stages)
+
+    def test_out_of_iterations(self):
+        result = injective_map(*turned_ring(180), max_iterations=3)
+        assert result.status is Status.OUT_OF_ITERATIONS
+        assert result.iterations == 3
+        assert "more iterations" in result.status.value
+
+    def test_interrupted(self):
+        def interrupt(step):
+            if step.iteration == 4:
+                raise KeyboardInterrupt
+
+        result = injective_map(*turned_ring(180), callback=interrupt)
+        assert result.status is Status.INTERRUPTED
+        flips = [signed_areas(turned_ring(180)[1], result.uv) <= 0]
+        assert np.sum(flips) == min(step.flipped for step in result.history)
+
+    def test_offset_beyond_the_doubles(self):
+        """At an offset of 1e15 sizes no double lies between the boundary's points."""
+        V, F, fixed, target = star_problem(n=2000)
+        target = target + 1e15
+        result = injective_map(V, F, fixed, target, max_iterations=40)
+        assert not result.injective
+        assert result.status is not Status.INJECTIVE
+        np.testing.assert_array_equal(result.uv[fixed], target)
+
+
+class TestLinearSolver:
+    def test_unknown_name(self):
+        with pytest.raises(ValueError, match="superlu"):
+            injective_map(*star_problem(n=60), linear_solver="magic")
+
+    @pytest.mark.parametrize("name", ["superlu", "qdldl"])
+    def test_named_one_is_used_and_agrees(self, name):
+        best, other = injective_map(*star_problem()), injective_map(*star_problem(), linear_solver=name)
+        assert other.linear_solver == name
+        assert other.injective
+        np.testing.assert_allclose(best.uv, other.uv, atol=1e-6)
+
+    def test_indefinite_matrix_shortens_the_step(self, monkeypatch):
+        problem = Problem(*star_problem())
+        solver = problem.laplacian().solver
+        factor, calls = solver.factor, []
+
+        def fail_twice(values):
+            calls.append(1)
+            if len(calls) in (3, 4):
+                raise NotPositiveDefinite("as asked")
+            factor(values)
+
+        monkeypatch.setattr(solver, "factor", fail_twice, raising=False)
+        assert solve(problem).injective
+
+    def test_indefinite_for_good_is_a_status(self, monkeypatch):
+        problem = Problem(*star_problem())
+        factor, calls = problem.laplacian().solver.factor, []
+
+        def fail(values):
+            calls.append(1)
+            if len(calls) > 2:
+                raise NotPositiveDefinite("as asked")
+            factor(values)
+
+        monkeypatch.setattr(problem.laplacian().solver, "factor", fail, raising=False)
+        result = solve(problem)
+        assert result.status is Status.UNSOLVABLE
+        assert result.history[0].flipped == result.stages[0].flipped[1] or result.stages[0].flipped[1] < 300
+
+
+def test_second_solve_of_a_moved_problem_agrees_with_a_fresh_one():
+    V, F, fixed, target = star_problem()
+    problem = Problem(V, F, fixed, target)
+    solve(problem)
+    again = solve(problem.moved(target[:, ::-1] * [1, -1]))
+    fresh = injective_map(V, F, fixed, target[:, ::-1] * [1, -1])
+    np.testing.assert_array_equal(again.uv, fresh.uv)
+
+
+def test_public_names_are_lazy_and_complete():
+    for name in quasiharmonic.__all__:
+        assert getattr(quasiharmonic, name) is not None
+    assert set(quasiharmonic.__all__) <= set(dir(quasiharmonic))
+    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+        quasiharmonic.magic  # noqa: B018

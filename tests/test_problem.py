@@ -1,0 +1,170 @@
+"""What `Problem` refuses, with what words; and what it accepts as given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from meshes import boundary_of
+
+from quasiharmonic import Problem
+from quasiharmonic.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.surfaces import annulus, grid, random_delaunay
+
+V, F = random_delaunay(60, seed=2)
+RIM = boundary_of(F)
+TARGET = V[RIM]
+
+
+def posed(V=V, F=F, fixed=RIM, target=TARGET, **more):
+    return Problem(V, F, fixed, target, **more)
+
+
+def changed(array, index, value):
+    array = np.array(array)
+    array[index] = value
+    return array
+
+
+TWO_TRIANGLES = np.array([[0, 1, 2], [3, 4, 5]])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"V": changed(V, (7, 1), np.nan)}, "V is not finite at vertex 7"),
+        ({"V": changed(V, ([3, 9], 0), np.inf)}, "V is not finite at vertices 3, 9"),
+        ({"V": V[:, :1]}, r"V must have shape \(n, 2\) or \(n, 3\)"),
+        ({"V": V[0]}, "V must have shape"),
+        ({"V": V.astype(complex)}, "V must hold real numbers"),
+        ({"V": V.astype(str)}, "V must hold real numbers"),
+        ({"F": np.zeros((0, 3), int)}, "the mesh has no triangles"),
+        ({"F": []}, "the mesh has no triangles"),
+        ({"V": np.zeros((0, 2)), "F": []}, "the mesh has no triangles"),
+        ({"F": F[:, :2]}, r"F must have shape \(f, 3\)"),
+        ({"F": F.astype(float)}, "F must hold integer"),
+        ({"F": changed(F, (5, 0), len(V))}, rf"F refers to vertex {len(V)}, but there are only {len(V)} "),
+        ({"F": changed(F, (5, 0), -1)}, "F refers to vertex -1"),
+        ({"F": changed(F, (5, 0), F[5, 1])}, "triangle 5: a vertex is used twice"),
+        ({"F": np.vstack([F, F[4]])}, f"triangle {len(F)} repeated"),
+        ({"F": np.vstack([F, np.roll(F[4], 1)[::-1]])}, f"triangle {len(F)} repeated"),
+        ({"F": np.vstack([F, [F[0, 0], F[0, 1], RIM[0]]])}, r"edge \(\d+, \d+\) in more than two triangles"),
+        ({"F": changed(F, 8, F[8][::-1])}, r"mixed winding: edges \(\d+, \d+\)"),
+        ({"V": np.vstack([V, [[5, 5]]])}, f"vertex {len(V)}: no triangle uses them"),
+        (
+            {"V": np.eye(6)[:, :2] + np.arange(12).reshape(6, 2) % 5, "F": TWO_TRIANGLES, "fixed": range(6),
+             "target": np.zeros((6, 2))},
+            "2 components, the first ones around vertices 0, 3: map them one at a time",
+        ),
+        (
+            {"V": np.eye(4)[:, :3], "F": [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], "fixed": [], "target": []},
+            "closed: it has no boundary",
+        ),
+        ({"fixed": RIM[1:], "target": TARGET[1:]}, f"boundary vertex {RIM[0]} not in fixed"),
+        ({"fixed": [], "target": np.zeros((0, 2))}, rf"\({len(RIM)} in all\) not in fixed"),
+        ({"fixed": np.append(RIM, RIM[2]), "target": np.vstack([TARGET, TARGET[2]])}, f"vertex {RIM[2]} fixed more than"),
+        ({"fixed": changed(RIM, 0, 999)}, "fixed refers to vertex 999"),
+        ({"fixed": changed(RIM, 0, -3)}, "fixed refers to vertex -3"),
+        ({"fixed": RIM.astype(float)}, "fixed must hold integer"),
+        ({"fixed": RIM[None]}, r"fixed must have shape \(k,\)"),
+        ({"target": TARGET[:-1]}, rf"target must have shape \({len(RIM)}, 2\)"),
+        ({"target": changed(TARGET, (3, 0), np.nan)}, "target is not finite at row 3"),
+        ({"V": changed(V, F[3, 0], V[F[3, 1]])}, "zero area in the rest mesh; pass reference='equilateral'"),
+        ({"V": changed(V, F[3, 0], V[F[3, 1]]), "reference": "rest"}, "zero area"),
+        ({"reference": "square"}, "reference must be one of equilateral, rest, corrected"),
+    ],
+)  # fmt: skip
+def test_malformed_input_is_named(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        posed(**arguments)
+
+
+def test_touching_fans_are_refused():
+    """A bow-tie: two triangles that share a vertex only."""
+    with pytest.raises(ValueError, match="boundary passes more than once through vertex 2"):
+        Problem(np.arange(10.0).reshape(5, 2) ** 2, [[0, 1, 2], [2, 3, 4]], range(5), np.zeros((5, 2)))
+
+
+def test_flat_triangles_are_accepted_on_the_callers_word():
+    flat = changed(V, F[3, 0], V[F[3, 1]])
+    for reference in ("equilateral", "corrected"):
+        assert posed(V=flat, reference=reference).reference == reference
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.longdouble, np.int32, np.uint8])
+@pytest.mark.parametrize("index", [np.int8, np.uint16, np.int32, np.uint64])
+def test_any_dtype_and_layout_is_accepted_and_nothing_modified(dtype, index):
+    V, F = grid(3, 3)
+    V = np.asfortranarray((9 * V).astype(dtype))
+    F, rim = F.astype(index), boundary_of(F).astype(index)
+    target = np.repeat(V[rim], 2, axis=0)[::2]
+    copies = [a.copy() for a in (V, F, rim, target)]
+    for array in (V, F, rim, target):
+        array.flags.writeable = False
+    problem = Problem(V, F, rim, target)
+    for name, kind in (("V", np.float64), ("F", np.int64), ("fixed", np.int64), ("target", np.float64)):
+        assert getattr(problem, name).dtype == kind
+    for before, after in zip(copies, (V, F, rim, target), strict=True):
+        np.testing.assert_array_equal(before, after)
+    np.testing.assert_array_equal(problem.F, F)
+
+
+def test_moved_shares_the_factorisation_and_checks_the_target():
+    problem = posed()
+    moved = problem.moved(2 * TARGET)
+    assert moved.laplacian() is problem.laplacian()
+    assert moved.mesh("rest") is problem.mesh("rest")
+    np.testing.assert_array_equal(moved.target, 2 * TARGET)
+    np.testing.assert_array_equal(problem.target, TARGET)
+    with pytest.raises(ValueError, match="target is not finite"):
+        problem.moved(np.full_like(TARGET, np.nan))
+
+
+@pytest.mark.parametrize("scale", [5e-324, 1e-300, 1e-150, 1.0, 1e150, 1e300, 1.7e308])
+def test_the_frame_is_of_unit_size_and_returns_what_it_took(scale, rng):
+    target = rng.uniform(-1, 1, TARGET.shape) * scale
+    frame = posed(target=target).frame
+    w = frame.inward(target)
+    assert np.all(np.isfinite(w.view(float)))
+    assert 0.2 < np.abs(w).max() <= 2 or scale < 1e-320
+    np.testing.assert_allclose(frame.outward(w), target, rtol=1e-15, atol=scale * 1e-15)
+
+
+def test_pins_and_loops():
+    V, F = annulus(6)
+    rim = boundary_of(F)
+    inner = np.setdiff1d(np.arange(len(V)), rim)
+    problem = Problem(V, F, np.append(rim, inner[3]), np.vstack([V[rim], V[inner[3]]]))
+    np.testing.assert_array_equal(problem.pins, inner[3:4])
+    assert sorted(map(len, problem.loops)) == [12, 28]
+
+
+class TestTopology:
+    def test_kinds_of_edges(self):
+        found = edges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [2, 1, 5], [5, 6, 4]]), 7)
+        assert found.nonmanifold.tolist() == [[0, 1]]
+        assert found.interior.tolist() == [[1, 2]]
+        assert found.inconsistent.tolist() == []
+        assert [0, 3] in found.boundary.tolist()
+        assert [2, 0] in found.boundary.tolist()
+        assert edges(np.array([[0, 1, 2], [0, 1, 3]]), 4).inconsistent.tolist() == [[0, 1]]
+
+    def test_loops_keep_the_surface_to_their_left(self):
+        V, F = annulus(6)
+        areas = []
+        for loop in boundary_loops(F, len(V)):
+            x, y = V[loop].T
+            areas.append((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
+        assert sorted(areas) == pytest.approx([-1, 4])
+
+    def test_against_brute_force(self, rng):
+        V, F = random_delaunay(200, seed=5)
+        half = [(int(a), int(b)) for t in F for a, b in zip(t, np.roll(t, -1), strict=True)]
+        single = {(a, b) for a, b in half if (b, a) not in set(half)}
+        found = edges(F[rng.permutation(len(F))], len(V))
+        assert {tuple(e) for e in found.boundary.tolist()} == single
+        assert len(found.interior) * 2 + len(single) == len(half)
+
+    def test_components(self):
+        labels = components(TWO_TRIANGLES, 7)
+        assert len(set(labels[:3])) == len(set(labels[3:6])) == 1
+        assert len(set(labels)) == 3
