@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .certificate import Certificate, certify, flipped_triangles, is_injective
-    from .inject import injective_map, solve
+    from .inject import injective_map, quasi_harmonic_map, solve
     from .problem import Problem
     from .result import MapResult, Stage, Status, Step
     from .strategy import Descent
@@ -29,6 +29,7 @@ _HOME = {
     "flipped_triangles": "certificate",
     "injective_map": "inject",
     "is_injective": "certificate",
+    "quasi_harmonic_map": "inject",
     "solve": "inject",
 }
 
@@ -44,6 +45,7 @@ __all__ = [
     "flipped_triangles",
     "injective_map",
     "is_injective",
+    "quasi_harmonic_map",
     "solve",
 ]
 

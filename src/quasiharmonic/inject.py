@@ -121,7 +121,7 @@ def solve(
     began = time.perf_counter() if _began is None else _began
     search = _Search(problem, linear_solver, callback, max_iterations)
     status = search.run(stages_of(strategy, problem))
-    uv = search.positions(search.best_map)
+    uv = _positions(problem, search.best_map)
     certificate = certify(problem.F, uv)
     return MapResult(
         uv=uv,
@@ -133,6 +133,39 @@ def solve(
         seconds=time.perf_counter() - began,
         xi=search.best_xi,
     )
+
+
+def quasi_harmonic_map(problem: Problem, xi: ComplexArray | None = None, *, linear_solver: str = "auto") -> FloatArray:
+    """The map of a tensor field (eq. 12): Tutte's embedding where no field is given.
+
+    Parameters
+    ----------
+    problem : Problem
+    xi : (f,) complex128, optional
+        The field, in the tanh parameterisation; zero by default.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+
+    Returns
+    -------
+    (n, 2) float64
+        Positions, the fixed vertices exactly at their target. Injective only where the target is convex
+        or ξ is right.
+
+    Raises
+    ------
+    quasiharmonic.linsolve.NotPositiveDefinite
+        When rounding leaves no positive definite Laplacian.
+    """
+    start = np.zeros(len(problem.F), dtype=np.complex128) if xi is None else xi
+    return _positions(problem, Objective(problem, linear_solver=linear_solver).evaluate(start).w)
+
+
+def _positions(problem: Problem, w: ComplexArray) -> FloatArray:
+    """A map of the problem's frame as the caller gets it, the fixed vertices to the last bit."""
+    uv = problem.frame.outward(w)
+    uv[problem.fixed] = problem.target
+    return uv
 
 
 _Visit = Callable[[Iterate], None]
@@ -178,12 +211,6 @@ class _Search:
         except KeyboardInterrupt:
             return Status.INTERRUPTED
         return Status.ROUNDED if self._rounded and status is not Status.INJECTIVE else status
-
-    def positions(self, w: ComplexArray) -> FloatArray:
-        """A map of the frame as the caller gets it, the fixed vertices to the last bit."""
-        uv = self.problem.frame.outward(w)
-        uv[self.problem.fixed] = self.problem.target
-        return uv
 
     @property
     def _left(self) -> int:
@@ -239,7 +266,7 @@ class _Search:
         flipped = here.flipped
         if flipped == 0:
             # Decided on the coordinates that are handed back, not on the solver's own.
-            flipped = flipped_triangles(self.problem.F, self.positions(here.w)).size
+            flipped = flipped_triangles(self.problem.F, _positions(self.problem, here.w)).size
             self._rounded |= flipped > 0
         step = Step(len(self.history), flipped, here.energy)
         self.history.append(step)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,8 @@ class Stage:
             "iterations": self.iterations,
             "seconds": self.seconds,
             "flipped": list(self.flipped),
-            "energy": list(self.energy),
+            # JSON has no infinity: before the first stage there is no energy.
+            "energy": [e if isfinite(e) else None for e in self.energy],
             "kept": self.kept,
         }
 

@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
 
     from . import report
 
-    if report.is_file(options.json):
+    if options.json not in (None, "-"):
         io.check_writable(options.json)
     mesh = io.read_mesh(options.input)
     uv = io.map_of(mesh)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from quasiharmonic.certificate import Certificate
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.io import MeshData
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.result import MapResult
 
 
 def add_parser(commands: Commands) -> None:
@@ -33,6 +37,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the rest surface, the start and the map")
     arguments.add_report(parser)
     solver = parser.add_argument_group("how it is solved")
+    solver.add_argument(
+        "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
+    )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.positive, default=2000, metavar="N")
     solver.add_argument(
@@ -44,40 +51,71 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
-    from quasiharmonic.certificate import certify
-    from quasiharmonic.inject import solve
     from quasiharmonic.problem import Problem
 
-    from . import progress, report
+    from . import report
 
     began = time.perf_counter()
     io.check_output(options.output)
-    for extra in (options.plot, *([options.json] if report.is_file(options.json) else [])):
-        if extra is not None:
-            io.check_writable(extra)
-    mesh, arrays = io.read_mesh_problem(options.input, options.fixed)
-    problem = Problem(*arrays, reference=options.reference)
-    with progress.line() as show:
-        result = solve(
-            problem, max_iterations=options.max_iterations, linear_solver=options.linear_solver, callback=show
-        )
-    io.write_map(options.output, mesh, result.uv)
-    # The verdict is on the file as a reader gets it.
-    written = io.read_mesh(options.output)
-    certificate = certify(written.F, io.map_of(written))
-    facts: dict[str, Any] = {
+    for other in (options.plot, None if options.json == "-" else options.json):
+        if other is not None:
+            io.check_writable(other)
+    mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
+    mesh = io.read_mesh(mesh_path)
+    fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
+    problem = Problem(*io.problem_arrays(mesh, fixed), reference=options.reference)
+    result = search(problem, options.strategy, options.max_iterations, options.linear_solver)
+    certificate = write(options.output, mesh, result)
+    if options.plot is not None:
+        draw(options.plot, problem, result, certificate)
+    facts = {
         **result.to_dict(),
         **report.verdict(certificate),
+        **report.sizes(problem),
         "input": str(options.input),
         "output": str(options.output),
-        "vertices": problem.n,
-        "triangles": len(problem.F),
-        "fixed": len(problem.fixed),
+        "seconds_in_all": time.perf_counter() - began,
     }
-    if options.plot is not None:
-        from quasiharmonic.plot import save_map_figure
-
-        save_map_figure(options.plot, problem, result.uv)
-    facts["seconds_in_all"] = time.perf_counter() - began
     report.emit(facts, options.json, report.of_map(result, certificate, options.output))
     return 0 if certificate.injective else 1
+
+
+def search(problem: Problem, strategy: str, max_iterations: int, linear_solver: str) -> MapResult:
+    """Solve with progress on the terminal."""
+    from quasiharmonic.inject import solve
+
+    from . import progress
+
+    with progress.line() as show:
+        return solve(
+            problem, strategy=strategy, max_iterations=max_iterations, linear_solver=linear_solver, callback=show
+        )
+
+
+def write(output: Path, mesh: MeshData, result: MapResult) -> Certificate:
+    """Write a map and judge the file as a reader gets it."""
+    from quasiharmonic import io
+    from quasiharmonic.certificate import certify
+
+    io.write_map(output, mesh, result.uv)
+    written = io.read_mesh(output)
+    return certify(written.F, io.map_of(written))
+
+
+def draw(path: Path, problem: Problem, result: MapResult, certificate: Certificate) -> None:
+    """Draw the rest surface, Tutte's embedding and the map."""
+    import numpy as np
+
+    from quasiharmonic.inject import quasi_harmonic_map
+    from quasiharmonic.plot import save_map_figure
+
+    inverted = np.concatenate([certificate.flipped, certificate.degenerate])
+    save_map_figure(
+        path,
+        problem.V,
+        problem.F,
+        result.uv,
+        quasi_harmonic_map(problem, linear_solver=result.linear_solver),
+        flipped=inverted,
+        fixed=problem.fixed,
+    )

@@ -9,12 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quasiharmonic.certificate import Certificate
+    from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
-
-
-def is_file(destination: str | None) -> bool:
-    """Whether ``--json`` names a file."""
-    return destination is not None and destination != "-"
 
 
 def verdict(certificate: Certificate) -> dict[str, Any]:
@@ -26,6 +22,11 @@ def verdict(certificate: Certificate) -> dict[str, Any]:
         "degenerate": [int(t) for t in certificate.degenerate],
         "certificate": certificate.to_dict(),
     }
+
+
+def sizes(problem: Problem) -> dict[str, Any]:
+    """How large a problem is."""
+    return {"vertices": problem.n, "triangles": len(problem.F), "fixed": len(problem.fixed)}
 
 
 def of_map(result: MapResult, certificate: Certificate, output: Path) -> str:

@@ -1,0 +1,239 @@
+"""Exact convex polygons in the plane, and the part of one that sees given points.
+
+All lines here pass through two points of the target, all points are where two such lines meet.
+Both are kept in homogeneous integers, so that every sign is exact and no number grows with the
+length of a computation: a corner is always the meeting point of two of the first lines, however
+often a polygon was cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..predicates import orientation
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Point = tuple[int, int]
+Line = tuple[int, int, int]
+"""``a, b, c``: the point (x, y) lies to the left where ``a x + b y + c > 0``."""
+
+# Coordinates below are at most 1 and rounded once, so that a product of two differences is wrong by
+# less than this; what the filter cannot decide by this margin is decided in integers.
+_MARGIN = 2.0**-48
+
+
+def line(p: Point, q: Point) -> Line:
+    """The line from ``p`` to ``q``, positive to its left."""
+    a, b = p[1] - q[1], q[0] - p[0]
+    return a, b, -(a * p[0] + b * p[1])
+
+
+def reverse(along: Line) -> Line:
+    """The same line, positive on the other side."""
+    a, b, c = along
+    return -a, -b, -c
+
+
+def _meet(first: Line, second: Line) -> Line:
+    """Where two lines meet, in homogeneous coordinates."""
+    a, b, c = first
+    d, e, f = second
+    return b * f - c * e, c * d - a * f, a * e - b * d
+
+
+@dataclass(frozen=True)
+class Convex:
+    """An open convex polygon of positive area.
+
+    Attributes
+    ----------
+    lines : list of Line
+        Its sides in counterclockwise order, the polygon to their left.
+    corners : list of (int, int, int)
+        Homogeneous coordinates of where each side starts, the last one positive.
+    """
+
+    lines: list[Line]
+    corners: list[tuple[int, int, int]]
+
+    @staticmethod
+    def box(low: Point, high: Point) -> Convex:
+        """The axis-parallel rectangle between two points."""
+        (x0, y0), (x1, y1) = low, high
+        corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+        sides = [line(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+        return Convex(sides, [_meet(sides[i - 1], sides[i]) for i in range(4)])
+
+    def cut(self, along: Line) -> Convex | None:
+        """What lies to the left of a line, or None if that has no area."""
+        a, b, c = along
+        sides = [a * x + b * y + c * w for x, y, w in self.corners]
+        if min(sides) >= 0:
+            return self
+        if max(sides) <= 0:
+            return None
+        lines: list[Line] = []
+        corners: list[tuple[int, int, int]] = []
+        for i, here in enumerate(sides):
+            side, after = self.lines[i], sides[i + 1 - len(sides)]
+            if here > 0 or (here == 0 and after > 0):
+                lines.append(side)
+                corners.append(self.corners[i])
+            elif after > 0:
+                lines.append(side)
+                corners.append(_meet(along, side))
+            if here > 0 and after <= 0:
+                lines.append(along)
+                corners.append(self.corners[i + 1 - len(sides)] if after == 0 else _meet(side, along))
+        return Convex(lines, corners)
+
+
+class Lattice:
+    """Positions as integers: the doubles of a target over their smallest unit.
+
+    Parameters
+    ----------
+    positions : (k, 2) float64
+        Finite.
+
+    Attributes
+    ----------
+    points : list of (int, int)
+        The same points, exactly.
+    near : (k, 2) float64
+        The same points, centred and scaled to magnitude one, rounded.
+    """
+
+    def __init__(self, positions: FloatArray) -> None:
+        fraction, exponent = np.frexp(positions)
+        mantissa = np.ldexp(fraction, 53).astype(np.int64)
+        lowest = int(exponent[mantissa != 0].min(initial=np.iinfo(np.int32).max))
+        shift = np.where(mantissa != 0, exponent - lowest, 0)
+        whole = [m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)]
+        self.points: list[Point] = list(zip(whole[::2], whole[1::2], strict=True))
+        xs, ys = whole[::2], whole[1::2]
+        self.low, self.high = (min(xs), min(ys)), (max(xs), max(ys))
+        self._centre = (self.low[0] + self.high[0]) // 2, (self.low[1] + self.high[1]) // 2
+        self._unit = max(self.high[0] - self.low[0], self.high[1] - self.low[1], 1)
+        self.near = self._near([(x, y, 1) for x, y in self.points])
+
+    def _near(self, points: Sequence[tuple[int, int, int]]) -> FloatArray:
+        (cx, cy), unit = self._centre, self._unit
+        # Quotients of integers are rounded once, whatever their size.
+        return np.array([((x - cx * w) / (unit * w), (y - cy * w) / (unit * w)) for x, y, w in points])
+
+    def corners(self, area: Convex) -> FloatArray:
+        """Corners of a polygon in the coordinates of ``near``; (r, 2) float64."""
+        return self._near(area.corners)
+
+
+class Walls:
+    """Segments that block the view, and what can be seen past them.
+
+    Parameters
+    ----------
+    positions : (k, 2) float64
+        Points, finite.
+    ends : (m, 2) int64
+        The segments, as pairs of points.
+    lattice : Lattice
+        The same points as integers.
+    """
+
+    def __init__(self, positions: FloatArray, ends: IntArray, lattice: Lattice) -> None:
+        self._positions, self._ends, self._lattice = positions, ends, lattice
+        corners = lattice.near[ends]
+        self._low, self._high = corners.min(axis=1), corners.max(axis=1)
+
+    def seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
+        """A part of ``area`` from which all ``eyes`` are seen, or None if there is no such point.
+
+        A point sees an eye when the open segment between them meets no wall (walls that lie on the
+        line, or end in the eye, take nothing away from an open set). The area is cut along the
+        shadow of one wall after another, the shadow dropped, and the parts looked at one by one.
+
+        Parameters
+        ----------
+        area : Convex
+            Where to look for points; of positive area.
+        eyes : sequence of int
+            Points to be seen.
+
+        Returns
+        -------
+        Convex or None
+            A polygon of positive area all of which sees every eye.
+        """
+        near = self._lattice.corners(area)
+        waiting = [(area, near, [self._before(eye, near) for eye in eyes])]
+        while waiting:
+            area, near, blocking = waiting.pop()
+            parts = None
+            blocking = list(blocking)
+            for k, eye in enumerate(eyes):
+                parts, blocking[k] = self._split(area, near, eye, blocking[k])
+                if parts is not None:
+                    break
+            if parts is None:
+                return area
+            waiting += [(part, self._lattice.corners(part), blocking) for part in parts]
+        return None
+
+    def _before(self, eye: int, near: FloatArray) -> IntArray:
+        """Walls that may stand between an eye and an area, as (m, 2) seen from right to left."""
+        here = self._lattice.near[eye]
+        low, high = np.minimum(near.min(axis=0), here), np.maximum(near.max(axis=0), here)
+        met = ((self._low <= high + _MARGIN) & (self._high >= low - _MARGIN)).all(axis=1)
+        ends = self._ends[met]
+        side = orientation(self._positions[eye], self._positions[ends[:, 0]], self._positions[ends[:, 1]])
+        ends = np.where((side < 0)[:, None], ends[:, ::-1], ends)
+        return ends[side != 0]
+
+    def _split(
+        self, area: Convex, near: FloatArray, eye: int, walls: IntArray
+    ) -> tuple[list[Convex] | None, IntArray]:
+        """Cut an area at the shadow of one of the walls.
+
+        Returns
+        -------
+        parts : list of Convex or None
+            What the wall leaves to be seen, the most promising last; None when no wall is in the way.
+        walls : (m, 2) int64
+            The walls that may still be in the way of these parts.
+        """
+        points = self._lattice.points
+        here = self._lattice.near[eye]
+        p, q = self._lattice.near[walls].transpose(1, 0, 2)
+        right = _cross(p - here, near - here)
+        left = _cross(q - here, near - here)
+        front = _cross(q - p, near[None] - p[:, None])
+        in_the_way = (
+            (right.max(axis=1, initial=-np.inf) > -_MARGIN)
+            & (left.min(axis=1, initial=np.inf) < _MARGIN)
+            & (front.min(axis=1, initial=np.inf) < _MARGIN)
+        )
+        # The walls that hide most corners first: a wall that hides all ends the search here.
+        hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
+        walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]
+        for k, (i, j) in enumerate(walls.tolist()):
+            first, second = line(points[eye], points[i]), line(points[eye], points[j])
+            across = line(points[i], points[j])
+            beside = area.cut(first)
+            ahead = beside and beside.cut(reverse(second))
+            if ahead is None or ahead.cut(reverse(across)) is None:
+                continue
+            assert beside is not None
+            parts = [area.cut(reverse(first)), beside.cut(second), ahead.cut(across)]
+            return [part for part in parts if part is not None], walls[k + 1 :]
+        return None, walls[:0]
+
+
+def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Cross products of vectors ``u`` (m, 2) with ``v``, (r, 2) or (m, r, 2); (m, r) float64."""
+    product: FloatArray = u[:, :1] * v[..., 1] - u[:, 1:] * v[..., 0]
+    return product

@@ -1,0 +1,268 @@
+"""The curves onto which the boundary goes: where they meet, how they turn, how often they wind.
+
+Everything is decided exactly. It rests on three facts. A map without inverted triangles covers
+every point off its boundary curves as often as they wind around it, so they never wind a negative
+number of times. The exterior angles of its boundary add up to at least 2π times the Euler
+characteristic of the surface, and to exactly that unless the map winds more than once around a
+vertex (count the angles of all triangles in two ways). And where the curves wind at most once
+around every point, such a map is injective.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..predicates import SegmentRelation, box_pairs, orientation, segment_relation
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+SignArray = NDArray[np.int8]
+
+# More meeting pairs than this are not collected: a target that is this entangled needs no full list.
+_MOST_CONTACTS = 10_000
+# Pairs of a point and an edge that `winding` compares at a time.
+_WINDING_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Pairs of segments that meet where they should not.
+
+    Attributes
+    ----------
+    pairs : (c, 2) int64
+        Indices of segments, the smaller first.
+    relation : (c,) int8
+        Values of `SegmentRelation`, none of them DISJOINT.
+    complete : bool
+        False when there are more pairs than were collected.
+    """
+
+    pairs: IntArray
+    relation: SignArray
+    complete: bool
+
+
+def contacts(positions: FloatArray, ends: IntArray) -> Contacts:
+    """Find all segments that have more in common than an end.
+
+    Parameters
+    ----------
+    positions : (n, 2) float64
+        Points; finite where ``ends`` uses them.
+    ends : (m, 2) int64
+        Segments as pairs of points. The same point twice is a point.
+
+    Returns
+    -------
+    Contacts
+        Pairs without a common end that meet, and pairs with one that overlap.
+    """
+    corners = positions[ends]
+    found: list[tuple[IntArray, SignArray]] = []
+    total, complete = 0, True
+    for i, j in box_pairs(corners.min(axis=1), corners.max(axis=1)):
+        relation = segment_relation(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
+        joined = (ends[i][:, :, None] == ends[j][:, None, :]).any(axis=(1, 2))
+        bad = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
+        found.append((np.stack([i, j], axis=1)[bad], relation[bad]))
+        total += int(bad.sum())
+        if total > _MOST_CONTACTS:
+            complete = False
+            break
+    pairs = np.concatenate([np.empty((0, 2), dtype=np.int64), *(p for p, _ in found)])
+    relations = np.concatenate([np.empty(0, dtype=np.int8), *(r for _, r in found)])
+    return Contacts(pairs, relations, complete)
+
+
+def turning_number(loop: FloatArray) -> int:
+    """How often the direction of a closed polygon turns around, counterclockwise.
+
+    A fold, where an edge goes back along the one before, counts as a turn by -π: the only angle
+    between 0 and 2π that triangles can fill there is 2π.
+
+    Parameters
+    ----------
+    loop : (l, 2) float64
+        Corners, no two consecutive ones equal.
+    """
+    after = np.roll(loop, -1, axis=0)
+    # Comparing coordinates is exact, subtracting them is not.
+    # Directions of angle 0 ≤ θ < π are up, the others down; each full turn passes from down to up.
+    up = (after[:, 1] > loop[:, 1]) | ((after[:, 1] == loop[:, 1]) & (after[:, 0] > loop[:, 0]))
+    turn = orientation(loop, after, np.roll(after, -1, axis=0))
+    up_after = np.roll(up, -1)
+    # A turn of zero from one to the other is a fold, and goes to the right.
+    passes = np.where(turn > 0, ~up & up_after, False).astype(np.int64)
+    passes -= np.where(turn <= 0, up & ~up_after, False)
+    return int(passes.sum())
+
+
+def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Winding number of closed curves around points.
+
+    Parameters
+    ----------
+    points : (k, 2) float64
+    tails, heads : (m, 2) float64
+        Ends of the directed edges that make up the curves.
+
+    Returns
+    -------
+    winding : (k,) int64
+        Counted counterclockwise: crossings of a ray to the right [1]_. Meaningless where ``on``.
+    on : (k,) bool
+        Whether the point lies on the curves.
+
+    References
+    ----------
+    .. [1] K. Hormann, A. Agathos, The point in polygon problem for arbitrary polygons.
+       Computational Geometry 20 (2001).
+    """
+    result = np.zeros(len(points), dtype=np.int64)
+    on = np.zeros(len(points), dtype=bool)
+    low, high = np.minimum(tails, heads), np.maximum(tails, heads)
+    step = max(_WINDING_CHUNK // max(len(tails), 1), 1)
+    for start in range(0, len(points), step):
+        y = points[start : start + step, 1, None]
+        which, edge = np.nonzero((low[:, 1] <= y) & (y <= high[:, 1]))
+        here = points[start + which]
+        tail, head = tails[edge], heads[edge]
+        side = orientation(tail, head, here)
+        rising = (tail[:, 1] <= here[:, 1]) & (here[:, 1] < head[:, 1]) & (side > 0)
+        falling = (head[:, 1] <= here[:, 1]) & (here[:, 1] < tail[:, 1]) & (side < 0)
+        np.add.at(result, start + which[rising], 1)
+        np.subtract.at(result, start + which[falling], 1)
+        met = (side == 0) & (low[edge, 0] <= here[:, 0]) & (here[:, 0] <= high[edge, 0])
+        on[start + which[met]] = True
+    return result, on
+
+
+class BoundaryCurves:
+    """The boundary loops of a surface at their positions in the plane.
+
+    Parameters
+    ----------
+    positions : (n, 2) float64
+        Positions of vertices, finite on the boundary.
+    loops : list of (l,) int64
+        The surface lies to the left of each.
+
+    Attributes
+    ----------
+    loops : list of (l,) int64
+        The same loops, each from its lowest corner on (of several, the leftmost).
+    ends : (m, 2) int64
+        Boundary edges, loop by loop, in order.
+    loop_of : (m,) int64
+        Index of the loop of each edge.
+    """
+
+    def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
+        self.positions = positions
+        self.loops = [_from_lowest(positions, loop) for loop in loops]
+        self.ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
+        self.loop_of = np.repeat(np.arange(len(loops)), [len(loop) for loop in loops])
+
+    @cached_property
+    def degenerate(self) -> IntArray:
+        """Indices of edges of length zero."""
+        return np.flatnonzero((self.tails == self.heads).all(axis=1))
+
+    @property
+    def tails(self) -> FloatArray:
+        """Where the edges start, (m, 2) float64."""
+        return self.positions[self.ends[:, 0]]
+
+    @property
+    def heads(self) -> FloatArray:
+        """Where the edges end, (m, 2) float64."""
+        return self.positions[self.ends[:, 1]]
+
+    @cached_property
+    def folds(self) -> IntArray:
+        """Vertices at which the curve goes back the way it came."""
+        folded = []
+        for loop in self.loops:
+            here, before, after = (self.positions[np.roll(loop, k)] for k in (0, 1, -1))
+            flat = orientation(before, here, after) == 0
+            # On one line: a fold unless the vertex lies between its neighbours.
+            low, high = np.minimum(before, after), np.maximum(before, after)
+            distinct = (here != before).any(axis=1) & (here != after).any(axis=1)
+            outside = ((here < low) | (here > high)).any(axis=1)
+            folded.append(loop[flat & distinct & outside])
+        return np.concatenate(folded)
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """Where the curves meet themselves or each other, as pairs of edges."""
+        return contacts(self.positions, self.ends)
+
+    @property
+    def simple(self) -> bool:
+        """Whether every loop is simple and none meets another."""
+        return not self.degenerate.size and not len(self.contacts.pairs)
+
+    @cached_property
+    def turning(self) -> list[int] | None:
+        """Turning number of each loop; None where edges of length zero have no direction."""
+        if self.degenerate.size:
+            return None
+        return [turning_number(self.positions[loop]) for loop in self.loops]
+
+    @cached_property
+    def winding_range(self) -> IntArray | None:
+        """Smallest winding number right of each loop, largest one left of it; (loops, 2) int64.
+
+        The numbers are those of all curves together, and every region of the plane but the outermost
+        lies beside some loop. None where curves touch or overlap instead of crossing, or meet too
+        often to be followed.
+        """
+        meet = self.contacts
+        if self.degenerate.size or not meet.complete or (meet.relation != SegmentRelation.CROSSING).any():
+            return None
+        edge, other = np.concatenate([meet.pairs, meet.pairs[:, ::-1]]).T
+        # Who crosses a curve from its right to its left comes to where it winds once more.
+        step = orientation(self.tails[other], self.heads[other], self.heads[edge])
+        several = np.bincount(edge, minlength=len(self.ends))[edge] > 1
+        when = [self._when(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)]
+        steps: list[dict[tuple[int, Fraction], int]] = [{} for _ in self.loops]
+        for k in sorted(range(len(edge)), key=lambda k: (edge[k], when[k])):
+            # What is crossed at the same point is crossed at once.
+            along = steps[self.loop_of[edge[k]]]
+            at = (int(edge[k]), when[k])
+            along[at] = along.get(at, 0) + int(step[k])
+        ranges = []
+        for index, along in enumerate(steps):
+            left = self._left_at_start(index) + np.cumsum([0, *along.values()])
+            ranges.append((left.min() - 1, left.max()))
+        return np.array(ranges, dtype=np.int64)
+
+    def _when(self, edge: int, other: int) -> Fraction:
+        """Where along an edge another crosses it, from 0 at its tail to 1 at its head."""
+        (px, py), (qx, qy), (rx, ry), (sx, sy) = (
+            tuple(map(Fraction, self.positions[vertex].tolist()))
+            for vertex in (*self.ends[edge], *self.ends[other])
+        )
+        tail = (sx - rx) * (py - ry) - (sy - ry) * (px - rx)
+        head = (sx - rx) * (qy - ry) - (sy - ry) * (qx - rx)
+        return tail / (tail - head)
+
+    def _left_at_start(self, index: int) -> int:
+        """Winding number just left of the lowest corner of a loop."""
+        own = self.loop_of == index
+        before, here, after = (self.positions[self.loops[index][k]] for k in (-1, 0, 1))
+        others, _ = winding(here[None], self.tails[~own], self.heads[~own])
+        # Below its lowest corner a loop does not wind; the corner's inner side is left of a left turn.
+        return int(others[0]) + int(orientation(before, here, after) > 0)
+
+
+def _from_lowest(positions: FloatArray, loop: IntArray) -> IntArray:
+    """A loop from its lowest corner on; of several, the leftmost."""
+    return np.roll(loop, -int(np.lexsort(positions[loop].T)[0]))

@@ -1,0 +1,190 @@
+"""What a diagnosis says: obstructions, each with its kind, its elements and what would help."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..mesh.topology import named
+
+IntArray = NDArray[np.int64]
+
+
+class Forbids(Enum):
+    """The largest class of maps in which an obstruction leaves none; the value says so in words."""
+
+    INJECTIVE = "no map without inverted triangles exists"
+    UNBRANCHED = "a map without inverted triangles winds more than once around one of its vertices"
+    BIJECTIVE = "no bijective map exists, though one without inverted triangles may"
+
+
+class Kind(Enum):
+    """What stands in the way; the value is what would help."""
+
+    COLLAPSED_EDGE = "Give the two vertices different positions."
+    INVERTED_TRIANGLE = "Split the triangle's interior edges, or move one of its vertices."
+    INVERTED_PATCH = "Split the fixed edges around the patch, or move their vertices."
+    SIGNED_AREA = "Reflect the target or reverse its loops until it winds counterclockwise around the mesh."
+    HALF_PLANES = "Split the edges between the vertex and the edges it should lie to the left of."
+    REVERSED = "Reverse the winding of the triangles, F[:, ::-1], or reflect the target."
+    TURNING_NUMBER = "Untwist the target: reverse or move the loops until their turning numbers add up."
+    NEGATIVE_WINDING = "Untwist the target, or move the loops so that holes lie inside and are wound as holes."
+    GENUS = "Cut the handles of the surface open."
+    CROSSING = "Move the named boundary edges apart if the map must not overlap itself."
+    FOLD = "Open the angle at the named vertices if the map must not overlap itself."
+    NESTING = "Move the loops so that one lies outside all others and these outside each other."
+    CHORD = "Split the edge, so that it may bend, or move its ends."
+    PIN = "Move the pin."
+    HIDDEN = "Split the edges between the vertex and the fixed vertices it cannot all see."
+
+
+def _ints(values: ArrayLike, *shape: int) -> IntArray:
+    array = np.asarray(values, dtype=np.int64).reshape(shape)
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Obstruction:
+    """One reason why there is no map.
+
+    Attributes
+    ----------
+    kind : Kind
+        Which condition is violated.
+    forbids : Forbids
+        Whether this rules out every injective map or only the bijective ones.
+    message : str
+        A sentence that names the elements.
+    vertices : (a,) int64
+        Vertices of the mesh; the one that finds no place comes first.
+    edges : (b, 2) int64
+        Edges of the mesh, by their vertices.
+    triangles : (c,) int64
+        Triangles of the mesh.
+    loops : (d,) int64
+        Boundary loops, as indices into ``Problem.loops``.
+    split : (s, 2) int64
+        Interior edges that would no longer be in the way if they had a vertex in the middle. Empty
+        where no refinement of the mesh helps.
+    """
+
+    kind: Kind
+    forbids: Forbids
+    message: str
+    vertices: IntArray = field(default_factory=lambda: _ints([], -1))
+    edges: IntArray = field(default_factory=lambda: _ints([], -1, 2))
+    triangles: IntArray = field(default_factory=lambda: _ints([], -1))
+    loops: IntArray = field(default_factory=lambda: _ints([], -1))
+    split: IntArray = field(default_factory=lambda: _ints([], -1, 2))
+
+    def __post_init__(self) -> None:
+        for name in ("vertices", "triangles", "loops"):
+            object.__setattr__(self, name, _ints(getattr(self, name), -1))
+        for name in ("edges", "split"):
+            object.__setattr__(self, name, _ints(getattr(self, name), -1, 2))
+
+    @property
+    def advice(self) -> str:
+        """What would help, in a sentence."""
+        return self.kind.value
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: names in lower case, arrays as lists."""
+        return {
+            "kind": self.kind.name.lower(),
+            "forbids": self.forbids.name.lower(),
+            "message": self.message,
+            "advice": self.advice,
+            "vertices": self.vertices.tolist(),
+            "edges": self.edges.tolist(),
+            "triangles": self.triangles.tolist(),
+            "loops": self.loops.tolist(),
+            "split": self.split.tolist(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """All obstructions found, and what was not looked for.
+
+    Attributes
+    ----------
+    obstructions : tuple of Obstruction
+        Those of the whole target first, then those of single elements. Empty when none is known,
+        which does not prove that a map exists.
+    unchecked : tuple of str
+        Conditions that do not apply or were not decided for this problem, and why.
+    """
+
+    obstructions: tuple[Obstruction, ...]
+    unchecked: tuple[str, ...] = ()
+
+    @property
+    def forbids_injective(self) -> bool:
+        """Whether it is proven that every map of this problem inverts a triangle."""
+        return any(o.forbids is Forbids.INJECTIVE for o in self.obstructions)
+
+    @property
+    def forbids_bijective(self) -> bool:
+        """Whether it is proven that no map of this problem is bijective."""
+        return bool(self.obstructions)
+
+    @property
+    def split(self) -> IntArray:
+        """Edges that the obstructions would have split, each once; (s, 2) int64, smaller index first."""
+        every = [np.sort(o.split, axis=1) for o in self.obstructions]
+        return np.unique(np.concatenate([_ints([], -1, 2), *every]), axis=0)
+
+    def summary(self, most: int = 5) -> str:
+        """The diagnosis as text.
+
+        Parameters
+        ----------
+        most : int
+            Obstructions of one kind that are spelled out before the rest is only counted.
+        """
+        if self.forbids_injective:
+            lines = ["No injective map exists: every map with these positions inverts a triangle."]
+        elif self.obstructions:
+            lines = ["No bijective map exists, though one without inverted triangles may."]
+        else:
+            lines = ["No known obstruction: a map may exist."]
+        counts = Counter(o.kind for o in self.obstructions)
+        for kind in counts:
+            same = [o for o in self.obstructions if o.kind is kind]
+            lines += [f"- {o.message} ({o.forbids.value})" for o in same[:most]]
+            if len(same) > most:
+                lines.append(f"- … and {len(same) - most} more of this kind")
+            lines.append(f"  {kind.value}")
+        if len(self.split):
+            lines.append(f"Splitting {len(self.split)} {'edge' if len(self.split) == 1 else 'edges'} may help.")
+        lines += [f"Not checked: {text}" for text in self.unchecked]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the verdicts, every obstruction, the edges to split."""
+        return {
+            "forbids_injective": self.forbids_injective,
+            "forbids_bijective": self.forbids_bijective,
+            "obstructions": [o.to_dict() for o in self.obstructions],
+            "split": self.split.tolist(),
+            "unchecked": list(self.unchecked),
+        }
+
+
+def named_edges(pairs: IntArray, most: int = 5) -> str:
+    """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
+    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
+    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
+    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"
+
+
+def named_vertices(vertices: IntArray) -> str:
+    """Name the first few of some vertices."""
+    return named("vertex", "vertices", vertices)

@@ -1,0 +1,112 @@
+"""Meshes, maps and problems in files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from .atomic import check_writable, write_whole
+from .errors import MeshFileError, OutputError
+from .handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
+from .meshdata import MeshData, map_of, vertex_places
+from .obj import read_obj, write_obj
+from .off import read_off, write_off
+
+__all__ = [
+    "MeshData",
+    "MeshFileError",
+    "OutputError",
+    "ProblemArrays",
+    "check_output",
+    "check_writable",
+    "map_of",
+    "problem_arrays",
+    "problem_files",
+    "read_handles",
+    "read_mesh",
+    "read_obj",
+    "read_off",
+    "read_problem",
+    "vertex_places",
+    "write_map",
+    "write_obj",
+    "write_off",
+    "write_whole",
+]
+
+
+_Path = str | os.PathLike[str]
+# What a suffix means: the one place to extend for another format. OFF has room for one set
+# of coordinates only.
+_READERS: dict[str, Callable[[_Path], MeshData]] = {".obj": read_obj, ".off": read_off}
+_MAP_WRITERS: dict[str, Callable[[_Path, MeshData, ArrayLike], None]] = {
+    ".obj": lambda path, mesh, uv: write_obj(path, mesh.with_map(uv)),
+    ".off": lambda path, mesh, uv: write_off(path, mesh.as_plane(uv)),
+}
+
+
+def read_mesh(path: str | os.PathLike[str]) -> MeshData:
+    """Read a triangle mesh, in the format that the suffix of its name says.
+
+    Parameters
+    ----------
+    path : str or path-like
+        An OBJ or OFF file.
+
+    Returns
+    -------
+    MeshData
+        The mesh; see `read_obj` and `read_off`.
+
+    Raises
+    ------
+    MeshFileError
+        When the format is not supported, or the file cannot be read as what it should be.
+    """
+    return _READERS[_suffix(path, "read")](path)
+
+
+def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> None:
+    """Write the map of a mesh, in the format that the suffix of the name says.
+
+    OBJ gets the mesh as it was read, with the map as its texture coordinates; OFF gets the map
+    alone, as a mesh in the plane z = 0. Numbers are written such that reading them gives the same
+    double. The file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Where to.
+    mesh : MeshData
+        The mesh, as `read_mesh` gave it.
+    uv : (n, 2) float
+        Place of every vertex in the plane.
+
+    Raises
+    ------
+    MeshFileError
+        When the format is not supported.
+    OutputError
+        When it cannot be written; the old file is then untouched.
+    ValueError
+        When ``uv`` has another shape or is not finite.
+    """
+    _MAP_WRITERS[_suffix(path, "written")](path, mesh, uv)
+
+
+def check_output(path: str | os.PathLike[str]) -> None:
+    """Say early whether `write_map` could write to ``path``; raises what it would."""
+    _suffix(path, "written")
+    check_writable(path)
+
+
+def _suffix(path: str | os.PathLike[str], done: str) -> str:
+    suffix = Path(path).suffix.lower()
+    known = _READERS if done == "read" else _MAP_WRITERS
+    if suffix not in known:
+        what = f"{suffix} files cannot be {done}" if suffix else "has no suffix that would say its format"
+        raise MeshFileError(path, what, remedy=f"supported are {', '.join(known)}")
+    return suffix

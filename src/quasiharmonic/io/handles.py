@@ -1,0 +1,168 @@
+"""Problems as files: a mesh with a first guess of its map, and a list of the vertices to hold.
+
+The format is that of the Locally Injective Mappings Benchmark (Du et al. 2020): a folder with
+``input.obj``, whose texture coordinates say where the fixed vertices go, and ``handles.txt``,
+which names these vertices.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from quasiharmonic.mesh.topology import boundary_edges, named
+
+from .errors import MeshFileError
+from .meshdata import FloatArray, IntArray, MeshData, vertex_places
+from .obj import read_obj
+from .textual import integer, read_text
+
+
+class ProblemArrays(NamedTuple):
+    """What `quasiharmonic.Problem` is made from.
+
+    Attributes
+    ----------
+    V : (n, 3) float64
+        Rest positions.
+    F : (f, 3) int64
+        Triangles.
+    fixed : (k,) int64
+        Vertices to hold.
+    target : (k, 2) float64
+        Where to hold them.
+    """
+
+    V: FloatArray
+    F: IntArray
+    fixed: IntArray
+    target: FloatArray
+
+
+def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] | None = None) -> ProblemArrays:
+    """Read a mapping problem.
+
+    Parameters
+    ----------
+    source : str or path-like
+        A folder with ``input.obj`` and, optionally, ``handles.txt``; or an OBJ file alone.
+    fixed : str or path-like, optional
+        A list of vertices to hold in place of the folder's. Where there is none at all, the
+        boundary is held.
+
+    Returns
+    -------
+    ProblemArrays
+        ``V, F, fixed, target``, the target being where the texture coordinates put ``fixed``.
+
+    Raises
+    ------
+    MeshFileError
+        When a file cannot be read or does not say where a fixed vertex goes.
+    """
+    mesh_path, fixed_path = problem_files(source, fixed)
+    mesh = read_obj(mesh_path)
+    return problem_arrays(mesh, None if fixed_path is None else read_handles(fixed_path, len(mesh.V)))
+
+
+def problem_files(
+    source: str | os.PathLike[str], fixed: str | os.PathLike[str] | None = None
+) -> tuple[Path, Path | None]:
+    """Tell the files of a problem: of the mesh, and of the vertices to hold where there is one."""
+    mesh_path = Path(source)
+    if mesh_path.is_dir():
+        folder, mesh_path = mesh_path, mesh_path / "input.obj"
+        if fixed is None and (folder / "handles.txt").exists():
+            fixed = folder / "handles.txt"
+    return mesh_path, None if fixed is None else Path(fixed)
+
+
+def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArrays:
+    """Make a mapping problem from a mesh that has texture coordinates.
+
+    Parameters
+    ----------
+    mesh : MeshData
+        The mesh. Seams are no obstacle where no vertex is fixed.
+    fixed : (k,) int64, optional
+        Vertices to hold, the boundary when not given.
+
+    Returns
+    -------
+    ProblemArrays
+        ``V, F, fixed, target``.
+
+    Raises
+    ------
+    MeshFileError
+        When nothing is there to hold, or a fixed vertex has no place or several; the message names
+        the first such vertices.
+    """
+    if mesh.FT is None:
+        raise MeshFileError(
+            mesh.source,
+            "has no texture coordinates, so nothing says where the fixed vertices go",
+            remedy="write it with uv coordinates, which OBJ has as vt",
+        )
+    if fixed is None:
+        fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
+        if not fixed.size:
+            raise MeshFileError(
+                mesh.source,
+                "has no boundary that could be fixed",
+                remedy="cut it open, or name fixed vertices",
+            )
+    uv, seam = vertex_places(mesh)
+    for wrong, what, remedy in (
+        (np.isnan(uv[fixed, 0]), "no place in the plane", "give every fixed vertex a vt"),
+        (seam[fixed], "more than one place in the plane", "cut the mesh along its seams first"),
+    ):
+        if wrong.any():
+            which = named("vertex", "vertices", fixed[wrong])
+            raise MeshFileError(mesh.source, f"{what} for the fixed {which} (0-based)", remedy=remedy)
+    return ProblemArrays(mesh.V, mesh.F, fixed, uv[fixed])
+
+
+def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
+    """Read a list of vertices: 0-based indices, one a line, with blank lines and ``#`` comments.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    n : int
+        Number of vertices there are.
+
+    Returns
+    -------
+    (k,) int64
+        The vertices in the order of the file.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for anything but an integer, an index outside ``0 … n - 1``, a vertex named
+        twice; for an empty list.
+    """
+    # Every vertex comes once, so this cannot outgrow the mesh.
+    seen: dict[int, int] = {}
+    for line, raw in enumerate(io.BytesIO(read_text(path)), 1):
+        text = raw.split(b"#", 1)[0].strip()
+        if not text:
+            continue
+        try:
+            vertex = integer(text)
+        except ValueError as error:
+            raise MeshFileError(path, str(error), line, "one vertex index a line is needed") from None
+        if not 0 <= vertex < n:
+            raise MeshFileError(path, f"vertex {vertex} of a mesh with {n}", line, "indices count from 0")
+        if vertex in seen:
+            raise MeshFileError(path, f"vertex {vertex}, already named at line {seen[vertex]}, again", line)
+        seen[vertex] = line
+    if not seen:
+        raise MeshFileError(path, "names no vertices")
+    return np.fromiter(seen, dtype=np.int64, count=len(seen))

@@ -1,0 +1,220 @@
+"""Wavefront OBJ, read and written such that nothing but the map changes."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .atomic import write_whole
+from .meshdata import MeshData
+from .objlines import REFUSED, read_obj_lines
+from .textual import integer_table, number_table, read_text
+
+# Kinds of line, for the reader that takes all lines of a kind at once.
+_BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)
+# Lines that look like statements to that reader and want the careful one.
+_CAREFUL = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
+_NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _CAREFUL + rb")\s)", re.MULTILINE)
+_FORMS = {
+    b"f 1 1 1\n": (0,),
+    b"f 1/1 1/1 1/1\n": (0, 1),
+    b"f 1//1 1//1 1//1\n": (0, 2),
+    b"f 1/1/1 1/1/1 1/1/1\n": (0, 1, 2),
+}
+_CHUNK = 100_000
+
+
+def read_obj(path: str | os.PathLike[str]) -> MeshData:
+    """Read a triangle mesh from an OBJ file.
+
+    Vertices, faces and the statements between faces keep their order. Faces may refer to vertices
+    in any form (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative). Every ``v`` and ``vt`` must be
+    finite, used or not. Of ``vt`` the first two numbers are read; what stands behind the
+    coordinates of a ``v`` is kept. Normals are kept without being looked at, and so is every
+    statement that is not geometry: groups, materials, comments, and ones not known here. Blank
+    lines and comments behind data are dropped. A comment that ends in a backslash ends there;
+    other lines go on.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    MeshData
+        The mesh, numbers correctly rounded to double.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for a face that is not a triangle, an index that refers to nothing, a number
+        that is none or not finite, free-form geometry, and ``l`` or ``p`` elements whose indices
+        are not plain (they could not be kept); for a file without vertices or faces, one that is
+        not text, or none at all.
+    """
+    data = read_text(path)
+    return _read_regular(path, data) or read_obj_lines(path, data)
+
+
+def write_obj(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write a mesh as an OBJ file, whole or not at all.
+
+    Numbers are written such that reading them gives the same double.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Where to.
+    mesh : MeshData
+        What to write: statements before the first vertex, then vertices, texture coordinates,
+        normals, and the faces with the other statements in between where they were.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written; the old file is then untouched.
+    """
+    write_whole(path, lambda file: file.writelines(_pieces(mesh)))
+
+
+def _read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
+    """Read a file whose lines of one kind all have one form; None when it is not so."""
+    lines = data.count(b"\n")
+    # Shorter lines than any vertex or face has would cost more memory than the file is worth.
+    if not lines or 4 * lines > len(data) or b"\\\n" in data:
+        return None
+    ends, kinds = _classify(data)
+    counts = np.bincount(kinds, minlength=6)
+    if not (counts[_VERTEX] and counts[_FACE]):
+        return None
+    statements = _lines_of(_STATEMENT, data, ends, kinds)
+    if _NOT_PLAIN.search(statements):
+        return None
+    rows = number_table(_lines_of(_VERTEX, data, ends, kinds), b"v", int(counts[_VERTEX]))
+    if rows is None or rows.shape[1] < 3:
+        return None
+    vt = None
+    if counts[_TEXTURE]:
+        vt = number_table(_lines_of(_TEXTURE, data, ends, kinds), b"vt", int(counts[_TEXTURE]))
+        if vt is None or not 2 <= vt.shape[1] <= 3:
+            return None
+    parts = _regular_faces(_lines_of(_FACE, data, ends, kinds), counts)
+    if parts is None:
+        return None
+    before = np.cumsum(kinds == _FACE)
+    before[: int(np.argmax((kinds > _BLANK) & (kinds < _STATEMENT)))] = -1
+    return MeshData(
+        np.ascontiguousarray(rows[:, :3]),
+        parts[0],
+        vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
+        FT=parts.get(1),
+        extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
+        normals=_lines_of(_NORMAL, data, ends, kinds),
+        FN=parts.get(2),
+        statements=statements,
+        statement_faces=before[kinds == _STATEMENT],
+        source=os.fspath(path),
+    )
+
+
+def _classify(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
+    """Find the end of every line, counting its newline, and its kind by its first letters."""
+    text = np.frombuffer(data, dtype=np.uint8)
+    ends = np.flatnonzero(text == ord("\n")) + 1
+    starts = np.concatenate(([0], ends[:-1]))
+    # A line may be shorter than three letters, but these are then not asked for.
+    first, second, third = (text.take(starts + i, mode="clip") for i in range(3))
+
+    def blank(letter: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        return np.isin(letter, (ord(" "), ord("\t")))
+
+    kinds = np.full(ends.size, _STATEMENT, dtype=np.int8)
+    kinds[first == ord("\n")] = _BLANK
+    kinds[(first == ord("f")) & blank(second)] = _FACE
+    kinds[(first == ord("v")) & blank(second)] = _VERTEX
+    kinds[(first == ord("v")) & (second == ord("t")) & blank(third)] = _TEXTURE
+    kinds[(first == ord("v")) & (second == ord("n")) & blank(third)] = _NORMAL
+    return ends, kinds
+
+
+def _lines_of(kind: int, data: bytes, ends: NDArray[np.int64], kinds: NDArray[np.int8]) -> bytes:
+    """Return all lines of one kind, one after another."""
+    member = np.concatenate(([False], kinds == kind, [False]))
+    change = np.flatnonzero(member[1:] != member[:-1])
+    cuts = np.concatenate(([0], ends))[change].tolist()
+    return b"".join([data[start:end] for start, end in zip(cuts[::2], cuts[1::2], strict=True)])
+
+
+def _regular_faces(block: bytes, counts: NDArray[np.int64]) -> dict[int, NDArray[np.int64]] | None:
+    """Return the indices of faces by what they refer to (0 vertices, 1 texture coordinates, 2 normals)."""
+    # No more of a line is taken apart than the longest regular face has, nine indices.
+    first = re.sub(rb"[0-9]+", b"1", block[: min(block.index(b"\n"), 200)])
+    form = b" ".join(first.split()) + b"\n"
+    if form not in _FORMS:
+        return None
+    table = integer_table(block, form, int(counts[_FACE]))
+    if table is None:
+        return None
+    referred = _FORMS[form]
+    parts = {}
+    for column, part in enumerate(referred):
+        indices = table[:, column :: len(referred)] - 1
+        if indices.min() < 0 or indices.max() >= counts[(_VERTEX, _TEXTURE, _NORMAL)[part]]:
+            return None
+        parts[part] = indices
+    return parts
+
+
+def _pieces(mesh: MeshData) -> Iterator[bytes]:
+    """Yield the contents of the file to write."""
+    at = np.concatenate((mesh.statement_faces, [len(mesh.F)]))
+    statements = mesh.statements.split(b"\n")
+    head = int(np.count_nonzero(at < 0))
+    yield b"".join(line + b"\n" for line in statements[:head])
+    rows = mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra])
+    if np.isnan(rows).any():
+        for row in rows.tolist():
+            yield ("v " + " ".join(repr(x) for x in row if not math.isnan(x)) + "\n").encode()
+    else:
+        yield from _number_lines("v", rows)
+    if mesh.vt is not None:
+        yield from _number_lines("vt", mesh.vt)
+    yield mesh.normals
+    corners = _corner_texts(mesh)
+    begin = 0
+    for end, line in zip(at[head:].tolist(), [*statements[head:-1], b""], strict=True):
+        for start in range(begin, end, _CHUNK):
+            stop = min(start + _CHUNK, end)
+            yield ("f %s %s %s\n" * (stop - start) % tuple(corners[3 * start : 3 * stop])).encode()
+        begin = end
+        yield line + b"\n" if line else b""
+
+
+def _number_lines(keyword: str, rows: NDArray[np.float64]) -> Iterator[bytes]:
+    form = keyword + " %r" * rows.shape[1] + "\n"
+    for start in range(0, len(rows), _CHUNK):
+        part = rows[start : start + _CHUNK]
+        # repr() is the shortest text that reads back as the same double.
+        yield (form * len(part) % tuple(part.ravel().tolist())).encode()
+
+
+def _corner_texts(mesh: MeshData) -> list[str]:
+    """Text of every corner of every face, one after another."""
+    parts = [mesh.F, mesh.FT, mesh.FN]
+    if mesh.FN is None and (mesh.FT is None or np.array_equal(mesh.F, mesh.FT)):
+        # Each vertex always looks the same: made once and looked up.
+        texts = [f"{i}" if mesh.FT is None else f"{i}/{i}" for i in range(1, len(mesh.V) + 1)]
+        return list(map(texts.__getitem__, mesh.F.ravel().tolist()))
+    absent = [-1] * mesh.F.size
+    columns = [absent if part is None else part.ravel().tolist() for part in parts]
+    texts = []
+    for a, b, c in zip(*columns, strict=True):
+        place = str(b + 1) if b >= 0 else ""
+        texts.append(f"{a + 1}/{place}/{c + 1}" if c >= 0 else f"{a + 1}/{place}" if place else f"{a + 1}")
+    return texts

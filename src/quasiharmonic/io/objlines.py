@@ -1,0 +1,201 @@
+"""OBJ read line by line: every form of it, and every fault with its line."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from array import array
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import MeshFileError
+from .meshdata import MeshData
+from .textual import integer, number, shown
+
+# Statements whose geometry would be lost, and elements that point to vertices in ways not kept.
+REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"call"}
+_PLAIN_ELEMENT = re.compile(rb"[lp][ \t0-9]*")
+# Weight and colour with opacity: what can stand behind the coordinates of a vertex.
+_MOST_EXTRA = 5
+_TRIANGULATE = "triangulate first"
+
+
+def read_obj_lines(path: str | os.PathLike[str], data: bytes) -> MeshData:
+    """Read the text of an OBJ file; what it takes and raises is said at `read_obj`."""
+    return _Reader(path, data).read()
+
+
+class _Reader:
+    """The state of reading one file. Compact arrays, so that memory stays a few times the file's."""
+
+    def __init__(self, path: str | os.PathLike[str], data: bytes) -> None:
+        self.path = path
+        self.data = data
+        self.coordinates, self.width = array("d"), array("b")
+        self.vt = array("d")
+        self.normals = bytearray()
+        self.normal_count = 0
+        self.corners = array("q")
+        self.face_line = array("q")
+        self.statements = bytearray()
+        self.statement_faces = array("q")
+        self.begun = False
+
+    def read(self) -> MeshData:
+        take = {b"v": self.vertex, b"vt": self.texture, b"vn": self.normal, b"f": self.face}
+        for line, text in _logical_lines(self.data):
+            keyword = text.split(None, 1)[0]
+            try:
+                if keyword in take:
+                    self.begun = True
+                    take[keyword](line, text)
+                else:
+                    self.statement(keyword, text)
+            except _FaultError as fault:
+                raise MeshFileError(self.path, fault.what, line, fault.remedy) from None
+            except ValueError as error:
+                raise MeshFileError(self.path, str(error), line) from None
+        return self.result()
+
+    def vertex(self, line: int, text: bytes) -> None:
+        row = _numbers(text, 3 + _MOST_EXTRA)
+        if len(row) < 3:
+            raise _FaultError(f"a vertex with {_count(row, 'coordinate')}", "three are needed")
+        self.coordinates.extend(row)
+        self.width.append(len(row))
+
+    def texture(self, line: int, text: bytes) -> None:
+        row = _numbers(text, 3)
+        if len(row) < 2:
+            raise _FaultError(f"a texture coordinate with {_count(row, 'number')}", "two are needed")
+        self.vt.extend(row[:2])
+
+    def normal(self, line: int, text: bytes) -> None:
+        self.normals += text + b"\n"
+        self.normal_count += 1
+
+    def face(self, line: int, text: bytes) -> None:
+        # However long the line, no more of it is taken apart than an error message needs.
+        corners = _uncommented(text).split(None, 101)[1:]
+        if len(corners) != 3:
+            count = _count(corners, "corner") if len(corners) <= 100 else "more than 100 corners"
+            remedy = _TRIANGULATE if len(corners) > 3 else "a triangle has 3"
+            raise _FaultError(f"face with {count}", remedy)
+        counts = (len(self.width), len(self.vt) // 2, self.normal_count)
+        for corner in corners:
+            self.corners.extend(_corner(corner, counts))
+        self.face_line.append(line)
+
+    def statement(self, keyword: bytes, text: bytes) -> None:
+        if keyword in REFUSED:
+            raise _FaultError(f"{keyword.decode()!r} statement", "only triangles can be read; convert it first")
+        if keyword in (b"l", b"p") and not _PLAIN_ELEMENT.fullmatch(text.rstrip()):
+            raise _FaultError(f"{keyword.decode()!r} element with relative or texture indices", "remove it")
+        self.statements += text + b"\n"
+        self.statement_faces.append(len(self.face_line) if self.begun else -1)
+
+    def result(self) -> MeshData:
+        vertices, faces = len(self.width), len(self.face_line)
+        if not vertices:
+            raise MeshFileError(self.path, "holds no vertices", remedy="is it an OBJ file?")
+        if not faces:
+            raise MeshFileError(self.path, "holds no faces", remedy="a triangle mesh is needed")
+        corners = np.array(self.corners, dtype=np.int64).reshape(faces, 3, 3)
+        counts = (vertices, len(self.vt) // 2, self.normal_count)
+        names = ("vertices", "texture coordinates", "normals")
+        for part, (count, what) in enumerate(zip(counts, names, strict=True)):
+            beyond = np.argwhere(corners[:, :, part] >= count)
+            if beyond.size:
+                face, corner = beyond[0].tolist()
+                fault = f"index {corners[face, corner, part] + 1}, but the file has {count} {what}"
+                raise MeshFileError(self.path, fault, self.face_line[face])
+        F, FT, FN = (np.ascontiguousarray(corners[:, :, part]) for part in range(3))
+        V, extra = self.vertices()
+        return MeshData(
+            V,
+            F,
+            vt=np.array(self.vt, dtype=np.float64).reshape(-1, 2) if self.vt else None,
+            FT=FT if (FT >= 0).any() else None,
+            extra=extra,
+            normals=bytes(self.normals),
+            FN=FN if (FN >= 0).any() else None,
+            statements=bytes(self.statements),
+            statement_faces=np.array(self.statement_faces, dtype=np.int64),
+            source=os.fspath(self.path),
+        )
+
+    def vertices(self) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Coordinates, and what stood behind them."""
+        width = np.array(self.width, dtype=np.int64)
+        rows = np.full((width.size, int(width.max())), np.nan)
+        rows[np.arange(rows.shape[1]) < width[:, None]] = self.coordinates
+        extra = np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None
+        return np.ascontiguousarray(rows[:, :3]), extra
+
+
+class _FaultError(Exception):
+    """A fault on the line being read, with what the user can do."""
+
+    def __init__(self, what: str, remedy: str) -> None:
+        self.what = what
+        self.remedy = remedy
+
+
+def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Lines that say something, each with its number; continued ones joined under their first."""
+    # Growing in place, because a hostile file may continue one line a million times.
+    joined, start = bytearray(), 0
+    for line, raw in enumerate(io.BytesIO(data), 1):
+        text = raw[:-1]
+        # A comment that ends in a backslash (a path, often) does not swallow the next line.
+        if text.endswith(b"\\") and (joined or not text.lstrip().startswith(b"#")):
+            joined += text[:-1] + b" "
+            start = start or line
+            continue
+        if start:
+            text = bytes(joined + text)
+            line, start = start, 0
+            joined.clear()
+        if text := text.lstrip():
+            yield line, text
+    if start and (text := bytes(joined).lstrip()):
+        yield start, text
+
+
+def _uncommented(text: bytes) -> bytes:
+    return text.split(b"#", 1)[0]
+
+
+def _numbers(text: bytes, most: int) -> list[float]:
+    tokens = _uncommented(text).split(None, most + 1)[1:]
+    if len(tokens) > most:
+        raise _FaultError(f"{shown(text.split(None, 1)[0])} with more than {most} numbers", "remove the rest")
+    return [number(token) for token in tokens]
+
+
+def _corner(text: bytes, counts: tuple[int, int, int]) -> list[int]:
+    """0-based references of ``a``, ``a/b``, ``a//c`` or ``a/b/c``; -1 for one that is not there."""
+    parts = text.split(b"/", 3)
+    if len(parts) > 3 or not parts[0]:
+        raise ValueError(f"{shown(text)} is not a corner of a face")
+    references = [-1, -1, -1]
+    for i, part in enumerate(parts):
+        if not part:
+            continue
+        index = integer(part)
+        if index > 0:
+            references[i] = index - 1
+        elif index == 0:
+            raise _FaultError(f"index 0 in {shown(text)}", "OBJ counts from 1")
+        elif index < -counts[i]:
+            raise ValueError(f"index {index} reaches back beyond the {counts[i]} that come before it")
+        else:
+            references[i] = counts[i] + index
+    return references
+
+
+def _count(items: list[bytes] | list[float], what: str) -> str:
+    return f"{len(items)} {what}{'' if len(items) == 1 else 's'}"

@@ -1,0 +1,177 @@
+"""Reading text files of numbers: the whole file at once where it is regular, by the line where not."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import stat
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import MeshFileError
+
+# What each kind of file that is not text begins with.
+_FOREIGN = {
+    b"\xff\xfe": ("is UTF-16 text", "save it as UTF-8"),
+    b"\xfe\xff": ("is UTF-16 text", "save it as UTF-8"),
+    b"\x1f\x8b": ("is compressed by gzip", "unpack it first"),
+    b"PK\x03\x04": ("is a zip archive", "unpack it first"),
+    b"BZh": ("is compressed by bzip2", "unpack it first"),
+    b"\xfd7zXZ": ("is compressed by xz", "unpack it first"),
+}
+_NUMERIC = b"0123456789.eE+-"
+_INTEGER = re.compile(rb"[+-]?[0-9]+")
+
+
+def read_text(path: str | os.PathLike[str]) -> bytes:
+    """Read a text file.
+
+    Returns
+    -------
+    bytes
+        The contents with every line ended by a single newline and no byte order mark. They need
+        not be valid UTF-8: only names and comments have letters, and those are passed through.
+
+    Raises
+    ------
+    MeshFileError
+        When there is no such file, it cannot be read, or it is not text.
+    """
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise MeshFileError(path, "is a directory", remedy="name a file")
+        if not stat.S_ISREG(mode):
+            raise MeshFileError(path, "is not a regular file")
+        data = Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise MeshFileError(path, "there is no such file") from error
+    except OSError as error:
+        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
+    except MeshFileError:
+        raise
+    except ValueError as error:
+        raise MeshFileError(ascii(path), f"is not a file name: {error}") from error
+    for start, (what, remedy) in _FOREIGN.items():
+        if data.startswith(start):
+            raise MeshFileError(path, what, remedy=remedy)
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    nul = data.find(b"\0")
+    if nul >= 0:
+        line = data.count(b"\n", 0, nul) + 1
+        raise MeshFileError(path, "a NUL byte", line, "this is a binary or a damaged file")
+    return data if data.endswith(b"\n") or not data else data + b"\n"
+
+
+def shown(token: bytes) -> str:
+    """Quote a piece of a file for a message, cut short and in plain ASCII."""
+    text = ascii(token[:40].decode("utf-8", "replace"))
+    return text if len(token) <= 40 else f"{text[:-1]}...'"
+
+
+def number(token: bytes) -> float:
+    """Turn decimal text into the nearest double; `ValueError` with a clear text for anything else."""
+    try:
+        # Python reads more than files mean: 1_000, or words for infinity.
+        value = math.nan if b"_" in token else float(token)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{shown(token)} is not a finite number")
+    return value
+
+
+def integer(token: bytes) -> int:
+    """Turn decimal text into an integer below 10¹⁸; `ValueError` with a clear text for anything else."""
+    if len(token) <= 18 and token.isdigit():
+        return int(token)
+    if not _INTEGER.fullmatch(token):
+        raise ValueError(f"{shown(token)} is not an integer")
+    digits = token.lstrip(b"+-").lstrip(b"0")
+    if len(digits) > 18:
+        raise ValueError(f"{shown(token)} is far too large")
+    value = int(digits or b"0")
+    return -value if token.startswith(b"-") else value
+
+
+def number_table(block: bytes, keyword: bytes, rows: int) -> NDArray[np.float64] | None:
+    """Read lines of numbers that all have the same form, at once.
+
+    Parameters
+    ----------
+    block : bytes
+        The lines, each beginning with ``keyword`` and ended by a newline.
+    keyword : bytes
+        Word before the numbers, or nothing.
+    rows : int
+        Number of lines.
+
+    Returns
+    -------
+    (rows, k) float64 or None
+        The numbers, with 1 ≤ k ≤ 8; None when the lines are not all alike or hold anything but
+        finite numbers.
+    """
+    block = _single_spaced(block)
+    separators = block[: block.index(b"\n")].count(b" ")
+    columns = separators if keyword else separators + 1
+    if not 1 <= columns <= 8:
+        return None
+    # Without its numbers every line must be the same. Between two separators there is one number
+    # at most, so the right count of numbers means that none is missing anywhere.
+    if block.translate(None, _NUMERIC) != (keyword + b" " * separators + b"\n") * rows:
+        return None
+    numbers = block.translate(None, keyword).split()
+    if len(numbers) != rows * columns:
+        return None
+    try:
+        # float() rounds correctly, and no array function is faster at it.
+        values = np.array(list(map(float, numbers)))
+    except ValueError:
+        return None
+    return values.reshape(rows, columns) if np.isfinite(values).all() else None
+
+
+def integer_table(block: bytes, form: bytes, rows: int) -> NDArray[np.int64] | None:
+    r"""Read lines of non-negative integers that all have the same form, at once.
+
+    Parameters
+    ----------
+    block : bytes
+        The lines, each ended by a newline.
+    form : bytes
+        A line with ``1`` for every number: ``b"f 1/1 1/1 1/1\n"``.
+    rows : int
+        Number of lines.
+
+    Returns
+    -------
+    (rows, k) int64 or None
+        The numbers, too large ones as 2⁶³ - 1; None when a line has another form.
+    """
+    block = _single_spaced(block)
+    frame = form.replace(b"1", b"")
+    if block.translate(None, b"0123456789") != frame * rows:
+        return None
+    # As in `number_table`; besides, digits may not stand where the form has none.
+    for joint in {form[i : i + 2] for i in range(len(form) - 1)}:
+        if b"1" not in joint and block.count(joint) != form.count(joint) * rows:
+            return None
+    columns = form.count(b"1")
+    separators = bytes(set(frame))
+    plain = block.translate(bytes.maketrans(separators, b" " * len(separators)))
+    values = np.fromstring(plain, dtype=np.int64, sep=" ")
+    return values.reshape(rows, columns) if values.size == rows * columns else None
+
+
+def _single_spaced(block: bytes) -> bytes:
+    """Make runs of blanks single and drop those at the ends of lines."""
+    block = block.replace(b"\t", b" ")
+    while b"  " in block:
+        block = block.replace(b"  ", b" ")
+    return block.replace(b" \n", b"\n")

@@ -1,0 +1,84 @@
+"""Sparse Cholesky behind one small protocol: analyse a pattern once, factor, solve, release.
+
+>>> import numpy as np
+>>> from quasiharmonic.linsolve import make_solver
+>>> indptr, indices = [0, 2, 3], [0, 1, 1]  # upper triangle of [[2, -1], [-1, 2]]
+>>> with make_solver(indptr, indices, name="superlu") as solver:
+...     solver.factor([2.0, -1.0, 2.0])
+...     solver.solve(np.array([1.0, 1.0])).round(12).tolist()
+[1.0, 1.0]
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from numpy.typing import ArrayLike
+
+from .base import LinearSolver, NotPositiveDefinite
+
+__all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver"]
+
+# Fastest first: the order in which "auto" tries them. Each entry is the module and the class in it.
+_BACKENDS = {
+    "pardiso": ("mkl", "Pardiso"),
+    "cholmod": ("cholmod", "Cholmod"),
+    "qdldl": ("qdldl", "Qdldl"),
+    "superlu": ("superlu", "SuperLU"),
+}
+
+
+def _backend(name: str) -> type[LinearSolver]:
+    module, attribute = _BACKENDS[name]
+    backend: type[LinearSolver] = getattr(import_module(f".{module}", __name__), attribute)
+    return backend
+
+
+def available() -> tuple[str, ...]:
+    """Names of the backends whose libraries are installed, best first; none of them is loaded."""
+    return tuple(name for name in _BACKENDS if _backend(name).present())
+
+
+def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto") -> LinearSolver:
+    """Analyse the pattern of a symmetric matrix with the best backend present, or with the one named.
+
+    Parameters
+    ----------
+    indptr, indices : (n+1,) and (nnz,) integer arrays
+        Upper triangle of the pattern in compressed sparse rows: columns ascending within each row, every row starting
+        with its diagonal entry.
+    name : {"auto", "pardiso", "cholmod", "qdldl", "superlu"}
+        Which backend to use. "auto" takes the first in this order that is installed and loads.
+
+    Returns
+    -------
+    LinearSolver
+        Its ``name`` says which backend it is.
+
+    Raises
+    ------
+    ValueError
+        No backend has this name, or the pattern is not as described.
+    ImportError
+        The backend named is not installed, or its library does not load.
+    """
+    if name == "auto":
+        for candidate in _BACKENDS:
+            backend = _backend(candidate)
+            if backend.present():
+                try:
+                    return backend(indptr, indices)
+                except ImportError:
+                    continue  # installed but broken; the last candidate comes with SciPy and always loads
+    if name not in _BACKENDS:
+        raise ValueError(
+            f"there is no linear solver {name!r}; the names are 'auto', {', '.join(map(repr, _BACKENDS))}, "
+            f"and available here are {', '.join(available())}"
+        )
+    backend = _backend(name)
+    if not backend.present():
+        raise ImportError(
+            f"linear solver {name!r} is not installed; available here are {', '.join(available())}. "
+            f"To install it: {backend.requirement}"
+        )
+    return backend(indptr, indices)

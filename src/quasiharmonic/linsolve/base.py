@@ -1,0 +1,215 @@
+"""The protocol every sparse solver follows.
+
+A backend supplies four steps, `_analyse`, `_factor`, `_solve` and `_release`. What is the same for all of them is here:
+checks, the copy of the values, the residual test, one step of refinement, locking.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+class NotPositiveDefinite(ArithmeticError):  # noqa: N818  (the name says what happened to the matrix, not to the program)
+    """The matrix is not numerically positive definite, or no solution can be vouched for.
+
+    Callers are expected to handle it: by a shorter step, by adding to the diagonal, by another backend.
+    """
+
+
+class LinearSolver(ABC):
+    """Solve A x = b for symmetric positive definite A of one fixed sparsity pattern.
+
+    The pattern is analysed at construction, `factor` takes new values for it, `solve` any number of right-hand
+    sides. A solver may be shared between threads; each call is atomic.
+
+    Parameters
+    ----------
+    indptr : (n+1,) integer array
+        Row starts of the upper triangle of A in compressed sparse rows, as in ``scipy.sparse.triu(A, format="csr")``.
+    indices : (nnz,) integer array
+        Column indices, ascending within each row. Every row starts with its diagonal entry.
+
+    Raises
+    ------
+    ValueError
+        The pattern is not as described.
+    ImportError
+        The library behind the backend cannot be loaded.
+    """
+
+    # No scaling is applied before factoring. Cholesky without pivoting commutes with scaling by powers of two: short of
+    # under- and overflow the factor of S A S is that of A, scaled, in every bit; so it saves no matrix that would fail.
+    # It matters where sizes are compared, which is in the residual test, and there the diagonal is scaled to one.
+
+    name: ClassVar[str]
+    requirement: ClassVar[str]
+
+    def __init__(self, indptr: ArrayLike, indices: ArrayLike) -> None:
+        self._indptr, self._indices = _checked_pattern(indptr, indices)
+        self.n = len(self._indptr) - 1
+        self.nnz = len(self._indices)
+        # The backend reads from this buffer and from no other: the caller's array is free for the next matrix, and a
+        # backend that holds addresses can prepare them once.
+        self._values: Floats = np.zeros(self.nnz)
+        self._lock = threading.Lock()
+        self._ready = False
+        self._closed = False
+        if self.n:
+            from .guard import ResidualTest
+
+            self._test = ResidualTest(self._indptr, self._indices, self._values)
+            self._analyse()
+
+    @classmethod
+    def present(cls) -> bool:
+        """Whether the library behind this backend is installed, found without loading it."""
+        return True
+
+    def factor(self, values: ArrayLike) -> None:
+        """Factor the matrix with these values.
+
+        Parameters
+        ----------
+        values : (nnz,) array
+            Entries of the upper triangle, aligned with the pattern given at construction. They are copied.
+
+        Raises
+        ------
+        NotPositiveDefinite
+            A pivot or a diagonal entry is not positive, or an entry is not finite.
+        ValueError
+            The array has the wrong shape, or the solver is closed.
+        """
+        values = np.asarray(values)
+        if values.shape != (self.nnz,):
+            raise ValueError(f"values has shape {values.shape}; the analysed pattern has {self.nnz} entries")
+        with self._lock:
+            self._require_open()
+            self._ready = False
+            np.copyto(self._values, values)
+            if self.n:
+                self._test.read()
+                self._factor()
+            self._ready = True
+
+    def solve(self, rhs: ArrayLike) -> Floats:
+        """Solve for one or several right-hand sides with the last factor.
+
+        Parameters
+        ----------
+        rhs : (n,) or (n, k) array
+            Right-hand sides; left unchanged.
+
+        Returns
+        -------
+        (n,) or (n, k) float64 array
+            The solution, a new array. With several columns it is Fortran-ordered.
+
+        Raises
+        ------
+        NotPositiveDefinite
+            The residual shows that the matrix is singular to working precision or the factor wrong, also after one
+            step of iterative refinement; or `rhs` is not finite.
+        ValueError
+            `rhs` has the wrong shape, or the solver is closed.
+        RuntimeError
+            There is no factor: `factor` was not called or did not succeed.
+        """
+        given = np.asarray(rhs, dtype=np.float64)
+        if given.ndim not in (1, 2) or given.shape[0] != self.n:
+            raise ValueError(f"right-hand side has shape {given.shape}; expected ({self.n},) or ({self.n}, k)")
+        b = np.asfortranarray(given.reshape(self.n, -1) if given.size else np.zeros((self.n, 0)))
+        with self._lock:
+            self._require_open()
+            if not self._ready:
+                raise RuntimeError("there is no factor to solve with: factor() was not called or did not succeed")
+            if not given.size:
+                return np.zeros(given.shape)
+            x = self._solve(b)
+            if not self._test.plausible(b, x):
+                x = self._examine(b, x)
+        return x[:, 0] if given.ndim == 1 else x
+
+    def close(self) -> None:
+        """Release the factor and whatever the library holds for it. Closing twice is allowed."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                self._ready = False
+                if self.n:
+                    self._release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise ValueError("the solver is closed")
+
+    def _examine(self, b: Floats, x: Floats) -> Floats:
+        """Judge by the true residual, refine once if it is too large, and give up if that does not help."""
+        excess = self._test.excess(b, x)
+        if excess > 1:
+            with np.errstate(all="ignore"):
+                x = x + self._solve(np.asfortranarray(b - self._test.multiply(x)))
+            excess = self._test.excess(b, x)
+        if excess <= 1:
+            return x
+        if not np.isfinite(b).all():
+            raise NotPositiveDefinite("there is no solution: the right-hand side has NaN or infinite entries")
+        raise NotPositiveDefinite(
+            "the matrix is not numerically positive definite: the residual of the solution found by "
+            f"{self.name} is {excess:.1e} times what is allowed"
+        )
+
+    # ---- what a backend supplies ------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _analyse(self) -> None:
+        """Find an ordering for the pattern; called once, with n > 0."""
+
+    @abstractmethod
+    def _factor(self) -> None:
+        """Factor `self._values`, or raise `NotPositiveDefinite` if any pivot is not positive."""
+
+    @abstractmethod
+    def _solve(self, b: Floats) -> Floats:
+        """Solve for (n, k) Fortran-ordered `b`, leaving it as it is, into a new Fortran-ordered array."""
+
+    def _release(self) -> None:  # noqa: B027  (most backends have nothing to release beyond their objects)
+        """Give back what Python's memory management does not."""
+
+
+def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Ints, Ints]:
+    """Private int32 copies of a pattern of an upper triangle, checked entry by entry."""
+    starts, columns = np.asarray(indptr), np.asarray(indices)
+    if starts.ndim != 1 or columns.ndim != 1 or starts.size == 0 or starts[0] != 0 or starts[-1] != columns.size:
+        raise ValueError("indptr must be one-dimensional, start with 0 and end with the number of indices")
+    if columns.size > np.iinfo(np.int32).max:
+        raise ValueError(f"the matrix has {columns.size} entries; at most 2^31 - 1 are supported")
+    n = starts.size - 1
+    lengths = np.diff(starts)
+    if n and lengths.min() < 1:
+        raise ValueError(f"row {int(np.argmin(lengths))} has no entries; every row needs its diagonal entry")
+    off = np.flatnonzero(columns[starts[:-1]] != np.arange(n))
+    if off.size:
+        raise ValueError(f"row {int(off[0])} does not start with its diagonal entry")
+    ascending = columns[1:] > columns[:-1]
+    ascending[starts[1:-1] - 1] = True
+    if not ascending.all() or (n and columns.max() >= n):
+        raise ValueError("column indices must be ascending within each row and smaller than the number of rows")
+    return starts.astype(np.int32), columns.astype(np.int32)

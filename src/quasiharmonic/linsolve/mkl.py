@@ -1,0 +1,206 @@
+"""MKL PARDISO, called through ctypes from the library that the `mkl` wheel brings."""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import re
+import site
+import sys
+import weakref
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from .base import Floats, Ints, LinearSolver, NotPositiveDefinite
+
+_ANALYSE, _FACTOR, _SOLVE, _FORWARD_ONLY, _RELEASE = 11, 22, 33, 331, -1
+_MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3
+_CLASSIC_TWO_LEVEL, _IMPROVED_TWO_LEVEL = 1, 10
+
+# Below this many unknowns: minimum degree ordering, one thread. Above: nested dissection, all threads. Ordering by
+# dissection takes three times as long (85 against 29 ms at 20k) and pays in parallel factorisation, which at this size
+# saves less than 3 of 8 ms and at 300k three quarters. Small tasks on all threads also suffer badly when the machine is
+# busy with something else, because MKL's threads wait for each other by spinning.
+_SEQUENTIAL_BELOW = 30_000
+
+_NOT_POSITIVE_DEFINITE = {-4, -7}
+_OUT_OF_MEMORY = {-2, -9}
+_ERRORS = {
+    -1: "input inconsistent",
+    -2: "not enough memory",
+    -3: "reordering problem",
+    -5: "unclassified internal error",
+    -6: "reordering failed",
+    -8: "32-bit integer overflow",
+    -9: "not enough memory for out-of-core work",
+}
+
+
+class Pardiso(LinearSolver):
+    """Supernodal Cholesky factorisation of the upper triangle, multi-threaded for large matrices."""
+
+    name = "pardiso"
+    requirement = "pip install mkl (x86-64 Linux and Windows)"
+
+    @classmethod
+    def present(cls) -> bool:
+        """Whether MKL's runtime library is found."""
+        return find_mkl() is not None
+
+    def _analyse(self) -> None:
+        self._handle = _Handle(self._indptr, self._indices, self._values, sequential=self.n < _SEQUENTIAL_BELOW)
+        self._release_once = weakref.finalize(self, self._handle.release)
+        self._handle.check(_ANALYSE)
+        self._ones = np.ones((self.n, 1), order="F")
+
+    def _factor(self) -> None:
+        self._handle.check(_FACTOR)
+        # The improved two-level algorithm takes the root of a negative pivot and goes on. The NaN spreads to all that
+        # depends on it, and half a solve with one right-hand side, 5 % of the factorisation's time, finds it.
+        if self._handle.sequential:
+            forward = np.empty_like(self._ones)
+            self._handle.check(_FORWARD_ONLY, self._ones, forward)
+            if not np.isfinite(forward.sum()):
+                raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a negative pivot")
+
+    def _solve(self, b: Floats) -> Floats:
+        x = np.empty_like(b, order="F")
+        self._handle.check(_SOLVE, b, x)
+        return x
+
+    def _release(self) -> None:
+        self._release_once()
+
+
+class _Handle:
+    """One PARDISO instance with its arguments laid out once, so that a call only sets the phase.
+
+    It keeps the arrays alive whose addresses it holds, and does not know the solver, so that it can outlive it for the
+    moment it takes to release the memory.
+    """
+
+    def __init__(self, indptr: Ints, indices: Ints, values: Floats, *, sequential: bool) -> None:
+        self.sequential = sequential
+        self._library = load_mkl()
+        self._arrays = (indptr, indices, values)
+        self._memory = np.zeros(64, dtype=np.int64)
+        self._iparm = np.zeros(64, dtype=np.int32)
+        self._iparm[0] = 1  # take nothing from the defaults
+        self._iparm[1] = _MINIMUM_DEGREE if sequential else _PARALLEL_DISSECTION
+        # No iterative refinement: zero is off for Cholesky (a negative count refines in extended precision).
+        self._iparm[7] = 0
+        # The plain algorithm is slower to factor and takes four times as long for two right-hand sides. The classic
+        # two-level one reports negative pivots but insists on nested dissection. The improved one takes any ordering,
+        # but with minimum degree and several threads its solution of single right-hand sides is wrong (MKL 2026.2).
+        self._iparm[23] = _IMPROVED_TWO_LEVEL if sequential else _CLASSIC_TWO_LEVEL
+        self._iparm[34] = 1  # indices count from zero
+
+        self._phase = ctypes.c_int(0)
+        self._columns = ctypes.c_int(1)
+        self._error = ctypes.c_int(0)
+        constant = [ctypes.byref(ctypes.c_int(value)) for value in (1, 1, 2)]  # factors, which, positive definite
+        nothing = ctypes.c_void_p(None)
+        self._head = (
+            _address(self._memory),
+            *constant,
+            ctypes.byref(self._phase),
+            ctypes.byref(ctypes.c_int(len(indptr) - 1)),
+            _address(values),
+            _address(indptr),
+            _address(indices),
+            nothing,
+            ctypes.byref(self._columns),
+            _address(self._iparm),
+            ctypes.byref(ctypes.c_int(0)),  # print nothing
+        )
+
+    def check(self, phase: int, b: Floats | None = None, x: Floats | None = None) -> None:
+        """Run one phase and turn its error code into an exception."""
+        code = self._call(phase, b, x)
+        if code in _NOT_POSITIVE_DEFINITE:
+            raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a pivot that is not positive")
+        if code:
+            text = f"MKL PARDISO failed in phase {phase} with error {code}: {_ERRORS.get(code, 'unknown error')}"
+            raise MemoryError(text) if code in _OUT_OF_MEMORY else RuntimeError(text)
+
+    def release(self) -> None:
+        """Free what PARDISO allocated."""
+        self._call(_RELEASE, None, None)
+
+    def _call(self, phase: int, b: Floats | None, x: Floats | None) -> int:
+        self._phase.value = phase
+        self._columns.value = 1 if b is None else b.shape[1]
+        self._error.value = 0
+        # The setting is local to the calling thread and overrides the environment's; zero takes it back.
+        before = self._library.MKL_Set_Num_Threads_Local(1) if self.sequential else 0
+        try:
+            self._library.pardiso(*self._head, _address(b), _address(x), ctypes.byref(self._error))
+        finally:
+            if self.sequential:
+                self._library.MKL_Set_Num_Threads_Local(before)
+        return self._error.value
+
+
+def _address(array: Floats | Ints | np.ndarray[tuple[int, ...], np.dtype[np.int64]] | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if array is None else array.ctypes.data)
+
+
+@cache
+def load_mkl() -> ctypes.CDLL:
+    """Load MKL's runtime library, once; raise ImportError if there is none that serves."""
+    path = find_mkl()
+    if path is None:
+        raise ImportError("MKL's runtime library mkl_rt was not found; install it with: pip install mkl")
+    try:
+        library = ctypes.CDLL(path)
+        layer = library.MKL_Set_Interface_Layer(0)
+    except (OSError, AttributeError) as error:
+        raise ImportError(f"MKL's runtime library {path} does not load: {error}") from error
+    # The environment or another package may already have switched MKL to 64-bit integers, for the whole process.
+    if layer & 1:
+        raise ImportError("MKL is set to 64-bit integers (ILP64) in this process; PARDISO is called with 32-bit ones")
+    library.pardiso.restype = None
+    return library
+
+
+@cache
+def find_mkl() -> str | None:
+    """Path of MKL's runtime library, or None."""
+    if ctypes.sizeof(ctypes.c_void_p) != 8 or platform.machine().lower() not in ("x86_64", "amd64"):
+        return None
+    return next(_candidates(), None)
+
+
+def _candidates() -> Iterator[str]:
+    """Paths where MKL's runtime library lies, the likeliest first, newer versions before older ones."""
+    for prefix in (sys.prefix, site.getuserbase()):
+        found = [
+            path for folder in ("lib", "Library/bin") for path in Path(prefix, folder).glob("*mkl_rt*") if _fits(path)
+        ]
+        yield from map(str, sorted(found, key=_version, reverse=True))
+    # Environments that see the packages of another one.
+    from importlib.metadata import PackageNotFoundError, files
+
+    try:
+        found = [Path(str(file.locate())) for file in files("mkl") or () if _fits(Path(file.name))]
+        yield from map(str, sorted((path for path in found if path.exists()), key=_version, reverse=True))
+    except PackageNotFoundError:
+        pass
+    from ctypes.util import find_library
+
+    for name in ("mkl_rt", "mkl_rt.3", "mkl_rt.2", "mkl_rt.1"):
+        if path := find_library(name):
+            yield path
+
+
+def _fits(path: Path) -> bool:
+    """Whether the file is a runtime library by its name: libmkl_rt.so.3, libmkl_rt.2.dylib or mkl_rt.3.dll."""
+    return re.fullmatch(r"(lib)?mkl_rt(\.\d+)?\.(so(\.\d+)*|dylib|dll)", path.name) is not None
+
+
+def _version(path: Path) -> int:
+    numbers = re.findall(r"\d+", path.name)
+    return int(numbers[0]) if numbers else 0

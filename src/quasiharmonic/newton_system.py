@@ -1,0 +1,180 @@
+"""Second derivatives of a deformation energy in vertex positions: assembly, factorisation, solve.
+
+The pattern of the matrix is that of the mesh's edges in 2×2 blocks and never changes, so it is found and
+analysed once. An assembly turns the triangles' quadratic forms into blocks and adds these up into the
+values that the factorisation reads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from .energies import QuadraticForm
+from .linsolve import make_solver
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
+
+
+class NewtonSystem:
+    """The matrix of ``Σⱼ formⱼ(dp, dq)`` by the positions of the free vertices.
+
+    Unknowns alternate between the x and the y of the free vertices, in ascending order.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles.
+    g : (3, f) complex128
+        Half the gradients of the hat functions: ``dp = Σ conj(gᵢ) dwᵢ`` and ``dq = Σ gᵢ dwᵢ``.
+    n : int
+        Number of vertices.
+    fixed : (k,) int
+        Vertices that do not move.
+    linear_solver : str
+        A name of `quasiharmonic.linsolve`, or ``"auto"``.
+
+    Attributes
+    ----------
+    free : (n - k,) int64
+        The vertices that do, ascending.
+    """
+
+    def __init__(
+        self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto"
+    ) -> None:
+        is_free = np.ones(n, dtype=bool)
+        is_free[fixed] = False
+        self.free = np.flatnonzero(is_free)
+        size = self.free.size
+        place = np.full(n, -1, dtype=np.int64)
+        place[self.free] = np.arange(size)
+        corner = place[F.T]
+        self._pairs(g, corner)
+        self._pattern(corner, size)
+        self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
+
+    def _pairs(self, g: ComplexArray, corner: IntArray) -> None:
+        """Products of gradients over the sides, from lower to higher free vertex, and at the corners."""
+        first, second = corner, corner[(1, 2, 0), :]
+        g1, g2 = g, g[(1, 2, 0), :]
+        upward = first <= second
+        low, high = np.where(upward, g1, g2), np.where(upward, g2, g1)
+        self._side_products = _parts(low, high)
+        self._corner_products = _parts(g, g)
+
+    def _pattern(self, corner: IntArray, size: int) -> None:
+        """Where the blocks go."""
+        tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
+        count = tail.size
+        inner = np.flatnonzero((tail >= 0) & (head >= 0))
+        key = np.minimum(tail[inner], head[inner]) * size + np.maximum(tail[inner], head[inner])
+        order = np.argsort(key, kind="stable")
+        inner, key = inner[order], key[order]
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        row, column = np.divmod(key[first], max(size, 1))
+        self._sum_sides = _summation(inner, np.append(first, inner.size), count)
+        at = np.flatnonzero(tail >= 0)
+        at = at[np.argsort(tail[at], kind="stable")]
+        self._sum_corners = _summation(at, np.append(0, np.cumsum(np.bincount(tail[at], minlength=size))), count)
+
+        # Row 2i holds xx and xy of the diagonal block and then of the others, row 2i + 1 yy and then yx, yy.
+        degree = np.bincount(row, minlength=size)
+        upper = np.append(0, np.cumsum(4 * degree + 3))
+        lower = upper[:-1] + 2 * degree + 2
+        nth = np.arange(row.size) - np.append(0, np.cumsum(degree))[row]
+        self._corner_slots = np.stack([upper[:-1], upper[:-1] + 1, lower])
+        xx, yx = upper[row] + 2 + 2 * nth, lower[row] + 1 + 2 * nth
+        self._side_slots = np.stack([xx, xx + 1, yx, yx + 1])
+        self._indptr = np.append(np.stack([upper[:-1], lower], axis=1).ravel(), upper[-1]).astype(np.int32)
+        self._indices = np.empty(upper[-1], dtype=np.int32)
+        own = 2 * np.arange(size)
+        self._indices[self._corner_slots] = own, own + 1, own + 1
+        self._indices[self._side_slots] = 2 * column, 2 * column + 1, 2 * column, 2 * column + 1
+        self._rows = np.repeat(np.arange(2 * size, dtype=np.int32), np.diff(self._indptr))
+        self._values = np.empty(upper[-1])
+
+    def assemble(self, form: QuadraticForm) -> None:
+        """Add up the triangles' quadratic forms.
+
+        Parameters
+        ----------
+        form : QuadraticForm
+            On every triangle, with its area and weight in it.
+        """
+        sides, corners = _blocks(form, self._side_products), _blocks(form, self._corner_products)
+        for slot, part in zip(self._side_slots, sides, strict=True):
+            self._values[slot] = self._sum_sides @ part.ravel()
+        for slot, part in zip(self._corner_slots, (corners[0], corners[1], corners[3]), strict=True):
+            self._values[slot] = self._sum_corners @ part.ravel()
+
+    def matrix(self) -> csr_array:
+        """The assembled matrix, both triangles; for study and tests."""
+        size = self._indptr.size - 1
+        upper = csr_array((self._values, self._indices, self._indptr), shape=(size, size))
+        strict = csr_array((np.where(self._rows < self._indices, self._values, 0), self._indices, self._indptr))
+        return csr_array(upper + strict.T)
+
+    def factor(self, shift: float = 0.0) -> None:
+        """Factor the assembled matrix, scaled to a unit diagonal.
+
+        Areas that span many orders of magnitude make the entries do so too; the scaling takes that out.
+
+        Parameters
+        ----------
+        shift : float
+            Added to the scaled diagonal.
+
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When the matrix, as rounded, is not positive definite.
+        """
+        diagonal = self._values[self._indptr[:-1]]
+        # A vertex whose triangles leave it free to move keeps a unit diagonal of its own.
+        self._scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+        scaled = self._values * self._scale[self._rows] * self._scale[self._indices]
+        scaled[self._indptr[:-1]] = 1 + shift
+        self.solver.factor(scaled)
+
+    def solve(self, load: ComplexArray) -> ComplexArray:
+        """Solve for the free vertices' displacements under a load on them; (n - k,) complex128."""
+        rhs = load.view(np.float64) * self._scale
+        solution = np.asarray(self.solver.solve(rhs.reshape(-1, 1, order="F"))).ravel() * self._scale
+        return solution.view(np.complex128)
+
+    def descend(self, load: ComplexArray) -> ComplexArray:
+        """The load divided by the matrix's diagonal: what is left when no factorisation exists."""
+        return (load.view(np.float64) * self._scale**2).view(np.complex128)
+
+
+def _parts(g1: ComplexArray, g2: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Real and imaginary parts of ``g₁ conj(g₂)`` and of ``g₁ g₂``."""
+    turned, product = g1 * g2.conj(), g1 * g2
+    return turned.real.copy(), turned.imag.copy(), product.real.copy(), product.imag.copy()
+
+
+def _blocks(
+    form: QuadraticForm, products: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Entries xx, xy, yx, yy of the blocks between pairs of corners i, j.
+
+    With dp and dq written out, the form is the real part of ``Σ Mᵢⱼ conj(dwᵢ) dwⱼ + Nᵢⱼ dwᵢ dwⱼ``.
+    """
+    cr, ci, sr, si = products
+    p2, q2 = form.p2, form.q2
+    even = (form.pp + form.qq) * cr + (form.pqc.real * sr + form.pqc.imag * si)
+    odd = (form.pp - form.qq) * ci
+    real = (p2.real + q2.real) * sr + (p2.imag - q2.imag) * si + form.pq.real * cr
+    imag = (p2.imag + q2.imag) * sr + (q2.real - p2.real) * si + form.pq.imag * cr
+    return even + real, -odd - imag, odd - imag, even - real
+
+
+def _summation(members: IntArray, offsets: IntArray, count: int) -> csr_array:
+    """Sums of some of ``count`` numbers: row i adds up ``members[offsets[i]:offsets[i + 1]]``."""
+    return csr_array(
+        (np.ones(members.size), members.astype(np.int32), offsets.astype(np.int32)), shape=(offsets.size - 1, count)
+    )

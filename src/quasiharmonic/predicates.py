@@ -1,0 +1,322 @@
+"""Exact geometric predicates on arrays of points.
+
+Every predicate here is decided for the coordinates as they are stored, whatever their magnitude:
+doubles are rational numbers, and no answer depends on how arithmetic rounds. All rests on
+`orientation`, which works in three stages, each for what the one before could not decide:
+
+1. the determinant in floating point, with a bound on its error (one pass over the array);
+2. the same after scaling each triple by a power of two to magnitude one, then as a sum of sixteen
+   doubles that equals the determinant exactly, distilled until its sign shows;
+3. integers of any size, for triples whose coordinates span more than 130 orders of magnitude.
+
+IEEE 754 doubles with gradual underflow are assumed, which is what NumPy has unless another library
+in the process has switched its thread to flush subnormal numbers to zero.
+
+References
+----------
+.. [1] J. R. Shewchuk, Adaptive precision floating-point arithmetic and fast robust geometric
+   predicates. Discrete & Computational Geometry 18 (1997).
+.. [2] S. M. Rump, T. Ogita, S. Oishi, Accurate floating-point summation part I: faithful rounding.
+   SIAM Journal on Scientific Computing 31 (2008).
+.. [3] G. Bohlender, Floating-point computation of functions with maximum accuracy.
+   IEEE Transactions on Computers C-26 (1977).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+SignArray = NDArray[np.int8]
+IntArray = NDArray[np.int64]
+
+# |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r,
+# u = 2⁻⁵³ [1]_, and 4u covers the second order and the rounding of the bound itself.
+_RELATIVE_BOUND = 2.0**-51
+# Each of the two products, and the bound, may lose up to 2⁻¹⁰⁷⁵ to underflow; sums lose nothing.
+_UNDERFLOW_BOUND = 2.0**-1060
+# After scaling, a coordinate is 0 or at least this (or else stage 3 has it): then all that stage 2
+# forms is a multiple of 2⁻⁹⁸⁴ and no product underflows.
+_SMALLEST_SCALED = 2.0**-440
+# Triples that stage 2 takes at a time, so that its sixteen components stay in the cache.
+_EXACT_CHUNK = 8192
+# Pairs of boxes that `box_pairs` handles at a time.
+_PAIR_CHUNK = 1 << 17
+
+
+def orientation(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> SignArray:
+    """Exact sign of the signed area of triangles.
+
+    Parameters
+    ----------
+    a, b, c : (k, 2) float64
+        Corners, or arrays that broadcast to a common shape (..., 2).
+
+    Returns
+    -------
+    (k,) int8
+        1 where ``a, b, c`` is counterclockwise, -1 where it is clockwise, 0 where the three points
+        lie exactly on a line.
+
+    Raises
+    ------
+    ValueError
+        When a coordinate is NaN or infinite.
+
+    Examples
+    --------
+    >>> orientation([[0.0, 0.0]], [[1.0, 0.0]], [[0.5, 1e-300]])
+    array([1], dtype=int8)
+    """
+    sign, nonfinite = orientation_or_nonfinite(a, b, c)
+    if nonfinite.size:
+        raise ValueError(f"NaN or infinite coordinates in triple {nonfinite[0]} ({nonfinite.size} in all)")
+    return sign
+
+
+def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[SignArray, IntArray]:
+    """As `orientation`, but name the triples with NaN or infinite coordinates instead of refusing them.
+
+    Returns
+    -------
+    sign : (k,) int8
+        As `orientation` has it, and 0 for the triples in ``nonfinite``.
+    nonfinite : (m,) int64
+        Ascending flat indices of the triples that have no orientation.
+    """
+    a, b, c = (np.asarray(p, dtype=np.float64) for p in (a, b, c))
+    corners = (a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
+    # An overflow or an invalid operation makes the bound infinite or the determinant NaN: undecided.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        sign = _filtered(*corners)
+        if np.all(sign):
+            return sign, np.empty(0, dtype=np.int64)
+        undecided = sign == 0
+        x = np.stack([np.broadcast_to(p, sign.shape)[undecided] for p in corners])
+        finite = np.isfinite(x).all(axis=0)
+        decided = np.zeros(finite.size, dtype=np.int8)
+        decided[finite] = _exact(x[:, finite])
+        sign[undecided] = decided
+    return sign, np.flatnonzero(undecided)[~finite]
+
+
+def _filtered(
+    ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray, cx: FloatArray, cy: FloatArray
+) -> SignArray:
+    """Sign of the orientation where floating point is sure of it, 0 elsewhere."""
+    left = (ax - cx) * (by - cy)
+    right = (ay - cy) * (bx - cx)
+    det = left - right
+    bound = np.abs(left)
+    bound += np.abs(right)
+    bound *= _RELATIVE_BOUND
+    bound += _UNDERFLOW_BOUND
+    sign = np.asarray(det > bound).view(np.int8)
+    sign -= np.asarray(det < -bound).view(np.int8)
+    return sign
+
+
+def _exact(x: FloatArray) -> SignArray:
+    """Orientation of the triples ``x``, (6, k) finite, as rows ax, ay, bx, by, cx, cy."""
+    # Differences have the right sign even where they are rounded, so products of different sign
+    # decide; this settles corners that coincide and lines along an axis at little cost.
+    left = np.sign(x[0] - x[4]) * np.sign(x[3] - x[5])
+    right = np.sign(x[1] - x[5]) * np.sign(x[2] - x[4])
+    sign: SignArray = np.sign(left - right).astype(np.int8)
+    open_ = np.flatnonzero((left == right) & (left != 0) & ((x[0] != x[2]) | (x[1] != x[3])))
+    for start in range(0, open_.size, _EXACT_CHUNK):
+        chunk = open_[start : start + _EXACT_CHUNK]
+        sign[chunk] = _scaled(x[:, chunk])
+    return sign
+
+
+def _scaled(x: FloatArray) -> SignArray:
+    """As `_exact`, with every triple brought to magnitude one."""
+    exponent = np.frexp(np.abs(x).max(axis=0))[1]
+    scaled = np.ldexp(x, -exponent)
+    # Scaling may have rounded these, so what follows holds for the others.
+    wide = ((np.abs(scaled) < _SMALLEST_SCALED) & (x != 0)).any(axis=0)
+    sign = _filtered(*scaled)
+    open_ = (sign == 0) & ~wide
+    if np.any(open_):
+        sign[open_] = _expanded(scaled[:, open_])
+    for k in np.flatnonzero(wide):
+        sign[k] = _in_integers(x[:, k])
+    return sign
+
+
+def _expanded(x: FloatArray) -> SignArray:
+    """Orientation by expansion, for coordinates of magnitude up to one that are 0 or ≥ 2⁻⁴⁴⁰."""
+    (ax, bx), (ax_tail, bx_tail) = _two_sum(x[0:4:2], -x[4])
+    (ay, by), (ay_tail, by_tail) = _two_sum(x[1:4:2], -x[5])
+    # (ax + ax_tail)(by + by_tail) − (ay + ay_tail)(bx + bx_tail), product by product, small ones first.
+    product, error = _two_product(
+        np.stack([ax_tail, -ay_tail, ax_tail, ax, -ay_tail, -ay, ax, -ay]),
+        np.stack([by_tail, bx_tail, by, by_tail, bx, bx_tail, by, bx]),
+    )
+    return _sign_of_sum(np.concatenate([error[:2], product[:2], error[2:6], error[6:], product[2:6], product[6:]]))
+
+
+def _sign_of_sum(terms: FloatArray) -> SignArray:
+    """Exact sign of the sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow.
+
+    Each sweep replaces the terms by others of the same exact sum, the last of which is the rounded
+    sum, the rest what was lost on the way [2]_. A sum is decided when the last outweighs the rest,
+    which it does after at most t - 1 sweeps [3]_ and as a rule after two or three.
+    """
+    sign = np.zeros(terms.shape[1], dtype=np.int8)
+    left = np.arange(terms.shape[1])
+    while left.size:
+        for i in range(1, len(terms)):
+            terms[i], terms[i - 1] = _two_sum(terms[i], terms[i - 1])
+        # Doubled, the computed weight of the rest is surely above the true one.
+        rest = 2.0 * np.abs(terms[:-1]).sum(axis=0)
+        decided = (np.abs(terms[-1]) > rest) | (rest == 0.0)
+        sign[left[decided]] = np.sign(terms[-1, decided])
+        left, terms = left[~decided], terms[:, ~decided]
+    return sign
+
+
+def _two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rounded sum and its error: ``a + b`` exactly (Knuth)."""
+    total = a + b
+    b_part = total - a
+    return total, (a - (total - b_part)) + (b - b_part)
+
+
+def _two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rounded product and its error: ``a * b`` exactly (Dekker, Veltkamp)."""
+    product = a * b
+    a_high, a_low = _split(a)
+    b_high, b_low = _split(b)
+    error = a_low * b_low - (((product - a_high * b_high) - a_low * b_high) - a_high * b_low)
+    return product, error
+
+
+def _split(a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Halves of at most 26 bits each with exact sum ``a``."""
+    scaled = 134217729.0 * a  # 2²⁷ + 1
+    high = scaled - (scaled - a)
+    return high, a - high
+
+
+def _in_integers(x: FloatArray) -> int:
+    """Orientation of one triple (6,) in integer arithmetic."""
+    ratios = [value.as_integer_ratio() for value in x.tolist()]
+    unit = max(denominator for _, denominator in ratios)  # all are powers of two
+    ax, ay, bx, by, cx, cy = (numerator * (unit // denominator) for numerator, denominator in ratios)
+    det: int = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
+    return (det > 0) - (det < 0)
+
+
+class SegmentRelation(IntEnum):
+    """What two closed segments have in common."""
+
+    DISJOINT = 0
+    """No point."""
+    CROSSING = 1
+    """One point, interior to both."""
+    TOUCHING = 2
+    """One point, an end of at least one of them."""
+    OVERLAPPING = 3
+    """A segment of positive length."""
+
+
+def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> SignArray:
+    """Decide exactly what the closed segments ``pq`` and ``rs`` have in common.
+
+    Parameters
+    ----------
+    p, q, r, s : (k, 2) float64
+        Ends of the segments, finite; a segment may be a single point.
+
+    Returns
+    -------
+    (k,) int8
+        Values of `SegmentRelation`.
+    """
+    relation = np.zeros(len(p), dtype=np.int8)
+    r_side, s_side = orientation(p, q, r), orientation(p, q, s)
+    # Most candidates have rs strictly on one side of pq and need no more than this.
+    near = np.flatnonzero(r_side * s_side <= 0)
+    p, q, r, s = (array.take(near, axis=0) for array in (p, q, r, s))
+    r_side, s_side = r_side[near], s_side[near]
+    p_side, q_side = orientation(r, s, p), orientation(r, s, q)
+    crossing = (r_side * s_side < 0) & (p_side * q_side < 0)
+    touching = (
+        ((r_side == 0) & _in_box(r, p, q))
+        | ((s_side == 0) & _in_box(s, p, q))
+        | ((p_side == 0) & _in_box(p, r, s))
+        | ((q_side == 0) & _in_box(q, r, s))
+    )
+    # On a common line the lexicographic order is the order along it, and an overlap is that of intervals.
+    collinear = (r_side == 0) & (s_side == 0) & (p_side == 0) & (q_side == 0)
+    p_first, r_first = _before(p, q), _before(r, s)
+    p, q = np.where(p_first[:, None], p, q), np.where(p_first[:, None], q, p)
+    r, s = np.where(r_first[:, None], r, s), np.where(r_first[:, None], s, r)
+    start = np.where(_before(p, r)[:, None], r, p)
+    end = np.where(_before(q, s)[:, None], q, s)
+    relation[near[touching]] = SegmentRelation.TOUCHING
+    relation[near[crossing]] = SegmentRelation.CROSSING
+    relation[near[collinear & _before(start, end)]] = SegmentRelation.OVERLAPPING
+    return relation
+
+
+def _before(a: FloatArray, b: FloatArray) -> BoolArray:
+    """Lexicographic order of points: by x, then by y."""
+    less: BoolArray = (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
+    return less
+
+
+def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
+    """Whether ``x`` lies in the closed box spanned by ``p`` and ``q``."""
+    inside: BoolArray = (np.minimum(p, q) <= x) & (x <= np.maximum(p, q))
+    return inside[:, 0] & inside[:, 1]
+
+
+def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of closed boxes that meet, in portions.
+
+    A binary tree over the boxes *in the order given* is descended against itself, all pairs of a
+    level at once. Boxes of consecutive edges of a curve make a tight tree whatever the scale of its
+    parts, so the cost for such boxes is about proportional to their number and the pairs found.
+
+    Parameters
+    ----------
+    lo, hi : (k, 2) float64
+        Corners.
+
+    Yields
+    ------
+    i, j : (m,) int64
+        Indices of boxes that meet, ``i < j``, each pair once.
+    """
+    depth = max(len(lo) - 1, 0).bit_length()
+    # Missing leaves are boxes that nothing meets.
+    padding = ((0, (1 << depth) - len(lo)), (0, 0))
+    tree = [(np.pad(lo, padding, constant_values=np.inf), np.pad(hi, padding, constant_values=-np.inf))]
+    for _ in range(depth):
+        lo, hi = tree[-1]
+        tree.append((np.minimum(lo[::2], lo[1::2]), np.maximum(hi[::2], hi[1::2])))
+    # The deepest portion first, so that what waits stays small however many pairs there are.
+    waiting = [(depth, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))]
+    while waiting:
+        level, i, j = waiting.pop()
+        lo, hi = tree[level]
+        meet = (lo.take(i, 0) <= hi.take(j, 0)) & (lo.take(j, 0) <= hi.take(i, 0))
+        i, j = i[meet[:, 0] & meet[:, 1]], j[meet[:, 0] & meet[:, 1]]
+        if level == 0:
+            yield i[i < j], j[i < j]
+            continue
+        same = i[i == j]
+        i, j = i[i < j], j[i < j]
+        i = np.concatenate([2 * same, 2 * same, 2 * same + 1, 2 * i, 2 * i, 2 * i + 1, 2 * i + 1])
+        j = np.concatenate([2 * same, 2 * same + 1, 2 * same + 1, 2 * j, 2 * j + 1, 2 * j, 2 * j + 1])
+        for start in range(0, i.size, _PAIR_CHUNK):
+            chunk = slice(start, start + _PAIR_CHUNK)
+            waiting.append((level - 1, i[chunk], j[chunk]))

@@ -1,0 +1,502 @@
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quasiharmonic.certificate import Obstacle, certify, flipped_triangles, is_injective
+from quasiharmonic.predicates import SegmentRelation
+from test_predicates import exact_orientation, exact_relation
+
+SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
+CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+def strip(columns, rows=1, closed=False):
+    """A band of ``columns × rows`` squares, column after column, along the first axis; closed to a ring or not."""
+    index = np.arange((columns + (not closed)) * (rows + 1)).reshape(-1, rows + 1)
+    following = np.roll(index, -1, axis=0) if closed else index[1:]
+    index = index if closed else index[:-1]
+    a, b, c, d = index[:, :-1], following[:, :-1], following[:, 1:], index[:, 1:]
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+
+
+def polar(radius, turns):
+    return np.stack([radius * np.cos(2 * np.pi * turns), radius * np.sin(2 * np.pi * turns)], axis=-1)
+
+
+def spiral(turns, pitch, columns=60):
+    """A band of width one wound around the origin, its inner side first in every column."""
+    t = np.linspace(0, turns, columns + 1)
+    # Counterclockwise columns need the outer side first.
+    outer, inner = polar(2 + pitch * t, t), polar(1 + pitch * t, t)
+    return strip(columns), np.stack([outer, inner], axis=1).reshape(-1, 2)
+
+
+def ring(inner=1.0, outer=2.0, columns=12):
+    """An annulus: vertex 2i outside, 2i + 1 inside."""
+    t = np.arange(columns) / columns
+    return strip(columns, closed=True), np.stack([polar(outer, t), polar(inner, t)], axis=1).reshape(-1, 2)
+
+
+def fan(polygon, centre=(0.0, 0.0)):
+    """A disk whose boundary goes onto a polygon: vertex 0 in the middle."""
+    k = len(polygon)
+    rim = np.arange(k)
+    return np.stack([np.zeros(k, dtype=int), 1 + rim, 1 + (rim + 1) % k], axis=1), np.vstack([centre, polygon])
+
+
+def together(*parts):
+    """Several meshes as one."""
+    offsets = np.cumsum([0] + [len(uv) for _, uv in parts])
+    return np.vstack([F + o for (F, _), o in zip(parts, offsets, strict=False)]), np.vstack([uv for _, uv in parts])
+
+
+def square(x, y, size):
+    return SQUARE, CORNERS * size + (x, y)
+
+
+def crossed_sheets():
+    """A ring of positive triangles with two branch points: two disks, a smaller one above, joined crosswise.
+
+    The slit is at y = 3 from x = 2 to x = 4; who crosses it changes sheet.
+    """
+    place, number = [], {}
+
+    def vertex(sheet, x, y, above):
+        if y == 3 and x in (2, 4):
+            key = ("end", x, y)
+        elif y == 3 and x == 3:
+            key = ("slit", sheet == above, x)
+        else:
+            key = (sheet, x, y)
+        if key not in number:
+            number[key] = len(place)
+            place.append((float(x), float(y)))
+        return number[key]
+
+    faces = []
+    for sheet, low, high in ((0, 0, 6), (1, 1, 5)):
+        for x, y in itertools.product(range(low, high), repeat=2):
+            a, b, c, d = (vertex(sheet, x + i, y + j, y >= 3) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+            faces += [(a, b, c), (a, c, d)]
+    return np.array(faces), np.array(place), sorted(number["end", x, 3] for x in (2, 4))
+
+
+def kinds(certificate):
+    return {reason.kind for reason in certificate.reasons}
+
+
+def covers_nothing_twice(F, uv):
+    """Injectivity by comparing all triangles with each other in rational arithmetic."""
+    if any(exact_orientation(*uv[t]) <= 0 for t in F):
+        return False
+    for s, t in itertools.combinations(F.tolist(), 2):
+        edges_s, edges_t = ([(f[i], f[(i + 1) % 3]) for i in range(3)] for f in (s, t))
+        apart = any(
+            all(exact_orientation(uv[i], uv[j], uv[v]) <= 0 for v in other)
+            for own, other in ((edges_s, t), (edges_t, s))
+            for i, j in own
+        )
+        if not apart:
+            return False
+        for (i, j), (k, m) in itertools.product(edges_s, edges_t):
+            shared = {i, j} & {k, m}
+            relation = exact_relation(uv[i], uv[j], uv[k], uv[m])
+            allowed = (SegmentRelation.DISJOINT, SegmentRelation.TOUCHING, SegmentRelation.OVERLAPPING)[len(shared)]
+            if relation != allowed:
+                return False
+    return True
+
+
+# --- triangles ---
+
+
+def test_the_three_verdicts_on_a_triangle():
+    F = np.array([[0, 1, 2], [0, 2, 1], [0, 1, 3], [0, 0, 1], [0, 1, 4], [5, 1, 2]])
+    uv = np.array([[0.0, 0], [1, 0], [0, 1], [2, 0], [np.nan, 0], [0, np.inf]])
+    c = certify(F, uv)
+    np.testing.assert_array_equal(c.flipped, [1])
+    np.testing.assert_array_equal(c.degenerate, [2, 3])
+    np.testing.assert_array_equal(c.nonfinite, [4, 5])
+    np.testing.assert_array_equal(flipped_triangles(F, uv), [1, 2, 3, 4, 5])
+    assert all(array.dtype == np.int64 for array in (c.flipped, c.degenerate, c.nonfinite))
+    assert not c.injective
+    assert c.bijective is False
+    assert not is_injective(F, uv)
+    said = "of 6 triangles, 1 is flipped (1), 2 are degenerate (2, 3), 2 are not finite (4, 5)"
+    assert said in c.summary()
+
+
+def test_predicate_and_locator_agree_with_the_certificate(rng, monkeypatch):
+    monkeypatch.setattr("quasiharmonic.certificate._TRIANGLE_CHUNK", 7)
+    F = strip(6, rows=5)
+    flat = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0), indexing="ij"), axis=-1).reshape(-1, 2)
+    for noise in (0.0, 0.1, 0.4, 1.0):
+        uv = flat + noise * rng.standard_normal(flat.shape)
+        uv[3] = np.round(uv[3])
+        signs = np.array([exact_orientation(*uv[t]) for t in F])
+        c = certify(F, uv, boundary=False)
+        np.testing.assert_array_equal(c.flipped, np.flatnonzero(signs < 0))
+        np.testing.assert_array_equal(c.degenerate, np.flatnonzero(signs == 0))
+        np.testing.assert_array_equal(flipped_triangles(F, uv), np.flatnonzero(signs <= 0))
+        assert is_injective(F, uv) == c.injective == bool((signs > 0).all())
+        assert c.bijective is None
+
+
+@pytest.mark.parametrize("scale", [1e-310, 1e-150, 1e-12, 1.0, 1e12, 1e150, 1e305])
+def test_verdicts_do_not_depend_on_scale(scale):
+    F, uv = ring()
+    assert certify(F, uv * scale).bijective
+    uv[1] = uv[5]
+    c = certify(F, uv * scale)
+    assert c.degenerate.size + c.flipped.size == flipped_triangles(F, uv).size
+    assert Obstacle.SELF_INTERSECTION in kinds(c)
+
+
+def test_offset_of_a_hundred_million_times_the_size():
+    F, uv = ring()
+    uv = uv + 4e8  # exact enough for doubles, not for singles
+    assert certify(F, uv).bijective
+    single = certify(F, uv.astype(np.float32))
+    assert not single.injective
+    assert single.degenerate.size
+
+
+def test_dtypes_layouts_and_untouched_input():
+    F, uv = ring()
+    uv = np.round(uv * 64)
+    for index in (np.int8, np.uint8, np.int32, np.uint64, ">i4"):
+        for real in (np.float16, np.float32, np.longdouble, ">f8", np.int16):
+            assert certify(F.astype(index), uv.astype(real)).bijective
+    padded = np.zeros((len(uv), 5))
+    padded[:, 1:4:2] = uv
+    view = padded[:, 1:4:2]
+    view.flags.writeable = False
+    assert certify(np.asfortranarray(F), view).bijective
+    assert certify(F.tolist(), uv.tolist()).bijective
+
+
+def test_vertices_of_no_triangle_are_not_looked_at():
+    uv = np.vstack([CORNERS, [[np.nan, np.inf], [0.5, 0.5]]])
+    assert certify(SQUARE, uv).bijective
+
+
+@pytest.mark.parametrize(
+    ("F", "uv", "said"),
+    [
+        (SQUARE[0], CORNERS, r"F has shape \(3,\)"),
+        (np.zeros((2, 4), int), CORNERS, r"F has shape \(2, 4\)"),
+        (SQUARE.astype(float), CORNERS, "F has dtype float64"),
+        (SQUARE.astype(bool), CORNERS, "F has dtype bool"),
+        (SQUARE + 1, CORNERS, r"outside 0 … 3 in triangle 1$"),
+        (np.repeat([[0, 1, -1]], 9, axis=0), CORNERS, r"triangles 0, 1, 2, 3, 4, … \(9 in all\)"),
+        (SQUARE, CORNERS[:, :1], r"uv has shape \(4, 1\)"),
+        (SQUARE, np.zeros((4, 3)), r"uv has shape \(4, 3\)"),
+        (SQUARE, CORNERS.astype(complex), "uv has dtype complex128"),
+        (SQUARE, CORNERS.astype(int) * (2**53 + 1), "double precision at vertices 1, 2, 3"),
+    ],
+)
+def test_malformed_input_is_named(F, uv, said):
+    for function in (certify, is_injective, flipped_triangles):
+        with pytest.raises(ValueError, match=said):
+            function(F, uv)
+
+
+def test_nothing_is_not_injective():
+    c = certify(np.empty((0, 3), int), np.empty((0, 2)))
+    assert not c.injective
+    assert c.bijective is False
+    assert c.summary() == "Not injective: there are no triangles."
+    assert not is_injective(np.empty((0, 3), int), CORNERS)
+
+
+# --- the whole map ---
+
+
+def test_disks_and_rings_that_are_bijective():
+    assert certify(SQUARE, CORNERS).bijective
+    assert certify(*spiral(turns=4, pitch=1.1)).bijective
+    assert certify(*ring()).bijective
+    c = certify(*together(square(0, 0, 1), square(2, 0, 1)))
+    assert c.bijective
+    assert len(c.loops) == 2
+    # An island in a lake on an island.
+    assert certify(*together(ring(3, 4), ring(1, 2), square(-0.4, -0.4, 0.8))).bijective
+
+
+def test_a_ring_turned_inside_out_is_bijective():
+    F, uv = ring()
+    uv = uv * [1, -1] / (uv**2).sum(axis=1, keepdims=True)
+    assert certify(F, uv).bijective
+
+
+def test_a_band_that_overlaps_itself_is_injective_only():
+    c = certify(*spiral(turns=1.5, pitch=0.5))
+    assert c.injective
+    assert c.bijective is False
+    assert kinds(c) == {Obstacle.SELF_INTERSECTION}
+    assert len(c.crossings)
+    assert c.summary().startswith(
+        "Injective: all 120 triangles are positive. Not bijective: boundary loop 0 meets itself ("
+    )
+
+
+def test_crossings_are_the_edges_that_cross():
+    F, uv = fan([[0, 0], [2, 2], [2, 0], [0, 2]], centre=(1, 1.5))
+    c = certify(F, uv)
+    np.testing.assert_array_equal(c.crossings, [[1, 2, 3, 4]])
+
+
+@pytest.mark.parametrize(
+    "polygon",
+    [
+        [[0, 0], [2, 0], [1, 0], [1, 1]],  # an edge back along the one before
+        [[0, 0], [2, 0], [2, 0], [0, 2]],  # an edge of no length
+        [[0, 0], [1, 0], [2, 0]],  # all on a line
+        [[0, 0], [0, 0], [0, 0]],
+        [[0, 0], [4, 0], [4, 2], [2, 0], [0, 2]],  # a vertex on an edge
+        [[0, 0], [2, 1], [4, 0], [4, 2], [2, 1], [0, 2]],  # two vertices at one place
+    ],
+)
+def test_touching_is_not_simple(polygon):
+    c = certify(*fan(polygon, centre=(1, 1)))
+    assert Obstacle.SELF_INTERSECTION in kinds(c)
+
+
+def test_inner_loop_outside_the_outer_one():
+    F, uv = ring()
+    uv[1::2] += [5, 0]
+    c = certify(F, uv)
+    assert c.flipped.size
+    assert Obstacle.WINDING in kinds(c)
+    assert [r.loops for r in c.reasons if r.kind is Obstacle.WINDING] == [(1,)]
+    assert "loop 1 runs clockwise and no other loop is around it" in c.summary()
+
+
+def test_inner_loop_touching_or_crossing_the_outer_one():
+    for shift in (1.0, 1.5):
+        F, uv = ring()
+        uv[1::2] += [shift, 0]  # vertex 1 comes to vertex 0, or passes it
+        c = certify(F, uv)
+        assert Obstacle.INTERSECTION in kinds(c)
+        assert [r.loops for r in c.reasons if r.kind is Obstacle.INTERSECTION] == [(0, 1)]
+
+
+def test_mirrored_map():
+    c = certify(ring()[0], ring()[1] * [-1, 1])
+    assert c.flipped.size == 24
+    assert {Obstacle.WINDING, Obstacle.NESTING} <= kinds(c)
+
+
+def test_a_fan_wound_twice():
+    for start in np.linspace(0, 1, 7):
+        t = start + np.arange(10) / 5
+        c = certify(*fan(polar(np.linspace(1, 2, 10), t)))
+        assert c.injective
+        assert c.bijective is False
+        np.testing.assert_array_equal(c.overwound, [0])
+        assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.OVERWOUND}
+
+
+def test_a_fan_wound_once_is_not_overwound(rng):
+    for _ in range(20):
+        t = np.sort(rng.random(9)) if rng.random() < 0.5 else (np.arange(8) / 8)
+        uv = polar(rng.uniform(1, 2, len(t)), t)
+        assert not certify(*fan(np.round(uv, 1))).overwound.size
+
+
+def test_only_interior_vertices_with_positive_triangles_are_overwound():
+    F, uv = fan(polar(np.linspace(1, 2, 12), np.arange(12) / 5))
+    c = certify(F[:-1], uv)  # vertex 0 is on the boundary now
+    assert c.injective
+    assert kinds(c) == {Obstacle.SELF_INTERSECTION}
+    t = np.array([0, 0.3, 0.6, 0.5, 0.8, 1.1, 1.4, 1.7])
+    c = certify(*fan(polar(np.linspace(1, 2, 8), t)))
+    np.testing.assert_array_equal(c.flipped, [2])
+    assert not c.overwound.size
+
+
+def test_branched_sheets_with_simple_loops_apart():
+    F, uv, branches = crossed_sheets()
+    c = certify(F, uv)
+    assert c.injective
+    assert c.bijective is False
+    assert not len(c.crossings)
+    np.testing.assert_array_equal(c.overwound, branches)
+    assert kinds(c) == {Obstacle.NESTING, Obstacle.OVERWOUND}
+    assert "covered 2 times" in c.summary()
+
+
+@pytest.mark.parametrize(
+    ("parts", "kind"),
+    [
+        ((square(0, 0, 2), square(1, 1, 2)), Obstacle.INTERSECTION),
+        ((square(0, 0, 2), square(2, 2, 2)), Obstacle.INTERSECTION),
+        ((square(0, 0, 2), square(2, 0.5, 1)), Obstacle.INTERSECTION),
+        ((square(0, 0, 2), square(0, 0, 2)), Obstacle.INTERSECTION),
+        ((square(0, 0, 3), square(1, 1, 1)), Obstacle.NESTING),
+    ],
+)
+def test_islands_that_overlap_or_touch(parts, kind):
+    c = certify(*together(*parts))
+    assert c.injective
+    assert c.bijective is False
+    assert kinds(c) == {kind}
+
+
+@pytest.mark.parametrize(
+    ("F", "said"),
+    [
+        ([[0, 1, 2], [0, 3, 1], [0, 1, 4]], r"edges are in three or more triangles (0–1)"),
+        ([[0, 1, 2], [0, 1, 3]], "edges are traversed twice in the same direction (0–1)"),
+        ([[0, 1, 2], [0, 1, 1]], "triangles repeat a vertex (1)"),
+        ([[0, 1, 2], [2, 3, 4]], "passes more than once through vertex 2"),
+    ],
+)
+def test_meshes_that_are_no_surface(F, said):
+    uv = np.array([[0.0, 0], [4, 0], [2, 1], [3, 2], [1, 2]])
+    c = certify(F, uv)
+    assert c.bijective is False
+    assert Obstacle.NOT_A_SURFACE in kinds(c)
+    assert said in c.summary()
+    assert c.injective == all(exact_orientation(*uv[t]) > 0 for t in F)
+
+
+def test_a_closed_surface():
+    F = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    c = certify(F, np.array([[0.0, 0], [3, 0], [0, 3], [1, 1]]))
+    np.testing.assert_array_equal(c.flipped, [0])
+    assert Obstacle.NO_BOUNDARY in kinds(c)
+
+
+def test_boundary_that_is_not_finite():
+    uv = CORNERS.copy()
+    uv[2] = np.nan
+    c = certify(SQUARE, uv)
+    assert c.bijective is False
+    assert kinds(c) == {Obstacle.NOT_INJECTIVE}
+
+
+def test_a_collapsed_map_is_answered_quickly():
+    F, uv = ring(columns=20_000)
+    c = certify(F, np.zeros_like(uv))
+    assert c.degenerate.size == len(F)
+    assert 0 < len(c.crossings) <= 1000
+
+
+def test_many_loops_and_long_loops():
+    holes = [ring(1, 1.5, columns=5)[1] + [4 * i, 4 * j] for i in range(15) for j in range(15)]
+    F = ring(columns=5)[0]
+    assert certify(*together(*((F, uv) for uv in holes))).bijective
+    assert certify(*together(*((F, uv) for uv in holes), square(-3, -3, 70))).reasons[0].kind is Obstacle.NESTING
+    assert certify(*ring(columns=30_000)).bijective
+
+
+def test_certificate_is_frozen_and_fit_for_json():
+    F, uv, _ = crossed_sheets()
+    for c in (certify(F, uv), certify(F, uv * [-1, 1]), certify(SQUARE, CORNERS, boundary=False), certify(*ring())):
+        told = json.loads(json.dumps(c.to_dict()))
+        assert told["injective"] == c.injective
+        assert told["bijective"] == c.bijective
+        assert told["flipped"] == c.flipped.tolist()
+        assert len(told["reasons"]) == len(c.reasons)
+        assert [str(r) for r in c.reasons] == [r["text"] for r in told["reasons"]]
+    assert told["loops"] == [{"start": 0, "length": 12}, {"start": 1, "length": 12}]
+    with pytest.raises(ValueError, match="read-only"):
+        c.flipped[:] = 0
+    with pytest.raises(AttributeError):
+        c.triangles = 3
+
+
+# --- against slower ways of deciding the same ---
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_bijective_means_that_no_triangles_share_more_than_their_vertices(data):
+    base = data.draw(st.sampled_from(["band", "ring", "fan", "islands"]))
+    if base == "band":
+        turns = data.draw(st.sampled_from([0.5, 0.9, 1.0, 1.2]))
+        F, uv = spiral(turns, pitch=data.draw(st.sampled_from([0.0, 0.5, 1.0, 1.5])), columns=7)
+    elif base == "ring":
+        F, uv = ring(inner=data.draw(st.sampled_from([0.25, 1.0, 1.75])), columns=5)
+    elif base == "fan":
+        k, turns = data.draw(st.sampled_from([(5, 1), (7, 2)]))
+        F, uv = fan(
+            polar(
+                np.array(data.draw(st.lists(st.integers(4, 8), min_size=k, max_size=k))) / 4, np.arange(k) * turns / k
+            )
+        )
+    else:
+        shift = data.draw(st.tuples(*[st.sampled_from([-3, -1.5, -1, 0, 0.5, 2.25])] * 2))
+        F, uv = together(ring(columns=4), square(*shift, 0.75))
+    # On a coarse lattice, so that touching and collinear happen.
+    cells = data.draw(st.sampled_from([2, 4, 64]))
+    uv = np.round(uv * cells) / cells
+    moved = data.draw(st.integers(0, len(uv) - 1))
+    uv[moved] += np.array(data.draw(st.tuples(*[st.integers(-1, 1)] * 2))) / cells
+    assert certify(F, uv).bijective == covers_nothing_twice(F, uv)
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=8))
+@settings(deadline=None)
+def test_polygons_are_judged_as_by_all_pairs_of_edges(polygon):
+    k = len(polygon)
+    places = np.array(polygon, dtype=float)
+    relation = {
+        (i, j): exact_relation(places[i], places[(i + 1) % k], places[j], places[(j + 1) % k])
+        for i, j in itertools.combinations(range(k), 2)
+    }
+    simple = len(set(polygon)) == k and all(
+        value == (SegmentRelation.TOUCHING if j - i in (1, k - 1) else SegmentRelation.DISJOINT)
+        for (i, j), value in relation.items()
+    )
+    found = kinds(certify(*fan(places, centre=(0.5, 1.25))))
+    assert (Obstacle.SELF_INTERSECTION not in found) == simple
+    if simple:
+        x, y = places.T
+        assert (Obstacle.WINDING in found) == (np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
+
+
+@pytest.fixture(scope="module")
+def independent():
+    """The project's independent checker, where it lies beside the repository."""
+    path = Path(__file__).parents[2] / "shared" / "tools" / "check_map.py"
+    if not path.exists():
+        pytest.skip("no independent checker beside the repository")
+    spec = importlib.util.spec_from_file_location("check_map", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_agreement_with_the_independent_checker(independent, rng):
+    F = strip(9, rows=9)
+    flat = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0), indexing="ij"), axis=-1).reshape(-1, 2)
+    for scale, offset, noise in itertools.product([5e-324, 1e-300, 1e-150, 1, 1e150, 1e307], [0, 1e8], [0, 1e-16, 0.3]):
+        uv = (flat + offset * (scale == 1) + noise * rng.standard_normal(flat.shape)) * scale
+        uv[:, 1] = np.where(rng.random(len(uv)) < 0.3, uv[:, 0], uv[:, 1])
+        signs = np.array([independent.orientation(*uv[t].tolist()) for t in F])
+        c = certify(F, uv)
+        np.testing.assert_array_equal(c.flipped, np.flatnonzero(signs < 0))
+        np.testing.assert_array_equal(c.degenerate, np.flatnonzero(signs == 0))
+
+
+@pytest.mark.parametrize("case", ["simple/Lshape", "simple/square_rot180", "simple/WeberZorin14_fig19", "hard/limbs_A"])
+def test_agreement_on_the_shared_cases(independent, case):
+    folder = Path(independent.__file__).parents[1] / "cases" / case
+    places, faces = independent.read(folder / "input.obj")
+    uv = np.array([p or (np.nan, np.nan) for p in places])
+    signs = np.array([independent.orientation(*(places[i] for i in t)) for t in faces])
+    c = certify(np.array(faces), uv)
+    np.testing.assert_array_equal(c.flipped, np.flatnonzero(signs < 0))
+    np.testing.assert_array_equal(c.degenerate, np.flatnonzero(signs == 0))
+    if case == "simple/WeberZorin14_fig19":
+        assert len(c.crossings) == 4

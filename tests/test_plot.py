@@ -1,0 +1,189 @@
+"""Figures: sizes, red where and only where triangles are inverted, no global state."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from quasiharmonic import surfaces
+from quasiharmonic.plot import plot_before_after, plot_map, plot_surface, save_map_figure
+from quasiharmonic.plot.maps import _figure
+from quasiharmonic.plot.shading import view
+from quasiharmonic.targets.correspondence import upright
+
+
+def pixels(figure):
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    file.seek(0)
+    return imread(file)[..., :3]
+
+
+def red(image):
+    """Pixels of the red that only inverted triangles have."""
+    return (image[..., 0] > 0.8) & (image[..., 1] < 0.25) & (image[..., 2] < 0.35)
+
+
+@pytest.fixture(scope="module")
+def planar():
+    V, F = surfaces.random_delaunay(150, seed=4)
+    folded = V.copy()
+    folded[149] = V[0] * 0.9  # across its neighbours
+    return V, F, folded
+
+
+def flips(F, uv):
+    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
+    return a[:, 0] * b[:, 1] <= a[:, 1] * b[:, 0]
+
+
+def test_map_is_red_only_where_it_is_inverted(planar):
+    V, F, folded = planar
+    assert not red(pixels(plot_map(V, F, V).figure)).any()
+    image = pixels(plot_map(V, F, folded).figure)
+    assert image.shape == (600, 600, 3)
+    assert flips(F, folded).sum() >= 2
+    assert red(image).sum() > 100
+
+
+def test_inverted_triangles_can_be_given(planar):
+    V, F, _ = planar
+    one = red(pixels(plot_map(V, F, V, flipped=[17]).figure))
+    mask = np.zeros(len(F), dtype=bool)
+    mask[17] = True
+    assert one.any()
+    assert np.array_equal(one, red(pixels(plot_map(V, F, V, flipped=mask).figure)))
+    assert not red(pixels(plot_map(V, F, planar[2], flipped=[]).figure)).any()
+
+
+def test_triangles_too_small_to_see_are_marked():
+    V, F = surfaces.grid(40, 40)
+    uv = V.copy()
+    # Nine vertices shrunk to a speck of a hundredth of a pixel, turned inside out.
+    centre = 20 + 20 * 41
+    near = [centre + i + 41 * j for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    uv[near] = V[centre] + (V[near] - V[centre])[:, ::-1] * 1e-4
+    image = red(pixels(plot_map(V, F, uv).figure))
+    assert image[280:320, 280:320].sum() > 8
+    assert flips(F, uv).sum() >= 8
+
+
+def test_interior_pins_are_drawn_and_boundary_ones_are_not(planar):
+    V, F, _ = planar
+    boundary = np.arange(int(np.unique(F).size ** 0.5))[:5]
+    plain = pixels(plot_map(V, F, V).figure)
+    assert np.array_equal(plain, pixels(plot_map(V, F, V, fixed=boundary).figure))
+    assert not np.array_equal(plain, pixels(plot_map(V, F, V, fixed=[*boundary, 149]).figure))
+
+
+def test_before_after(planar):
+    V, F, folded = planar
+    image = red(pixels(plot_before_after(V, F, folded, V)))
+    assert image.shape == (480, 900)
+    assert image[:, :450].any()
+    assert not image[:, 450:].any()
+
+
+def test_saved_figure_has_three_panels_or_two(planar, tmp_path):
+    V, F, folded = planar
+    save_map_figure(tmp_path / "three.png", V, F, V, folded)
+    image = imread(tmp_path / "three.png")[..., :3]
+    assert image.shape == (450, 1200, 3)
+    columns = red(image).any(axis=0)
+    assert columns[400:800].any()
+    assert not columns[:400].any()
+    assert not columns[800:].any()
+    for panel in np.split(image, 3, axis=1):
+        assert (panel < 0.9).any(axis=2).mean() > 0.3
+    save_map_figure(tmp_path / "two.png", V, F, V)
+    assert imread(tmp_path / "two.png").shape[:2] == (450, 800)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["three.png", "two.png"]
+
+
+def test_given_flips_are_those_of_the_map_not_of_the_guess(planar, tmp_path):
+    V, F, folded = planar
+    save_map_figure(tmp_path / "map.png", V, F, V, folded, flipped=[3], fixed=[0])
+    columns = red(imread(tmp_path / "map.png")).any(axis=0)
+    assert columns[400:800].sum() > 20
+    assert columns[800:].any()
+
+
+def test_surface_hides_what_is_behind():
+    V, F = surfaces.cat(16)
+    seen = view(V, F)
+    assert seen.points.shape == (len(V), 2)
+    # Depth grows towards the viewer, who looks at the nose, far before the boundary.
+    assert seen.depth[0] > seen.depth[-96:].max()
+    assert seen.inside.mean() < 0.25
+    assert seen.color.min() >= 0
+    assert seen.color.max() <= 1
+    # Without relief nothing is hidden and a planar mesh is shown as it is.
+    W, G = surfaces.annulus(6)
+    flat = view(W, G)
+    assert flat.points == pytest.approx(W)
+    assert not flat.inside.any()
+
+
+def sphere(hole):
+    """Unit sphere without a small cap around the direction ``hole``."""
+    V, F = surfaces.disk(16)
+    angle = np.hypot(*V.T) * np.radians(165)
+    turn = np.arctan2(V[:, 1], V[:, 0])
+    top = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
+    return top @ upright(-np.asarray(hole, dtype=float)), F
+
+
+@pytest.mark.parametrize("hole", [(0, -1, 0), (0, 1, 0), (0, 0, -1), (1, 0, 0)])
+def test_surfaces_stand_on_their_hole(hole):
+    V, F = sphere(hole)
+    assert view(V, F).points[-96:, 1].mean() < -0.8
+
+
+def test_inner_side_is_grey():
+    V, F = sphere((1, 1, 1))
+    figure = _figure((3, 3))
+    ax = figure.add_axes((0, 0, 1, 1))
+    plot_surface(V, F, ax)
+    image = pixels(figure)
+    seen = view(V, F)
+    rim = seen.points[-96:].mean(axis=0)
+
+    def saturation(point):
+        x, y = ax.transData.transform(point)
+        pixel = image[round(299 - y), round(x)]
+        return float(np.ptp(pixel) / pixel.max())
+
+    assert saturation(rim) < 0.2
+    assert saturation(-rim) > 0.4
+
+
+def test_not_finite_vertices_are_named(planar):
+    V, F, _ = planar
+    uv = V.copy()
+    uv[77, 1] = np.nan
+    with pytest.raises(ValueError, match="uv has no finite place for vertex 77"):
+        plot_map(V, F, uv)
+    with pytest.raises(ValueError, match="before has no finite place for vertex 77"):
+        plot_before_after(V, F, uv, V)
+
+
+def test_degenerate_map_is_drawn(planar):
+    V, F, _ = planar
+    image = pixels(plot_map(V, F, np.zeros_like(V)).figure)
+    assert red(image).any()
+
+
+def test_no_display_and_no_pyplot():
+    code = (
+        "import sys, quasiharmonic.plot as p\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "from quasiharmonic import surfaces as s\n"
+        "V, F = s.disk(2); p.plot_map(V, F, V)\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

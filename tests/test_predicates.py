@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quasiharmonic import predicates
+from quasiharmonic.predicates import SegmentRelation, box_pairs, orientation, orientation_or_nonfinite, segment_relation
+
+
+def exact_orientation(a, b, c):
+    """Sign of the signed area in rational arithmetic."""
+    ax, ay, bx, by, cx, cy = (Fraction(float(x)) for x in (*a, *b, *c))
+    det = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
+    return (det > 0) - (det < 0)
+
+
+def exact_relation(p, q, r, s):
+    """What two segments share, by solving for the common point in rational arithmetic."""
+    p, q, r, s = (tuple(Fraction(float(x)) for x in point) for point in (p, q, r, s))
+    if p == q or r == s:
+        point, (a, b) = (p, (r, s)) if p == q else (r, (p, q))
+        on_line = (b[0] - a[0]) * (point[1] - a[1]) == (b[1] - a[1]) * (point[0] - a[0])
+        return SegmentRelation(2 * (on_line and min(a, b) <= point <= max(a, b)))
+    d, e, f = ((y[0] - x[0], y[1] - x[1]) for x, y in ((p, q), (r, s), (p, r)))
+    det = d[0] * e[1] - d[1] * e[0]
+    if det == 0:
+        if d[0] * f[1] != d[1] * f[0]:
+            return SegmentRelation.DISJOINT
+        # Positions along pq, which has length 1 there.
+        along = sorted(((x[0] - p[0]) * d[0] + (x[1] - p[1]) * d[1]) / (d[0] ** 2 + d[1] ** 2) for x in (r, s))
+        lo, hi = max(along[0], 0), min(along[1], 1)
+        return SegmentRelation.OVERLAPPING if lo < hi else SegmentRelation(2 * (lo == hi))
+    t = (f[0] * e[1] - f[1] * e[0]) / det
+    u = (f[0] * d[1] - f[1] * d[0]) / det
+    if 0 < t < 1 and 0 < u < 1:
+        return SegmentRelation.CROSSING
+    return SegmentRelation(2 * (0 <= t <= 1 and 0 <= u <= 1))
+
+
+def agrees(a, b, c):
+    expected = [exact_orientation(*corners) for corners in zip(a, b, c, strict=True)]
+    np.testing.assert_array_equal(orientation(a, b, c), expected)
+
+
+any_float = st.floats(allow_nan=False, allow_infinity=False)
+# Few bits and many magnitudes: products that cancel exactly, sums that underflow.
+sparse_float = st.builds(
+    lambda bits, exponent: float(np.ldexp(float(bits), exponent)), st.integers(-9, 9), st.integers(-1074, 1019)
+)
+lattice = st.integers(-3, 3).map(float)
+point_of = {name: st.tuples(x, x) for name, x in (("any", any_float), ("sparse", sparse_float), ("lattice", lattice))}
+
+
+@pytest.mark.parametrize("kind", point_of)
+def test_orientation_is_exact_for_all_doubles(kind):
+    @given(st.lists(st.tuples(*[point_of[kind]] * 3), min_size=1, max_size=20))
+    @settings(deadline=None)
+    def check(triples):
+        agrees(*np.array(triples).transpose(1, 0, 2))
+
+    check()
+
+
+@given(
+    st.tuples(any_float, any_float, any_float, any_float),
+    st.floats(0, 1),
+    st.integers(-2, 2),
+    st.integers(-2, 2),
+)
+@settings(deadline=None)
+def test_orientation_of_points_next_to_a_line(ends, t, i, j):
+    a, b = np.array(ends[:2]) / 2, np.array(ends[2:]) / 2
+    c = a * (1 - t) + b * t
+    c = c + np.array([i, j]) * np.spacing(c)
+    agrees(a[None], b[None], c[None])
+    agrees(c[None], a[None], b[None])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-150, 1e150, 1e-161, 1e200, 1e-300, 1e299, 1e-310, 5e-324])
+@pytest.mark.parametrize("offset", [0.0, 1e8])
+def test_orientation_at_any_scale(rng, scale, offset):
+    agrees(*((rng.integers(-3, 4, (3, 400, 2)) + offset) * scale))
+    a, b = (rng.standard_normal((2, 400, 2)) + offset) * scale
+    t = rng.random((400, 1))
+    c = a * (1 - t) + b * t
+    agrees(a, b, c)
+    agrees(a, b, rng.permutation(c))
+
+
+def test_orientation_where_every_stage_must_come_in(rng):
+    size = 3000
+    exponents = rng.integers(-430, 500, (3, size, 2)) * rng.integers(0, 2, (3, size, 2))
+    a, b, c = rng.choice([-1.0, -0.75, 0.0, 1.0], (3, size, 2)) * 2.0**exponents
+    agrees(a, b, c)
+    # Differences of more than 53 bits on a line through the origin.
+    d = rng.standard_normal((size, 2))
+    agrees(d, 2.0**30 * d, 2.0**61 * d)
+    agrees(2.0**30 * d, 2.0**61 * d, d)
+    # Products whose head is the same on both sides and whose tails decide.
+    head = 1 + rng.integers(0, 4, (size, 2)) * 2.0**-52
+    agrees(head, -head, np.stack([head[:, 1] * 2.0**-60, head[:, 0] * 2.0**-60], axis=1) * 2.0**-300)
+
+
+def test_products_that_underflow_to_the_wrong_order():
+    # Left product 1.5 - 1.5ε, right one 1.5 - 1.5·2⁻¹⁰⁰ - ε, in units of the smallest double and with ε
+    # lost in the differences: the left one rounds to 2, the right one to 1, but the right one is larger.
+    unit = np.array([2.0**-500, 2.0**-574])
+    a, b, c = np.array([[[1.5, 1.5 + 1.5 * 2.0**-50]], [[1 - 2.0**-50, 1.0]], [[0.0, 2.0**-80]]]) * unit
+    assert orientation(a, b, c)[0] == exact_orientation(a[0], b[0], c[0]) == -1
+
+
+def test_a_hundred_thousand_exactly_collinear_triples(rng):
+    x = rng.random((3, 100_000)) + 0.1
+    # With a slope of one and no rounding the points lie on the diagonal, inexact differences and all.
+    assert not orientation(*np.stack([x, x], axis=2)).any()
+    d = rng.standard_normal((100_000, 2))
+    assert not orientation(d, 2 * d, 4 * d).any()
+
+
+def test_antisymmetry_on_near_misses(rng):
+    a, b = rng.random((2, 2000, 2))
+    c = (a + b) / 2
+    expected = orientation(a, b, c)
+    assert set(expected) == {-1, 0, 1}
+    for permuted, parity in (((b, c, a), 1), ((c, a, b), 1), ((b, a, c), -1), ((a, c, b), -1), ((c, b, a), -1)):
+        np.testing.assert_array_equal(orientation(*permuted), parity * expected)
+
+
+def test_shapes_broadcast_and_are_kept():
+    corner = np.array([0.0, 0.0])
+    right = np.array([[1.0, 0.0], [2.0, 0.0]])
+    third = np.array([[[0.0, 1.0]], [[3.0, 0.0]], [[0.0, -1e-320]]])
+    np.testing.assert_array_equal(orientation(corner, right, third), [[1, 1], [0, 0], [-1, -1]])
+    np.testing.assert_array_equal(orientation(corner, third, right), [[-1, -1], [0, 0], [1, 1]])
+    transposed = np.asfortranarray(np.broadcast_to(third, (3, 2, 2)))
+    np.testing.assert_array_equal(orientation(corner, right, transposed), [[1, 1], [0, 0], [-1, -1]])
+    assert orientation(corner, [1.0, 0.0], [0.0, 1.0]).shape == ()
+    assert orientation(corner, [1.0, 0.0], [2.0, 0.0]) == 0
+    assert orientation(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2))).shape == (0,)
+
+
+def test_what_is_not_finite_is_refused_or_named():
+    a = np.zeros((6, 2))
+    b = np.tile([1.0, 0.0], (6, 1))
+    c = np.array([[0.0, 1], [np.nan, 1], [0, np.inf], [0, -1], [-np.inf, np.inf], [2, 0]])
+    sign, nonfinite = orientation_or_nonfinite(a, b, c)
+    np.testing.assert_array_equal(sign, [1, 0, 0, -1, 0, 0])
+    np.testing.assert_array_equal(nonfinite, [1, 2, 4])
+    with pytest.raises(ValueError, match=r"triple 1 \(3 in all\)"):
+        orientation(a, b, c)
+
+
+lattice_segments = st.lists(st.tuples(*[st.tuples(st.integers(0, 4), st.integers(0, 4))] * 4), min_size=1, max_size=30)
+
+
+@given(lattice_segments, st.sampled_from([1.0, 0.1, 1e-200, 1e299, 5e-324]), st.sampled_from([0.0, 1e8]))
+@settings(max_examples=200, deadline=None)
+def test_segment_relation_is_exact(segments, scale, offset):
+    p, q, r, s = ((np.array(segments) + offset) * scale).transpose(1, 0, 2)
+    expected = [exact_relation(*ends) for ends in zip(p, q, r, s, strict=True)]
+    np.testing.assert_array_equal(segment_relation(p, q, r, s), expected)
+    np.testing.assert_array_equal(segment_relation(s, r, p, q), expected)
+
+
+def test_segments_that_miss_each_other_by_a_rounding():
+    p, q = np.array([[0.0, 0.0]]), np.array([[3.0, 1.0]])
+    r = np.array([[0.3, 0.1]])  # not on pq: neither coordinate is what it reads
+    away = np.array([[0.0, 5.0]])
+    assert segment_relation(p, q, r, away)[0] == exact_relation(p[0], q[0], r[0], away[0]) != SegmentRelation.TOUCHING
+    assert segment_relation(p, q, q / 2, away)[0] == SegmentRelation.TOUCHING
+
+
+@pytest.mark.parametrize("chunk", [3, 1 << 17])
+def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
+    monkeypatch.setattr(predicates, "_PAIR_CHUNK", chunk)
+    for count in (0, 1, 2, 3, 8, 57):
+        lo = rng.integers(0, 20, (count, 2)).astype(float)
+        hi = lo + rng.integers(0, 5, (count, 2))
+        found = [pair for i, j in box_pairs(lo, hi) for pair in zip(i.tolist(), j.tolist(), strict=True)]
+        expected = {
+            (i, j)
+            for i in range(count)
+            for j in range(i + 1, count)
+            if (lo[i] <= hi[j]).all() and (lo[j] <= hi[i]).all()
+        }
+        assert len(found) == len(expected)
+        assert set(found) == expected
