@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meshes import bend, lift, random_xi, signed_areas, surfaces
 
+from meshes import bend, lift, random_xi, signed_areas, surfaces
 from quasiharmonic.laplacian import Laplacian
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh

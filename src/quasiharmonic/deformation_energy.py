@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .energies import Deformation, Energy, QuadraticForm
-from .mesh.reference import ReferenceMesh, rest_frames
-from .mesh.topology import named
+from quasiharmonic.energies import Deformation, Energy, QuadraticForm
+from quasiharmonic.mesh.reference import ReferenceMesh, rest_frames
+from quasiharmonic.mesh.topology import named
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -61,6 +61,9 @@ class DeformationEnergy:
         self.energy = energy
         self.F = np.asarray(F, dtype=np.int64)
         surface = as_surface(V)
+        # Products of lengths must not leave the numbers' range. A power of two costs no digits.
+        exponent = int(np.frexp(np.abs(surface).max(initial=0))[1])
+        surface = np.ldexp(surface, -exponent)
         z1, z2 = rest_frames(surface, self.F)
         flat = np.flatnonzero(~(z1 * z2.imag > 0))
         if flat.size:
@@ -71,7 +74,7 @@ class DeformationEnergy:
             raise ValueError(f"the area of the map must be positive, not {area}")
         mesh = ReferenceMesh(surface, self.F, "rest")
         total = float(mesh.m.sum())
-        scale = 1.0 if area is None else float(np.sqrt(total / area))
+        scale = float(np.ldexp(1.0, -exponent)) if area is None else float(np.sqrt(total / area))
         self.g: ComplexArray = 0.5 * scale * mesh.gamma
         self.share: FloatArray = mesh.m / total
         if weights is not None:
@@ -85,7 +88,7 @@ class DeformationEnergy:
         Determinants come from the images' areas. An area too small to be told from its own rounding is
         taken to be that rounding: it is positive if the map has been certified, and the energy huge.
         """
-        d1, d2 = self._edges(w)
+        d1, d2 = _edges(self._corners, w)
         left, right = d1.real * d2.imag, d1.imag * d2.real
         area, noise = left - right, 2.0**-51 * (np.abs(left) + np.abs(right))
         area = 0.5 * np.where(np.abs(area) <= noise, noise, area)
@@ -112,9 +115,16 @@ class DeformationEnergy:
         at = self._corners.ravel()
         return np.bincount(at, pull.real, minlength=n) + 1j * np.bincount(at, pull.imag, minlength=n)
 
-    def curvature_of(self, d: Deformation, *, project: bool = True) -> QuadraticForm:
-        """Second derivatives by (p, q) on every triangle, weights and areas included."""
-        return self.energy.curvature(d, project=project).scaled(self.share)
+    def curvature_of(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivatives by (p, q) on every triangle, weights and areas included.
+
+        Parameters
+        ----------
+        d : Deformation
+        negative : float
+            What negative eigenvalues are multiplied by; see `Energy.curvature`.
+        """
+        return self.energy.curvature(d, negative=negative).scaled(self.share)
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
         """How far along a direction each triangle's area first vanishes.
@@ -127,8 +137,8 @@ class DeformationEnergy:
         (f,) float64
             Positive, ``inf`` where it never does. Exact up to the rounding of the areas.
         """
-        d1, d2 = self._edges(w)
-        e1, e2 = self._edges(direction)
+        d1, d2 = _edges(self._corners, w)
+        e1, e2 = _edges(self._corners, direction)
         c0 = d1.real * d2.imag - d1.imag * d2.real
         c1 = d1.real * e2.imag - d1.imag * e2.real + e1.real * d2.imag - e1.imag * d2.real
         c2 = e1.real * e2.imag - e1.imag * e2.real
@@ -141,9 +151,16 @@ class DeformationEnergy:
         first[rises] = (c1 + root)[rises] / (-2 * c2[rises])
         return np.where(c0 > 0, first, 0.0)
 
-    def _edges(self, w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        w0 = w[self._corners[0]]
-        return w[self._corners[1]] - w0, w[self._corners[2]] - w0
+
+def signed_areas(F: NDArray[np.integer], w: ComplexArray) -> FloatArray:
+    """Signed areas of the images of triangles (f, 3) under a map (n,) complex128; (f,) float64."""
+    d1, d2 = _edges(F.T, w)
+    return 0.5 * (d1.real * d2.imag - d1.imag * d2.real)
+
+
+def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    w0 = w[corners[0]]
+    return w[corners[1]] - w0, w[corners[2]] - w0
 
 
 def as_surface(V: ArrayLike) -> FloatArray:

@@ -38,8 +38,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .mesh.reference import rest_frames
-from .mesh.topology import boundary_edges
+from quasiharmonic.mesh.reference import rest_frames
+from quasiharmonic.mesh.topology import boundary_edges
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -145,14 +145,16 @@ class Energy(ABC):
     def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
         """Derivatives by p and q, (f,) complex128: ``∂/∂Re + i ∂/∂Im`` of each."""
 
-    def curvature(self, d: Deformation, *, project: bool = True) -> QuadraticForm:
+    def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative as a quadratic form in (dp, dq).
 
         Parameters
         ----------
         d : Deformation
-        project : bool
-            Clamp its eigenvalues at zero, which makes the form positive semidefinite.
+        negative : float
+            What becomes of negative eigenvalues: they are multiplied by this. 0 clamps them, which makes
+            the form positive semidefinite; -1 takes absolute values, a more careful choice while the energy
+            is far from quadratic; 1 leaves the second derivative as it is.
 
         Raises
         ------
@@ -178,39 +180,45 @@ class Isotropic(Energy):
         slope_a, slope_b = self.slopes(d)
         return 2 * slope_a * d.p, 2 * slope_b * d.q
 
-    def curvature(self, d: Deformation, *, project: bool = True) -> QuadraticForm:
+    def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative as a quadratic form in (dp, dq)."""
         slope_a, slope_b = self.slopes(d)
         aa, ab, bb = self.bends(d)
-        root_a, root_b = np.sqrt(d.a), np.sqrt(d.b)
         turn_p, turn_q = 2 * slope_a, 2 * slope_b
         along_p, along_q = turn_p + 4 * d.a * aa, turn_q + 4 * d.b * bb
-        mixed = 4 * root_a * root_b * ab
-        if project:
-            turn_p, turn_q = np.maximum(turn_p, 0), np.maximum(turn_q, 0)
-            along_p, mixed, along_q = _clamped(along_p, mixed, along_q)
-        # The direction of a vanishing p or q does not matter: there, along and across are alike.
-        to_p = np.conj(d.p) / np.where(root_a > 0, root_a, 1)
-        to_q = np.conj(d.q) / np.where(root_b > 0, root_b, 1)
+        turn_p, turn_q = _damped(turn_p, negative), _damped(turn_q, negative)
+        along_p, kept, along_q = _filtered(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
+        mixed = 4 * kept * ab
+        # Where p or q vanishes its direction does not matter: along and across are alike.
+        to_p, to_q = np.conj(d.p), np.conj(d.q)
         return QuadraticForm(
             pp=0.5 * (along_p + turn_p),
             qq=0.5 * (along_q + turn_q),
-            p2=0.5 * (along_p - turn_p) * to_p**2,
-            q2=0.5 * (along_q - turn_q) * to_q**2,
+            p2=0.5 * (along_p - turn_p) * _inverse(d.a) * to_p**2,
+            q2=0.5 * (along_q - turn_q) * _inverse(d.b) * to_q**2,
             pq=mixed * to_p * to_q,
-            pqc=mixed * to_p * np.conj(to_q),
+            pqc=mixed * to_p * d.q,
         )
 
 
-def _clamped(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Symmetric 2×2 matrices with their negative eigenvalues set to zero."""
+def _damped(eigenvalue: FloatArray, negative: float) -> FloatArray:
+    return np.where(eigenvalue < 0, negative * eigenvalue, eigenvalue)
+
+
+def _filtered(
+    xx: FloatArray, xy: FloatArray, yy: FloatArray, negative: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Symmetric 2×2 matrices with their negative eigenvalues multiplied by ``negative``.
+
+    Returns the diagonal entries, and between them what the off-diagonal entry is multiplied by.
+    """
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-    radius = np.hypot(half, xy)
+    radius = np.sqrt(half**2 + xy**2)
     # Eigenvalues mean ± radius, projectors ½ (1 ± K/radius) with K the traceless part.
-    upper, lower = np.maximum(mean + radius, 0), np.maximum(mean - radius, 0)
+    upper, lower = _damped(mean + radius, negative), _damped(mean - radius, negative)
     centre = 0.5 * (upper + lower)
-    ratio = 0.5 * (upper - lower) / np.where(radius > 0, radius, 1)
-    return centre + ratio * half, ratio * xy, centre - ratio * half
+    kept = 0.5 * (upper - lower) * _inverse(radius)
+    return centre + kept * half, kept, centre - kept * half
 
 
 class MIPS(Isotropic):
@@ -396,12 +404,11 @@ class MassSpring(Energy):
         pull = 2 * self._stiffness * (1 - self._lengths * _inverse(length)) * side
         return np.sum(pull * self._sides.conj(), axis=0), np.sum(pull * self._sides, axis=0)
 
-    def curvature(self, d: Deformation, *, project: bool = True) -> QuadraticForm:
-        """Second derivative; a compressed spring bends it inwards across itself, which is clamped."""
+    def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivative; what is negative is what a compressed spring has across itself."""
         side, length = self._images(d)
         along, across = 2 * self._stiffness, 2 * self._stiffness * (1 - self._lengths * _inverse(length))
-        if project:
-            across = np.maximum(across, 0)
+        across = _damped(across, negative)
         # Of a side's change ds = dp z + dq z̄: along |ds|² of its part along the side, across |ds|² of the rest.
         z, zz = self._sides, self._lengths**2
         both, turn = 0.5 * (along + across), 0.5 * (along - across) * (np.conj(side) * _inverse(length)) ** 2

@@ -24,6 +24,7 @@ so at a rough tensor field V₄ may be negative. The others are sums of squares.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class Functional(ABC):
     problem : Problem
     mesh : ReferenceMesh
     laplacian : Laplacian
-        Of the problem's free vertices, factored for the field that `evaluate` is given.
+        Of the problem's free vertices, factored for the field in question.
     """
 
     name: str
@@ -58,23 +59,36 @@ class Functional(ABC):
         self.laplacian = laplacian
 
     @abstractmethod
-    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
-        """Value and gradient.
+    def value(self, at: QuasiHarmonicMap) -> float:
+        """V at a tensor field and its map."""
 
-        Parameters
-        ----------
-        field : TensorField
-        w : (n,) complex128
-            The quasi-harmonic map of ``field``, in the problem's frame.
-        dw : Derivatives
-            Its derivatives.
+    @abstractmethod
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """``∂V/∂Re μ + i ∂V/∂Im μ`` there; (f,) complex128."""
 
-        Returns
-        -------
-        value : float
-        gradient : (f,) complex128
-            ``∂V/∂Re μ + i ∂V/∂Im μ``.
-        """
+
+class QuasiHarmonicMap(Protocol):
+    """What a functional looks at.
+
+    Attributes
+    ----------
+    field : TensorField
+    w : (n,) complex128
+        The quasi-harmonic map of ``field``, in the problem's frame.
+    dw : Derivatives
+        Its derivatives.
+    dirichlet : float
+        Its V₃.
+    """
+
+    @property
+    def field(self) -> TensorField: ...
+    @property
+    def w(self) -> ComplexArray: ...
+    @property
+    def dw(self) -> Derivatives: ...
+    @property
+    def dirichlet(self) -> float: ...
 
 
 class Dirichlet(Functional):
@@ -87,8 +101,11 @@ class Dirichlet(Functional):
 
     name = "dirichlet"
 
-    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
-        return beltrami_energy(self.mesh, field, dw), beltrami_gradient(self.mesh, field, dw)
+    def value(self, at: QuasiHarmonicMap) -> float:
+        return at.dirichlet
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        return beltrami_gradient(self.mesh, at.field, at.dw)
 
 
 class Neumann(Functional):
@@ -99,11 +116,14 @@ class Neumann(Functional):
 
     name = "neumann"
 
-    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
-        residual = neumann_residual(self.problem, self.laplacian, w)
+    def value(self, at: QuasiHarmonicMap) -> float:
+        residual = neumann_residual(self.problem, self.laplacian, at.w)
+        return 0.5 * float(np.vdot(residual, residual).real)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        residual = neumann_residual(self.problem, self.laplacian, at.w)
         spread = self.mesh.derivatives(self.laplacian.extend(residual))
-        gradient = field.pull_twist(*twist(self.mesh, dw, spread))
-        return 0.5 * float(np.vdot(residual, residual).real), gradient
+        return at.field.pull_twist(*twist(self.mesh, at.dw, spread))
 
 
 class Poisson(Functional):
@@ -119,34 +139,38 @@ class Poisson(Functional):
     def __init__(self, problem: Problem, mesh: ReferenceMesh, laplacian: Laplacian) -> None:
         super().__init__(problem, mesh, laplacian)
         self._held = Laplacian(problem.F, problem.n, problem.fixed[:1], laplacian.solver.name)
+        self._known: tuple[TensorField, ComplexArray] | None = None
 
-    def response(self, field: TensorField, w: ComplexArray) -> ComplexArray:
+    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
         """``L† g`` up to a constant: the map that the target's Neumann data alone would bring about."""
-        self._held.factor(self.mesh.edge_stiffness(field.entries()))
-        return self._held.respond(neumann_target(self.problem, w))
+        if self._known is None or self._known[0] is not at.field:
+            self._held.factor(self.mesh.edge_stiffness(at.field.entries()))
+            self._known = at.field, self._held.respond(neumann_target(self.problem, at.w))
+        return self._known[1]
 
-    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
-        response = self.response(field, w)
-        d = self.mesh.derivatives(response)
-        work = float(np.vdot(neumann_target(self.problem, w), response - w).real)
-        return 0.5 * work, -0.5 * field.pull_twist(*twist(self.mesh, d, d))
+    def value(self, at: QuasiHarmonicMap) -> float:
+        return 0.5 * float(np.vdot(neumann_target(self.problem, at.w), self.response(at) - at.w).real)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        d = self.mesh.derivatives(self.response(at))
+        return -0.5 * at.field.pull_twist(*twist(self.mesh, d, d))
 
 
 class Sobolev(Poisson):
-    """V₂ = V₃ + V₄, the Neumann residual in the norm of L† (eq. 26): the energy of the difference of the maps
-    that the Dirichlet and the Neumann data bring about.
+    """V₂ = V₃ + V₄, the Neumann residual in the norm of L† (eq. 26).
+
+    That is the energy of the difference of the maps that the Dirichlet and the Neumann data bring about.
     """
 
     name = "sobolev"
     sees_positions = True
 
-    def evaluate(self, field: TensorField, w: ComplexArray, dw: Derivatives) -> tuple[float, ComplexArray]:
-        response = self.response(field, w)
-        d = self.mesh.derivatives(response)
-        residual = neumann_residual(self.problem, self.laplacian, w)
-        value = 0.5 * float(np.vdot(residual, w - response).real)
-        gradient = beltrami_gradient(self.mesh, field, dw) - 0.5 * field.pull_twist(*twist(self.mesh, d, d))
-        return value, gradient
+    def value(self, at: QuasiHarmonicMap) -> float:
+        residual = neumann_residual(self.problem, self.laplacian, at.w)
+        return 0.5 * float(np.vdot(residual, at.w - self.response(at)).real)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        return beltrami_gradient(self.mesh, at.field, at.dw) + super().gradient(at)
 
 
 FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson)}
@@ -155,7 +179,7 @@ FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev
 def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
     """V₃ of any map, ``Σ 2m |q − μp|² / (1 − |μ|²)``: its A-Dirichlet energy less its signed area."""
     residual = dw.q - field.mu * dw.p
-    return 2.0 * float(np.dot(mesh.m, (residual.real**2 + residual.imag**2) / field.defect))
+    return 2.0 * float((mesh.m * (residual.real**2 + residual.imag**2) / field.defect).sum())
 
 
 def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> ComplexArray:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.certificate import certify, flipped_triangles
-from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize import Stop
@@ -170,9 +171,7 @@ def _positions(problem: Problem, w: ComplexArray) -> FloatArray:
 
 _Visit = Callable[[Iterate], None]
 _METHODS: dict[str, Callable[[Objective, Iterate, _Visit, Descent, int], None]] = {
-    "vector-adam": lambda o, start, visit, stage, n: vector_adam(
-        o, start, visit, iterations=n, schedule=stage.steps
-    ),
+    "vector-adam": lambda o, start, visit, stage, n: vector_adam(o, start, visit, iterations=n, schedule=stage.steps),
     "l-bfgs": lambda o, start, visit, stage, n: lbfgs(o, start, visit, iterations=n),
     "newton": lambda o, start, visit, stage, n: newton(o, start, visit, iterations=n),
     "alternating": lambda o, start, visit, stage, n: alternating(o, start, visit, iterations=n),
@@ -186,7 +185,9 @@ class _Search:
         self, problem: Problem, linear_solver: str, callback: Callable[[Step], object] | None, budget: int
     ) -> None:
         self.problem = problem
+        # Where rounding defeats one backend's factorisation, another's order of elimination may do.
         self.linear_solver = linear_solver
+        self._spare = available() if linear_solver == "auto" else ()
         self.callback = callback
         self.budget = budget
         self.history: list[Step] = []
@@ -206,6 +207,9 @@ class _Search:
         try:
             for stage in stages:
                 status = self._descend(stage)
+                while status is Status.UNSOLVABLE and self._spare and self._left > 0:
+                    self.linear_solver = self._spare[0]
+                    status = self._descend(replace(stage, resume=True))
                 if status is Status.INJECTIVE or self._left <= 0:
                     break
         except KeyboardInterrupt:
@@ -226,6 +230,8 @@ class _Search:
                 self.problem, stage.functional, stage.parameterization, stage.reference, self.linear_solver
             )
             self.linear_solver = objective.laplacian.solver.name
+            if self.linear_solver in self._spare:
+                self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
             start = objective.evaluate(self._start(objective, stage.resume))
             self._visit(start)
             _METHODS[stage.optimizer](objective, start, self._visit, stage, min(stage.iterations, self._left))
@@ -255,10 +261,8 @@ class _Search:
         best = self.deepest
         if not resume or best is None:
             return np.zeros(len(self.problem.F), dtype=np.complex128)
-        if best.objective.mesh is objective.mesh:
-            mu = best.field.mu
-        else:
-            mu = own_tensor(objective.mesh.derivatives(best.w))
+        same = best.objective.mesh is objective.mesh
+        mu = best.field.mu if same else own_tensor(objective.mesh.derivatives(best.w))
         return objective.bounded(objective.parameterization.invert(mu))
 
     def _visit(self, here: Iterate) -> None:

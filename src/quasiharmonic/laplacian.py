@@ -61,9 +61,7 @@ class Laplacian:
         inner, key = inner[order], key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))
         row, column = np.divmod(key[first], max(size, 1))
-        self._gather = csr_array(
-            (ones[: inner.size], inner, np.append(first, inner.size)), shape=(first.size, count)
-        )
+        self._gather = csr_array((ones[: inner.size], inner, np.append(first, inner.size)), shape=(first.size, count))
         # A row of the upper triangle is its diagonal entry followed by those entries.
         indptr = np.arange(size + 1) + np.append(0, np.cumsum(np.bincount(row, minlength=size)))
         self._diagonal = indptr[:-1]
@@ -120,11 +118,10 @@ class Laplacian:
             Equal to ``w`` at the fixed vertices, to the last bit.
         """
         pull = -self._stiffness[self._border] * w[self._border_fixed]
+        load = np.zeros(self.free.size, dtype=np.complex128)
+        np.add.at(load, self._border_row, pull)
         out = w.copy()
-        out[self.free] = self._solve(
-            np.bincount(self._border_row, pull.real, minlength=self.free.size),
-            np.bincount(self._border_row, pull.imag, minlength=self.free.size),
-        )
+        out[self.free] = self._solve(load)
         return out
 
     def respond(self, load: ComplexArray) -> ComplexArray:
@@ -139,7 +136,7 @@ class Laplacian:
         (n,) complex128
         """
         out = np.zeros(load.shape, dtype=np.complex128)
-        out[self.free] = self._solve(load.real[self.free], load.imag[self.free])
+        out[self.free] = self._solve(load[self.free])
         return out
 
     def flux(self, w: ComplexArray) -> ComplexArray:
@@ -160,10 +157,10 @@ class Laplacian:
         imag = np.bincount(tail, pull.imag, minlength=n) - np.bincount(head, pull.imag, minlength=n)
         return real + 1j * imag
 
-    def _solve(self, real: FloatArray, imag: FloatArray) -> ComplexArray:
-        """One solve for both coordinates with the factor at hand."""
-        rhs = np.empty((self.free.size, 2), order="F")
-        rhs[:, 0], rhs[:, 1] = real, imag
+    def _solve(self, load: ComplexArray) -> ComplexArray:
+        """One solve for both coordinates with the factor at hand; (n - k,) complex128."""
+        rhs = np.empty((load.size, 2), order="F")
+        rhs[:, 0], rhs[:, 1] = load.real, load.imag
         solution = self.solver.solve(rhs)
         return solution[:, 0] + 1j * solution[:, 1]
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, triu
 
-from .energies import QuadraticForm
-from .linsolve import make_solver
+from quasiharmonic.energies import QuadraticForm
+from quasiharmonic.linsolve import make_solver
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -43,9 +43,7 @@ class NewtonSystem:
         The vertices that do, ascending.
     """
 
-    def __init__(
-        self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto"
-    ) -> None:
+    def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
         is_free = np.ones(n, dtype=bool)
         is_free[fixed] = False
         self.free = np.flatnonzero(is_free)
@@ -94,7 +92,7 @@ class NewtonSystem:
         own = 2 * np.arange(size)
         self._indices[self._corner_slots] = own, own + 1, own + 1
         self._indices[self._side_slots] = 2 * column, 2 * column + 1, 2 * column, 2 * column + 1
-        self._rows = np.repeat(np.arange(2 * size, dtype=np.int32), np.diff(self._indptr))
+        self._first = self._indptr[:-1]
         self._values = np.empty(upper[-1])
 
     def assemble(self, form: QuadraticForm) -> None:
@@ -110,45 +108,47 @@ class NewtonSystem:
             self._values[slot] = self._sum_sides @ part.ravel()
         for slot, part in zip(self._corner_slots, (corners[0], corners[1], corners[3]), strict=True):
             self._values[slot] = self._sum_corners @ part.ravel()
+        self._diagonal = self._values[self._first]
 
     def matrix(self) -> csr_array:
-        """The assembled matrix, both triangles; for study and tests."""
-        size = self._indptr.size - 1
-        upper = csr_array((self._values, self._indices, self._indptr), shape=(size, size))
-        strict = csr_array((np.where(self._rows < self._indices, self._values, 0), self._indices, self._indptr))
-        return csr_array(upper + strict.T)
+        """The assembled matrix, both of its triangles; for study and tests."""
+        size = self._first.size
+        upper = csr_array((self._values.copy(), self._indices, self._indptr), shape=(size, size))
+        return csr_array(upper + triu(upper, k=1).T)
 
     def factor(self, shift: float = 0.0) -> None:
-        """Factor the assembled matrix, scaled to a unit diagonal.
-
-        Areas that span many orders of magnitude make the entries do so too; the scaling takes that out.
+        """Factor the assembled matrix.
 
         Parameters
         ----------
         shift : float
-            Added to the scaled diagonal.
+            Fraction by which the diagonal is raised. Measured on the diagonal, it means the same to
+            triangles of any size.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
             When the matrix, as rounded, is not positive definite.
         """
-        diagonal = self._values[self._indptr[:-1]]
-        # A vertex whose triangles leave it free to move keeps a unit diagonal of its own.
-        self._scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-        scaled = self._values * self._scale[self._rows] * self._scale[self._indices]
-        scaled[self._indptr[:-1]] = 1 + shift
-        self.solver.factor(scaled)
+        diagonal = self._diagonal * (1 + shift)
+        # A vertex whose triangles leave it free to move gets a one of its own.
+        self._values[self._first] = np.where(diagonal > 0, diagonal, 1)
+        self.solver.factor(self._values)
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """Solve for the free vertices' displacements under a load on them; (n - k,) complex128."""
-        rhs = load.view(np.float64) * self._scale
-        solution = np.asarray(self.solver.solve(rhs.reshape(-1, 1, order="F"))).ravel() * self._scale
-        return solution.view(np.complex128)
+        """Solve for the displacements of the free vertices under a load on them; (n - k,) complex128.
 
-    def descend(self, load: ComplexArray) -> ComplexArray:
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When the solution has no correct digits.
+        """
+        return self.solver.solve(np.ascontiguousarray(load).view(np.float64)).view(np.complex128)
+
+    def solve_diagonal(self, load: ComplexArray) -> ComplexArray:
         """The load divided by the matrix's diagonal: what is left when no factorisation exists."""
-        return (load.view(np.float64) * self._scale**2).view(np.complex128)
+        diagonal = np.where(self._diagonal > 0, self._diagonal, 1)
+        return (np.ascontiguousarray(load).view(np.float64) / diagonal).view(np.complex128)
 
 
 def _parts(g1: ComplexArray, g2: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -136,16 +136,12 @@ class Iterate:
             area = float(np.abs(self.dw.area).sum())
         return self.dirichlet / area if area > 0 else np.inf
 
-    @property
+    @cached_property
     def value(self) -> float:
         """The objective's value."""
-        return self._evaluated[0]
+        return self.objective.functional.value(self)
 
     @cached_property
     def gradient(self) -> ComplexArray:
         """Its gradient in ξ, ``∂/∂Re ξ + i ∂/∂Im ξ``; (f,) complex128."""
-        return self.field.pull(self._evaluated[1])
-
-    @cached_property
-    def _evaluated(self) -> tuple[float, ComplexArray]:
-        return self.objective.functional.evaluate(self.field, self.w, self.dw)
+        return self.field.pull(self.objective.functional.gradient(self))

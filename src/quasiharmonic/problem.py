@@ -169,7 +169,9 @@ def _indices(name: str, values: ArrayLike) -> IntArray:
 def _finite(name: str, one: str, values: FloatArray) -> None:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
-        raise ValueError(f"{name} is not finite at {named(one, one[:-2] + 'ices' if one == 'vertex' else one + 's', bad)}")
+        raise ValueError(
+            f"{name} is not finite at {named(one, one[:-2] + 'ices' if one == 'vertex' else one + 's', bad)}"
+        )
 
 
 def _in_range(name: str, indices: IntArray, n: int) -> None:

@@ -30,6 +30,18 @@ class Status(Enum):
         "The map is injective in the solver's own coordinates, but its smallest triangles invert when the "
         "positions are rounded to doubles at the target's offset: move the target nearer to the origin."
     )
+    POLISHED = (
+        "Every triangle is strictly positive, decided exactly, and the distortion has converged: "
+        "no small change of the map lowers it noticeably."
+    )
+    STILL_FALLING = (
+        "Every triangle is strictly positive, decided exactly. The distortion was still falling after the last "
+        "iteration: allow more iterations for less of it."
+    )
+    EXHAUSTED = (
+        "Every triangle is strictly positive, decided exactly. The distortion falls no further because triangles "
+        "are as small as double precision can resolve: an energy that minds their size would open them up."
+    )
     UNSOLVABLE = (
         "No linear solver could factor the system any more; this is the best map so far. "
         "Another linear solver or reference triangle may help."
@@ -50,7 +62,7 @@ class Stage:
     flipped : tuple of int
         Triangles not strictly positive before and after.
     energy : tuple of float
-        V₃ over the target's area before and after (dimensionless).
+        V₃ over the target's area before and after (dimensionless); for a polish, the mean energy.
     kept : bool
         Whether its result was taken on; what makes a map worse is discarded.
     """
@@ -85,7 +97,8 @@ class Step:
     flipped : int
         Triangles whose area, in floating point, is not positive.
     energy : float
-        V₃ over the target's area: dimensionless, 0 only at injective maps, and the smaller the nearer.
+        V₃ over the target's area: dimensionless, 0 only at injective maps, and the smaller the nearer. In a
+        polish, the mean energy.
     """
 
     iteration: int

@@ -63,7 +63,7 @@ class Descent:
     @property
     def name(self) -> str:
         """How reports call it."""
-        words = [self.optimizer, self.parameterization]
+        words: list[str] = [self.optimizer, self.parameterization]
         if self.optimizer in ("vector-adam", "l-bfgs"):
             words.append(self.functional)
         return ", ".join(words)

@@ -23,7 +23,10 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("input", type=Path, metavar="FILE", help="OBJ or OFF file")
     parser.add_argument(
-        "--as", dest="precision", choices=("float64", "float32"), default="float64",
+        "--as",
+        dest="precision",
+        choices=("float64", "float32"),
+        default="float64",
         help="judge the positions as a reader in this precision sees them (default: float64)",
     )
     arguments.add_report(parser)
@@ -47,7 +50,11 @@ def run(options: argparse.Namespace) -> int:
         with np.errstate(over="ignore"):
             uv = uv.astype(np.float32)
     certificate = certify(mesh.F, uv)
-    facts = {**report.verdict(certificate), "input": str(options.input), "precision": options.precision,
-             "triangles": len(mesh.F)}
+    facts = {
+        **report.verdict(certificate),
+        "input": str(options.input),
+        "precision": options.precision,
+        "triangles": len(mesh.F),
+    }
     report.emit(facts, options.json, f"{options.input}: {certificate.summary()}")
     return 0 if certificate.injective else 1

@@ -42,9 +42,7 @@ def add_parser(commands: Commands) -> None:
     )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.positive, default=2000, metavar="N")
-    solver.add_argument(
-        "--linear-solver", default="auto", choices=("auto", "pardiso", "cholmod", "qdldl", "superlu")
-    )
+    solver.add_argument("--linear-solver", default="auto", choices=("auto", "pardiso", "cholmod", "qdldl", "superlu"))
     parser.set_defaults(run=run)
 
 

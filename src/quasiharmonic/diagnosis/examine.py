@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..predicates import SegmentRelation
 from ..mesh.topology import named
+from ..predicates import SegmentRelation
 from ..problem import Problem
 from .curves import BoundaryCurves
 from .local import Fixture, collapsed_edges, half_planes, inverted_patches, inverted_triangles, stars

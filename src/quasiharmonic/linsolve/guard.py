@@ -11,7 +11,7 @@ from .base import Floats, Ints, NotPositiveDefinite
 BACKWARD = 1e-10
 # Largest residual relative to |b| alone. When x has become so large that rounding in A x hides b, the matrix is within
 # rounding of a singular one and x means nothing, however small the backward error is.
-FORWARD = 1e-3
+FORWARD = 1e-4
 
 
 class ResidualTest:

@@ -71,11 +71,13 @@ def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Refere
     reference : {"rest", "equilateral", "corrected"}
         The triangles in which gradients and areas are taken.
     """
-    V, F = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
-    mesh = ReferenceMesh(V, F, reference)
+    F = np.asarray(F, dtype=np.int64)
+    mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), F, reference)
     f, n = len(F), len(V)
     shape, offsets = (f, n), np.arange(0, 3 * f + 1, 3)
-    Gx, Gy = (csr_array((part.T.ravel(), F.ravel(), offsets), shape=shape) for part in (mesh.gamma.real, mesh.gamma.imag))
+    Gx, Gy = (
+        csr_array((part.T.ravel(), F.ravel(), offsets), shape=shape) for part in (mesh.gamma.real, mesh.gamma.imag)
+    )
     edge = boundary_edges(F, n)
     half = csr_array((np.full(len(edge), 0.5), (edge[:, 0], edge[:, 1])), shape=(n, n))
     D = csr_array(half - half.T)

@@ -87,8 +87,6 @@ class ReferenceMesh:
         self.kind = kind
         self.F = F
         self.n = len(V)
-        z1: NDArray[np.inexact]
-        z2: ComplexArray
         if kind == "equilateral":
             z1, z2 = np.ones(1), np.array([0.5 + np.sqrt(0.75) * 1j])
         else:
@@ -160,7 +158,8 @@ def _corrected(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArr
         # Adding zero turns -0 into 0: between coincident points the angle is 0, not π.
         return np.arctan2(np.abs(turn.imag), turn.real + 0.0)
 
-    angles = np.stack([angle(z1 + 0j, z2), angle(z2 - z1, -z1 + 0j), angle(-z2, z1 - z2)])
+    base = z1.astype(np.complex128)
+    angles = np.stack([angle(base, z2), angle(z2 - base, -base), angle(-z2, base - z2)])
     angles = np.maximum(angles, np.pi / 6)
     angles *= np.pi / angles.sum(axis=0)
     # Sine rule: |z2| / sin(angle at 1) = |z1| / sin(angle at 2).

@@ -1,4 +1,4 @@
-"""L-BFGS, SciPy's (§9.1): fewer and surer steps than Adam's on smooth objectives, each at the price of a line search."""
+"""L-BFGS, SciPy's (§9.1): surer steps than Adam's, at the price of a line search."""
 
 from __future__ import annotations
 

@@ -58,9 +58,7 @@ def newton(
         When rounding leaves no positive definite Laplacian.
     """
     mesh, problem = objective.mesh, objective.problem
-    system = NewtonSystem(
-        problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name
-    )
+    system = NewtonSystem(problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name)
     here, damping = start, _FIRST_DAMPING
     model = _Model(here)
     for _ in range(iterations):
@@ -129,7 +127,9 @@ class _Model:
         high, low = np.maximum(high, floor), np.maximum(low, floor)
         # The eigenvectors stay: the deviator is scaled to the new half difference, of either sign.
         swapped = np.abs(mean - half) > np.abs(mean + half)
-        stretch = np.divide(np.where(swapped, -1, 1) * 0.5 * np.abs(high - low), half, out=np.zeros_like(half), where=half > 0)
+        stretch = np.divide(
+            np.where(swapped, -1, 1) * 0.5 * np.abs(high - low), half, out=np.zeros_like(half), where=half > 0
+        )
         deviator, k12 = stretch * 0.5 * (k11 - k22), stretch * k12
         k11, k22, det = 0.5 * (high + low) + deviator, 0.5 * (high + low) - deviator, high * low
 
@@ -156,9 +156,7 @@ class _Model:
         return (alpha + 1j * beta) * self.unit, predicted
 
 
-def _less_squares(
-    form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArray]
-) -> QuadraticForm:
+def _less_squares(form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArray]) -> QuadraticForm:
     """The form less the squares ``Re(conj(b_p) dp + conj(b_q) dq)²``."""
     pp, qq, p2, q2, pq, pqc = form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
     for bp, bq in vectors:

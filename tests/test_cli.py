@@ -1,0 +1,246 @@
+"""The command, as a user calls it: exit statuses, files, reports, messages."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshes import boundary_of, lift, signed_areas
+from quasiharmonic import io
+from quasiharmonic.cli import main
+from quasiharmonic.surfaces import random_delaunay
+from test_inject import star_problem, turned_ring
+
+CASES = Path(__file__).parents[2] / "shared" / "cases"
+
+
+def write_problem(folder, V, F, fixed, target, handles=True):
+    uv = np.full((len(V), 2), 0.5)
+    uv[fixed] = target
+    io.write_obj(folder / "input.obj", io.MeshData(V, F).with_map(uv))
+    if handles:
+        (folder / "handles.txt").write_text("".join(f"{i}\n" for i in fixed))
+    return folder / "input.obj"
+
+
+@pytest.fixture
+def star(tmp_path):
+    return write_problem(tmp_path, *star_problem())
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+class TestMap:
+    def test_writes_a_certified_map(self, star, tmp_path, capsys):
+        out, report, picture = tmp_path / "out.obj", tmp_path / "report.json", tmp_path / "out.png"
+        assert run("map", star, "-o", out, "--json", report, "--plot", picture) == 0
+        V, F, fixed, target = star_problem()
+        written = io.read_mesh(out)
+        uv = io.map_of(written)
+        np.testing.assert_array_equal(written.F, F)
+        np.testing.assert_array_equal(written.V, V)
+        np.testing.assert_array_equal(uv[fixed], target)
+        assert signed_areas(F, uv).min() > 0
+        facts = json.loads(report.read_text())
+        assert facts["injective"] is True
+        assert facts["flipped"] == facts["degenerate"] == []
+        assert facts["iterations"] > 0
+        assert facts["seconds"] > 0
+        assert facts["linear_solver"]
+        assert facts["stages"][0]["iterations"] == facts["iterations"]
+        assert facts["triangles"] == len(F)
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        said = capsys.readouterr()
+        assert "Injective: all" in said.out
+        assert said.err == ""
+
+    def test_folder_with_handles_and_pins(self, tmp_path):
+        V, F = random_delaunay(150, seed=3)
+        fixed = np.append(boundary_of(F), np.argmin((V**2).sum(axis=1)))
+        target = np.vstack([V[fixed[:-1]], [[0.3, 0.1]]])
+        write_problem(tmp_path, V, F, fixed, target)
+        assert run("map", tmp_path, "-o", tmp_path / "out.obj") == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], target)
+
+    def test_json_alone_on_standard_output(self, star, tmp_path, capsys):
+        assert run("map", star, "-o", tmp_path / "out.off", "--json", "-") == 0
+        assert json.loads(capsys.readouterr().out)["injective"] is True
+        assert run("check", tmp_path / "out.off") == 0
+
+    def test_a_map_that_is_not_injective_is_written_and_said_to_be_so(self, tmp_path, capsys):
+        problem = write_problem(tmp_path, *turned_ring(180))
+        out = tmp_path / "out.obj"
+        assert run("map", problem, "-o", out, "--max-iterations", 2, "--json", tmp_path / "r.json") == 1
+        said = capsys.readouterr().out
+        assert re.search(r"Not injective: of \d+ triangles, \d+ are flipped", said)
+        assert "more iterations" in said
+        facts = json.loads((tmp_path / "r.json").read_text())
+        assert facts["injective"] is False
+        assert facts["flipped"]
+        assert run("check", out) == 1
+
+    @pytest.mark.parametrize("strategy", ["speed", "quality"])
+    @pytest.mark.parametrize("reference", ["equilateral", "rest", "corrected"])
+    def test_options_reach_the_solver(self, star, tmp_path, strategy, reference):
+        arguments = "--strategy", strategy, "--reference", reference, "--linear-solver", "superlu"
+        report = tmp_path / "r.json"
+        assert run("map", star, "-o", tmp_path / "o.obj", *arguments, "--json", report) == 0
+        facts = json.loads(report.read_text())
+        assert facts["linear_solver"] == "superlu"
+        assert ("si-log" in facts["stages"][0]["name"]) == (strategy == "quality")
+
+
+def bad_meshes():
+    """(name, V, F, words) of meshes that `qhm map` must refuse."""
+    V, F = random_delaunay(60, seed=2)
+    V = lift(V)
+    inner = next(t for t in range(len(F)) if not np.isin(F[t], boundary_of(F)).any())
+    flat = V.copy()
+    flat[F[inner, 0]] = flat[F[inner, 1]]
+    mixed = F.copy()
+    mixed[inner] = mixed[inner][::-1]
+    return [
+        ("zero area", flat, F, "zero area in the rest mesh"),
+        ("repeated triangle", V, np.vstack([F, F[3]]), "repeated"),
+        ("non-manifold edge", V, np.vstack([F, [*F[inner, :2], boundary_of(F)[0]]]), "in more than two triangles"),
+        ("mixed winding", V, mixed, "mixed winding"),
+        ("two components", np.vstack([V, V + 9]), np.vstack([F, F + len(V)]), "2 components"),
+        ("isolated vertex", np.vstack([V, [[9, 9, 9]]]), F, "no triangle uses"),
+        ("vertex twice in a face", V, np.vstack([F, [0, 0, 1]]), "used twice"),
+        ("closed", np.eye(4)[:, :3], np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), "no boundary"),
+    ]
+
+
+class TestRefuses:
+    @pytest.mark.parametrize(("name", "V", "F", "words"), bad_meshes(), ids=[m[0] for m in bad_meshes()])
+    def test_bad_meshes(self, tmp_path, capsys, name, V, F, words):
+        problem = write_problem(tmp_path, V, F, np.arange(3), np.zeros((3, 2)), handles=False)
+        assert run("map", problem, "-o", tmp_path / "out.obj") == 2
+        said = capsys.readouterr()
+        assert words in said.err
+        assert said.out == ""
+        assert not (tmp_path / "out.obj").exists()
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("", "no "),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces|no triangles|no texture"),
+            ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "line 3"),
+            ("v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3\n", "line 3"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n", "line 4"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3 4\n", "4 corners"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "texture coordinates"),
+        ],
+    )
+    def test_bad_files(self, tmp_path, capsys, text, words):
+        (tmp_path / "in.obj").write_text(text)
+        assert run("map", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 2
+        assert re.search(words, capsys.readouterr().err)
+        assert not (tmp_path / "out.obj").exists()
+
+    def test_fixed_that_misses_part_of_the_boundary(self, star, tmp_path, capsys):
+        lines = (tmp_path / "handles.txt").read_text().split()
+        (tmp_path / "some.txt").write_text("\n".join(lines[3:]))
+        assert run("map", star, "-o", tmp_path / "out.obj", "--fixed", tmp_path / "some.txt") == 2
+        assert "not in fixed" in capsys.readouterr().err
+
+    def test_missing_input_and_unwritable_output(self, star, tmp_path, capsys):
+        assert run("map", tmp_path / "none.obj", "-o", tmp_path / "out.obj") == 2
+        assert "none.obj" in capsys.readouterr().err
+        assert run("map", star, "-o", tmp_path / "nowhere" / "out.obj") == 2
+        assert "nowhere" in capsys.readouterr().err
+        assert run("map", star, "-o", tmp_path / "out.xyz") == 2
+        assert ".obj, .off" in capsys.readouterr().err
+
+    def test_wrong_call(self, star, capsys):
+        with pytest.raises(SystemExit) as stop:
+            run("map", star)
+        assert stop.value.code == 2
+        assert "-o" in capsys.readouterr().err
+
+
+class TestCheck:
+    def test_statuses(self, star, tmp_path, capsys):
+        assert run("check", star) == 1
+        assert "Not injective" in capsys.readouterr().out
+        run("map", star, "-o", tmp_path / "out.obj")
+        assert run("check", tmp_path / "out.obj", "--json", "-") == 0
+        assert json.loads(capsys.readouterr().out.splitlines()[-1])["bijective"] is True
+        assert run("check", tmp_path / "none.obj") == 2
+
+    def test_as_float32(self, tmp_path, capsys):
+        """A triangle that exists in doubles only."""
+        uv = np.array([[0, 0], [1, 0], [0.5, 1e-50]])
+        io.write_obj(tmp_path / "thin.obj", io.MeshData(np.eye(3), np.array([[0, 1, 2]])).with_map(uv))
+        assert run("check", tmp_path / "thin.obj") == 0
+        assert run("check", tmp_path / "thin.obj", "--as", "float32") == 1
+        assert "Not injective" in capsys.readouterr().out
+
+
+class TestDemo:
+    def test_writes_its_three_files(self, tmp_path, capsys):
+        assert run("demo", "-o", tmp_path / "d") == 0
+        assert sorted(p.name for p in (tmp_path / "d").iterdir()) == ["demo.json", "demo.obj", "demo.png"]
+        facts = json.loads((tmp_path / "d" / "demo.json").read_text())
+        assert facts["injective"]
+        assert facts["bijective"]
+        assert str(tmp_path / "d") in capsys.readouterr().out
+        assert run("check", tmp_path / "d" / "demo.obj") == 0
+
+
+def test_help_imports_no_numerics():
+    """`qhm --help` must not pay for NumPy."""
+    code = (
+        "import sys; from quasiharmonic.cli import main\n"
+        "try: main(['map', '--help'])\n"
+        "except SystemExit: pass\n"
+        "import quasiharmonic; assert not {'numpy', 'scipy', 'matplotlib'} & set(sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_module_runs_as_the_command():
+    done = subprocess.run([sys.executable, "-m", "quasiharmonic", "--version"], capture_output=True, text=True)
+    assert done.stdout.startswith("qhm ")
+
+
+def test_progress_on_a_terminal_only(star, tmp_path):
+    """On a pseudo-terminal a line is written over; nothing of it stays."""
+    pty = pytest.importorskip("pty")
+    leader, follower = pty.openpty()
+    command = [sys.executable, "-m", "quasiharmonic", "map", str(star), "-o", str(tmp_path / "out.obj")]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=follower)
+    os.close(follower)
+    shown = os.read(leader, 1 << 16).decode()
+    os.close(leader)
+    assert done.returncode == 0
+    assert "iteration" in shown
+    assert "inverted 0" in shown
+    assert shown.endswith("\r\x1b[K")
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the development cases are not beside this checkout")
+@pytest.mark.parametrize(
+    "case",
+    sorted(str(p.relative_to(CASES)) for d in ("simple", "letters") for p in (CASES / d).glob("*"))
+    + [f"hard/{name}" for name in ("limbs_A", "armadillo_G", "camel_H", "bunny_comma")],
+)
+def test_real_cases(case, tmp_path):
+    """Every one is solved, and an independent checker agrees on the written file."""
+    out = tmp_path / "out.obj"
+    folder = CASES / case
+    assert run("map", folder / "input.obj", "-o", out, "--fixed", folder / "handles.txt") == 0
+    checker = CASES.parent / "tools" / "check_map.py"
+    command = [sys.executable, checker, out, "--input", folder / "input.obj", "--handles", folder / "handles.txt"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

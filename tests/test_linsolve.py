@@ -1,0 +1,619 @@
+"""Every backend against dense algebra, and against matrices that are not positive definite."""
+
+from __future__ import annotations
+
+import gc
+import platform
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from quasiharmonic import linsolve
+from quasiharmonic.linsolve import NotPositiveDefinite, available, cholmod, make_solver, mkl, qdldl, superlu
+
+ALL = ("pardiso", "cholmod", "qdldl", "superlu")
+HAS_MKL_WHEEL = platform.machine().lower() in ("x86_64", "amd64") and sys.platform in ("linux", "win32")
+
+
+# The code that large matrices take, on small ones.
+LARGE = {"pardiso for large": (mkl, "_SEQUENTIAL_BELOW"), "cholmod for large": (cholmod, "_SIMPLICIAL_BELOW")}
+
+
+@pytest.fixture(params=(*ALL, *LARGE))
+def name(request, monkeypatch):
+    backend = request.param.split()[0]
+    if backend not in available():
+        assert backend != "pardiso" or not HAS_MKL_WHEEL, "mkl is a dependency on this platform"
+        pytest.skip(f"the library behind {backend} is not installed")
+    if request.param in LARGE:
+        monkeypatch.setattr(*LARGE[request.param], 0)
+    return backend
+
+
+def stiffness(side, seed=0, contrast=1.0, boundary=False):
+    """P1 stiffness matrix with a random tensor of determinant one per triangle, on a grid of side² inner vertices.
+
+    With `boundary` the outer ring is kept, so that constants are in the null space.
+    """
+    rng = np.random.default_rng(seed)
+    m = side + 2
+    ids = np.arange(m * m).reshape(m, m)
+    a, b, c, d = ids[:-1, :-1].ravel(), ids[1:, :-1].ravel(), ids[1:, 1:].ravel(), ids[:-1, 1:].ravel()
+    F = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    grid = np.stack(np.meshgrid(np.arange(m), np.arange(m), indexing="ij"), -1).reshape(-1, 2)
+    P = grid + 0.2 * rng.uniform(-1, 1, (m * m, 2))
+    E = np.stack([P[F[:, 1]] - P[F[:, 0]], P[F[:, 2]] - P[F[:, 0]]], axis=1)
+    g = np.linalg.inv(E)
+    G = np.concatenate([-g.sum(axis=2, keepdims=True), g], axis=2)
+    rho, theta = contrast * rng.random(len(F)), rng.uniform(0, 2 * np.pi, len(F))
+    cosh, sinh = np.cosh(2 * rho), np.sinh(2 * rho)
+    A = np.empty((len(F), 2, 2))
+    A[:, 0, 0], A[:, 1, 1] = cosh - sinh * np.cos(theta), cosh + sinh * np.cos(theta)
+    A[:, 0, 1] = A[:, 1, 0] = -sinh * np.sin(theta)
+    K = np.einsum("fai,fab,fbj->fij", G, A, G) * np.abs(np.linalg.det(E))[:, None, None]
+    full = sp.coo_array((K.ravel(), (np.repeat(F, 3, axis=1).ravel(), np.tile(F, 3).ravel())), shape=(m * m, m * m))
+    full = full.tocsr()
+    if not boundary:
+        inner = ids[1:-1, 1:-1].ravel()
+        full = full[inner][:, inner]
+    return upper(full)
+
+
+def upper(matrix):
+    triangle = sp.csr_array(sp.triu(matrix, format="csr"))
+    triangle.sort_indices()
+    return triangle
+
+
+def both(triangle):
+    return triangle + sp.triu(triangle, 1).T
+
+
+def dense(matrix):
+    """A symmetric dense matrix as a full upper triangle, zeros included."""
+    n = len(matrix)
+    rows, columns = np.triu_indices(n)
+    return sp.csr_array((matrix[rows, columns], columns, np.r_[0, np.cumsum(np.arange(n, 0, -1))]), shape=(n, n))
+
+
+def solver_for(triangle, name):
+    return make_solver(triangle.indptr, triangle.indices, name=name)
+
+
+def solve(triangle, rhs, name):
+    with solver_for(triangle, name) as solver:
+        solver.factor(triangle.data)
+        return solver.solve(rhs)
+
+
+# ---- right answers ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [1, 2, 5, 20])
+@pytest.mark.parametrize("columns", [None, 1, 2, 5])
+def test_agrees_with_dense_algebra(name, side, columns):
+    A = stiffness(side)
+    rhs = np.random.default_rng(1).standard_normal((side * side,) if columns is None else (side * side, columns))
+    x = solve(A, rhs, name)
+    assert x.shape == rhs.shape
+    assert x.dtype == np.float64
+    np.testing.assert_allclose(x, np.linalg.solve(both(A).toarray(), rhs), rtol=1e-10, atol=1e-12)
+
+
+def test_high_contrast(name):
+    A = stiffness(20, contrast=6.0)
+    rhs = both(A) @ np.ones(400)
+    np.testing.assert_allclose(solve(A, rhs, name), 1, rtol=1e-4)
+
+
+def test_new_values_on_the_same_pattern(name):
+    with solver_for(stiffness(12), name) as solver:
+        assert solver.name == name
+        for seed in range(5):
+            A = stiffness(12, seed=seed, contrast=0.5 * seed)
+            solver.factor(A.data)
+            for columns in (1, 3):
+                rhs = np.random.default_rng(seed).standard_normal((144, columns))
+                np.testing.assert_allclose(both(A) @ solver.solve(rhs), rhs, rtol=0, atol=1e-9)
+
+
+def test_the_callers_arrays_are_neither_kept_nor_changed(name):
+    A = stiffness(10)
+    indptr, indices, values = A.indptr.copy(), A.indices.copy(), A.data.copy()
+    solver = make_solver(indptr, indices, name=name)
+    solver.factor(values)
+    indptr[:], indices[:], values[:] = 7, 7, np.nan
+    rhs = np.arange(200.0).reshape(100, 2)
+    before = rhs.copy()
+    x = solver.solve(rhs)
+    np.testing.assert_array_equal(rhs, before)
+    assert not np.shares_memory(x, rhs)
+    np.testing.assert_allclose(both(A) @ x, rhs, rtol=0, atol=1e-10)
+    kept = x.copy()
+    solver.solve(-rhs)
+    np.testing.assert_array_equal(x, kept)
+
+
+def test_any_layout_and_dtype_of_input(name):
+    A = stiffness(10)
+    rounded = sp.csr_array((A.data.astype(np.float32), A.indices, A.indptr), shape=A.shape)
+    solver = make_solver(A.indptr.astype(np.uint64), A.indices.tolist(), name=name)
+    solver.factor(np.repeat(rounded.data, 2)[::2])
+    wide = np.random.default_rng(0).integers(-9, 9, (100, 6))
+    for rhs in (wide, wide[:, ::2], wide[::-1], np.asfortranarray(wide), wide.astype(np.float32), wide[:, 3]):
+        np.testing.assert_allclose(both(rounded) @ solver.solve(rhs), rhs, rtol=0, atol=1e-10)
+
+
+def test_unknowns_that_do_not_touch(name):
+    A = upper(sp.block_diag([both(stiffness(4)), sp.eye_array(3) * 5, both(stiffness(6, seed=2))], format="csr"))
+    rhs = np.random.default_rng(0).standard_normal((A.shape[0], 2))
+    np.testing.assert_allclose(both(A) @ solve(A, rhs, name), rhs, rtol=0, atol=1e-11)
+
+
+def test_no_unknowns_and_one(name):
+    with make_solver([0], [], name=name) as none:
+        none.factor([])
+        assert none.solve(np.zeros(0)).shape == (0,)
+        assert none.solve(np.zeros((0, 2))).shape == (0, 2)
+    with make_solver([0, 1], [0], name=name) as one:
+        one.factor([4.0])
+        assert one.solve([2.0]).tolist() == [0.5]
+        assert one.solve([[2.0, 4.0]]).tolist() == [[0.5, 1.0]]
+        assert one.solve(np.zeros((1, 0))).shape == (1, 0)
+        with pytest.raises(NotPositiveDefinite, match="diagonal entry 0 is 0"):
+            one.factor([0.0])
+
+
+def test_zero_right_hand_sides(name):
+    A = stiffness(5)
+    rhs = np.zeros((25, 3))
+    rhs[:, 1] = 1
+    x = solve(A, rhs, name)
+    assert not x[:, [0, 2]].any()
+    np.testing.assert_allclose(both(A) @ x, rhs, atol=1e-12)
+
+
+def test_explicit_zeros_in_the_pattern(name):
+    A = stiffness(8)
+    solver = solver_for(A, name)
+    A.data[np.flatnonzero(A.indices != np.repeat(np.arange(64), np.diff(A.indptr)))[::3]] = 0
+    rhs = np.ones(64)
+    solver.factor(A.data)
+    np.testing.assert_allclose(both(A) @ solver.solve(rhs), rhs, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("decades", [3, 10, 60])
+def test_diagonal_scaling_changes_nothing(name, decades):
+    A = stiffness(12, contrast=1.0)
+    scale = 2.0 ** np.round(np.random.default_rng(3).uniform(-decades, decades, 144) * np.log2(10))
+    scaled = upper(sp.diags_array(scale) @ both(A) @ sp.diags_array(scale))
+    rhs = np.random.default_rng(4).standard_normal((144, 2))
+    x = solve(scaled, scale[:, None] * rhs, name)
+    np.testing.assert_allclose(scale[:, None] * x, solve(A, rhs, name), rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("factor", [1e-200, 1e-20, 1e20, 1e200])
+def test_units_do_not_matter(name, factor):
+    A = stiffness(10)
+    rhs = np.random.default_rng(0).standard_normal((100, 2)) * [1, 1e-9]
+    expected = solve(A, rhs, name)
+    A.data *= factor
+    np.testing.assert_allclose(solve(A, rhs, name) * factor, expected, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(solve(A, rhs * factor, name), expected, rtol=1e-9, atol=0)
+
+
+def test_same_input_same_bits(name):
+    A = stiffness(40, contrast=2.0)
+    rhs = np.random.default_rng(0).standard_normal((1600, 2))
+    first, second = solver_for(A, name), solver_for(A, name)
+    results = []
+    for solver in (first, second, first):
+        solver.factor(A.data)
+        results.append(solver.solve(rhs))
+    np.testing.assert_array_equal(results[0], results[1])
+    np.testing.assert_array_equal(results[0], results[2])
+
+
+# ---- matrices that are not positive definite ----------------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    n=st.integers(1, 30),
+    negative=st.integers(0, 3),
+    smallest=st.floats(-6, 0),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_inertia_decides(name, n, negative, smallest, seed):
+    rng = np.random.default_rng(seed)
+    Q, _ = np.linalg.qr(rng.standard_normal((n, n)))
+    eigenvalues = 10 ** rng.uniform(smallest, 0, n)
+    eigenvalues[: min(negative, n)] *= -1
+    A = dense((Q * eigenvalues) @ Q.T)
+    rhs = rng.standard_normal(n)
+    if negative:
+        with pytest.raises(NotPositiveDefinite):
+            solver_for(A, name).factor(A.data)
+    else:
+        np.testing.assert_allclose(both(A) @ solve(A, rhs, name), rhs, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.5, 1.5])
+def test_an_indefinite_matrix_is_an_event_and_the_next_one_is_solved(name, share):
+    A = stiffness(15)
+    smallest = np.linalg.eigvalsh(both(A).toarray())[0]
+    shifted = A.copy()
+    shifted.data[A.indptr[:-1]] -= smallest * (1 + share)
+    with solver_for(A, name) as solver:
+        for _ in range(2):
+            with pytest.raises(NotPositiveDefinite, match="not positive definite"):
+                solver.factor(shifted.data)
+            with pytest.raises(RuntimeError, match="did not succeed"):
+                solver.solve(np.ones(225))
+            solver.factor(A.data)
+            np.testing.assert_allclose(both(A) @ solver.solve(np.ones(225)), 1, rtol=1e-10)
+
+
+@pytest.mark.parametrize("contrast", [0.0, 3.0])
+@pytest.mark.parametrize("side", [3, 20])
+def test_a_semidefinite_matrix_is_an_event(name, side, contrast):
+    A = stiffness(side, contrast=contrast, boundary=True)
+    with pytest.raises(NotPositiveDefinite):
+        solve(A, np.random.default_rng(0).random((A.shape[0], 2)), name)
+
+
+def test_exactly_singular(name):
+    path = dense(np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]]))
+    with pytest.raises(NotPositiveDefinite):
+        solve(path, [1.0, 2, 4], name)
+    pair = dense(np.array([[0.0, 1], [1, 0]]))
+    with pytest.raises(NotPositiveDefinite, match="diagonal entry 0 is 0"):
+        solver_for(pair, name).factor(pair.data)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1.0, 0.0])
+@pytest.mark.parametrize("where", ["first", "middle", "last"])
+def test_bad_diagonal_entries(name, bad, where):
+    A = stiffness(6)
+    row = {"first": 0, "middle": 17, "last": 35}[where]
+    A.data[A.indptr[row]] = bad
+    expected = "NaN or too large" if bad == np.inf else f"diagonal entry {row} is {bad:g}"
+    with pytest.raises(NotPositiveDefinite, match=expected):
+        solver_for(A, name).factor(A.data)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308])
+def test_bad_entries_off_the_diagonal(name, bad):
+    A = stiffness(6)
+    A.data[A.indptr[17] + 1] = bad
+    with pytest.raises(NotPositiveDefinite, match="not positive definite"):
+        solver_for(A, name).factor(A.data)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_bad_right_hand_sides(name, bad):
+    A = stiffness(6)
+    rhs = np.ones((36, 2))
+    rhs[20, 1] = bad
+    with pytest.raises(NotPositiveDefinite, match="the right-hand side has NaN or infinite entries"):
+        solve(A, rhs, name)
+
+
+# ---- the residual test --------------------------------------------------------------------------------------------
+
+
+def broken(monkeypatch, damage):
+    """A solver whose backend's solutions go through `damage` before they come out, and the list of its calls."""
+    A = stiffness(15)
+    solver = solver_for(A, "superlu")
+    solver.factor(A.data)
+    original, calls = solver._solve, []
+
+    def damaged(b):
+        calls.append(b)
+        return damage(original(b))
+
+    monkeypatch.setattr(solver, "_solve", damaged)
+    return A, solver, calls
+
+
+def one_wrong_entry(x):
+    x[100, -1] += 1e-2 * np.abs(x[:, -1]).max()
+    return x
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        np.zeros_like,
+        np.negative,
+        lambda x: np.full_like(x, np.nan),
+        lambda x: np.full_like(x, np.inf),
+        lambda x: 1e30 * x,
+        lambda x: x[::-1],
+        lambda x: x + np.random.default_rng(0).standard_normal(x.shape) * np.abs(x).max(),
+        one_wrong_entry,
+    ],
+)
+@pytest.mark.parametrize("unit", [1.0, 1e-30, 1e180])
+def test_a_wrong_solution_does_not_come_out(monkeypatch, damage, unit):
+    _, solver, calls = broken(monkeypatch, damage)
+    rhs = np.random.default_rng(1).standard_normal((225, 2)) * [1, unit]
+    with pytest.raises(NotPositiveDefinite, match=r"not numerically positive definite: the residual .* superlu"):
+        solver.solve(rhs)
+    assert len(calls) == 2, "one step of refinement, and no more"
+
+
+def test_an_inaccurate_solution_is_refined(monkeypatch):
+    A, solver, calls = broken(monkeypatch, lambda x: x * (1 + 1e-6))
+    rhs = np.random.default_rng(1).standard_normal((225, 2))
+    np.testing.assert_allclose(both(A) @ solver.solve(rhs), rhs, rtol=0, atol=1e-9)
+    assert len(calls) == 2
+
+
+def test_a_right_solution_is_not_touched(monkeypatch):
+    _, solver, calls = broken(monkeypatch, lambda x: x)
+    solver.solve(np.random.default_rng(1).standard_normal((225, 3)))
+    assert len(calls) == 1
+
+
+# ---- life of a solver ---------------------------------------------------------------------------------------------
+
+
+def test_order_of_calls(name):
+    A = stiffness(4)
+    solver = solver_for(A, name)
+    with pytest.raises(RuntimeError, match=r"factor\(\) was not called"):
+        solver.solve(np.ones(16))
+    solver.factor(A.data)
+    with pytest.raises(ValueError, match=r"values has shape \(5,\); the analysed pattern has 49 entries"):
+        solver.factor(np.ones(5))
+    for shape in [(15,), (15, 2), (2, 16), (), (16, 1, 1)]:
+        with pytest.raises(ValueError, match=r"expected \(16,\) or \(16, k\)"):
+            solver.solve(np.ones(shape))
+    solver.solve(np.ones(16))
+    solver.close()
+    solver.close()
+    with pytest.raises(ValueError, match="the solver is closed"):
+        solver.solve(np.ones(16))
+    with pytest.raises(ValueError, match="the solver is closed"):
+        solver.factor(A.data)
+
+
+def test_two_threads_with_a_solver_each(name):
+    barrier = threading.Barrier(2)
+
+    def work(seed):
+        A = stiffness(25, seed=seed)
+        rhs = np.random.default_rng(seed).standard_normal((625, 1 + seed))
+        barrier.wait()
+        worst = 0.0
+        with solver_for(A, name) as solver:
+            for _ in range(20):
+                solver.factor(A.data)
+                worst = max(worst, np.abs(both(A) @ solver.solve(rhs) - rhs).max())
+        return worst
+
+    with ThreadPoolExecutor(2) as pool:
+        assert max(pool.map(work, range(2))) < 1e-10
+
+
+def test_two_threads_with_one_solver(name):
+    A = stiffness(25)
+    rhs = np.random.default_rng(0).standard_normal((625, 8))
+    with solver_for(A, name) as solver, ThreadPoolExecutor(2) as pool:
+        solver.factor(A.data)
+        expected = [solver.solve(column) for column in rhs.T]
+        for _ in range(10):
+            for x, known in zip(pool.map(solver.solve, rhs.T), expected, strict=True):
+                np.testing.assert_array_equal(x, known)
+
+
+# ---- patterns and names -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("indptr", "indices", "message"),
+    [
+        ([], [], "indptr must be one-dimensional"),
+        ([1, 2], [0, 0], "start with 0"),
+        ([0, 2], [0], "end with the number of indices"),
+        ([[0, 1]], [0], "one-dimensional"),
+        ([0, 1, 1], [0], "row 1 has no entries"),
+        ([0, 1, 2], [0, 0], "row 1 does not start with its diagonal entry"),
+        ([0, 2, 3], [1, 0, 1], "row 0 does not start with its diagonal entry"),
+        ([0, 3, 4, 5], [0, 2, 1, 1, 2], "ascending within each row"),
+        ([0, 2, 3], [0, 0, 1], "ascending within each row"),
+        ([0, 2, 3], [0, 5, 1], "smaller than the number of rows"),
+    ],
+)
+def test_malformed_patterns(indptr, indices, message):
+    with pytest.raises(ValueError, match=message):
+        make_solver(indptr, indices)
+
+
+def test_unknown_name():
+    with pytest.raises(
+        ValueError, match=r"no linear solver 'umfpack'.*'auto', 'pardiso'.*available here are .*superlu"
+    ):
+        make_solver([0, 1], [0], name="umfpack")
+
+
+@pytest.mark.parametrize(
+    ("backend", "command"),
+    [
+        (mkl.Pardiso, "pip install mkl"),
+        (cholmod.Cholmod, "pip install scikit-sparse"),
+        (qdldl.Qdldl, "pip install qdldl"),
+    ],
+)
+def test_a_backend_that_is_not_installed(monkeypatch, backend, command):
+    monkeypatch.setattr(backend, "present", classmethod(lambda cls: False))
+    assert backend.name not in available()
+    with pytest.raises(ImportError, match=f"'{backend.name}' is not installed; available .*superlu.*: {command}"):
+        make_solver([0, 1], [0], name=backend.name)
+    assert make_solver([0, 1], [0]).name != backend.name
+
+
+def test_auto_takes_the_first_that_loads(monkeypatch):
+    def fail(self):
+        raise ImportError("undefined symbol")
+
+    left = list(available())
+    assert left == [name for name in ALL if name in left]
+    assert left[-1] == "superlu"
+    for backend in (mkl.Pardiso, cholmod.Cholmod, qdldl.Qdldl):
+        solver = make_solver([0, 1], [0])
+        assert solver.name == left[0]
+        if backend.name in left:
+            monkeypatch.setattr(backend, "_analyse", fail)
+            with pytest.raises(ImportError, match="undefined symbol"):
+                make_solver([0, 1], [0], name=backend.name)
+            left.remove(backend.name)
+    assert make_solver([0, 1], [0]).name == "superlu"
+
+
+def test_import_loads_no_backend():
+    code = (
+        "import sys, quasiharmonic.linsolve as l; l.available(); "
+        "print([m for m in ('scipy', 'qdldl', 'sksparse') if m in sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_the_backends_are_modules_of_the_package():
+    assert {superlu.SuperLU.name, mkl.Pardiso.name, cholmod.Cholmod.name, qdldl.Qdldl.name} == set(linsolve._BACKENDS)
+
+
+# ---- MKL ----------------------------------------------------------------------------------------------------------
+
+needs_mkl = pytest.mark.skipif(not HAS_MKL_WHEEL, reason="MKL has no wheel for this platform")
+
+
+@needs_mkl
+def test_pardiso_with_all_threads():
+    A = stiffness(180, contrast=1.0)
+    assert A.shape[0] >= mkl._SEQUENTIAL_BELOW
+    rhs = np.random.default_rng(0).standard_normal((A.shape[0], 2))
+    with solver_for(A, "pardiso") as solver:
+        for columns in (rhs, rhs[:, 0]):
+            solver.factor(A.data)
+            x = solver.solve(columns)
+            np.testing.assert_allclose(both(A) @ x, columns, rtol=0, atol=1e-9)
+            np.testing.assert_array_equal(x, solver.solve(columns))
+        indefinite = A.data.copy()
+        indefinite[A.indptr[:-1]] *= 0.9
+        with pytest.raises(NotPositiveDefinite, match="PARDISO met a pivot that is not positive"):
+            solver.factor(indefinite)
+        solver.factor(A.data)
+        solver.solve(rhs)
+
+
+@needs_mkl
+def test_pardiso_leaves_the_number_of_threads_alone():
+    library = mkl.load_mkl()
+    before = library.MKL_Set_Num_Threads_Local(0)
+    try:
+        library.MKL_Set_Num_Threads_Local(2)
+        solve(stiffness(5), np.ones(25), "pardiso")
+        assert library.MKL_Set_Num_Threads_Local(0) == 2
+    finally:
+        library.MKL_Set_Num_Threads_Local(before)
+
+
+@needs_mkl
+@pytest.mark.parametrize(
+    ("code", "kind", "message"),
+    [
+        (-2, MemoryError, "phase 22 with error -2: not enough memory"),
+        (-1, RuntimeError, "phase 22 with error -1: input inconsistent"),
+        (-77, RuntimeError, "phase 22 with error -77: unknown error"),
+        (-4, NotPositiveDefinite, "PARDISO met a pivot"),
+    ],
+)
+def test_pardiso_errors(monkeypatch, code, kind, message):
+    A = stiffness(4)
+    solver = solver_for(A, "pardiso")
+    with monkeypatch.context() as patch:
+        patch.setattr(solver._handle, "_call", lambda *_: code)
+        with pytest.raises(kind, match=message):
+            solver.factor(A.data)
+    solver.factor(A.data)
+    solver.solve(np.ones(16))
+
+
+@needs_mkl
+def test_pardiso_releases_its_memory():
+    A = stiffness(4)
+    by_hand, forgotten = solver_for(A, "pardiso"), solver_for(A, "pardiso")
+    finalizers = by_hand._release_once, forgotten._release_once
+    by_hand.close()
+    assert [f.alive for f in finalizers] == [False, True]
+    handle = forgotten._handle
+    assert handle._memory.any()
+    del forgotten
+    gc.collect()
+    assert not finalizers[1].alive
+    assert not handle._memory.any()
+
+
+@needs_mkl
+def test_mkl_in_64_bit_mode_is_left_alone():
+    code = (
+        "import os; os.environ['MKL_INTERFACE_LAYER'] = 'ILP64'\n"
+        "from quasiharmonic.linsolve import make_solver\n"
+        "import ctypes; from quasiharmonic.linsolve import mkl\n"
+        "ctypes.CDLL(mkl.find_mkl()).MKL_Get_Max_Threads()\n"
+        "s = make_solver([0, 1], [0]); s.factor([2.0]); print(s.name, s.solve([2.0]))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    solver, answer = run.stdout.split()
+    assert answer == "[1.]"
+    assert solver in available()
+    assert solver != "pardiso"
+
+
+def test_which_files_are_mkl(tmp_path):
+    names = ["libmkl_rt.so.1", "libmkl_rt.so.3", "libmkl_rt.so.2", "libmkl_rt.so"]
+    no = ["libmkl_rt.so.3.bak", "libmkl_rt.lib", "libmkl_core.so.3", "mkl_rt.py"]
+    yes = [*names, "mkl_rt.2.dll", "mkl_rt.dll", "libmkl_rt.2.dylib"]
+    assert [file for file in yes + no if mkl._fits(tmp_path / file)] == yes
+    assert max(names, key=lambda file: mkl._version(tmp_path / file)) == "libmkl_rt.so.3"
+
+
+def test_mkl_is_found_where_environments_keep_it(monkeypatch, tmp_path):
+    places = {"lib": ["libmkl_rt.so.2", "libmkl_rt.so.3", "libmkl_core.so.3"], "Library/bin": ["mkl_rt.2.dll"]}
+    for folder, files in places.items():
+        (tmp_path / folder).mkdir(parents=True)
+        for file in files:
+            (tmp_path / folder / file).touch()
+    monkeypatch.setattr(mkl.sys, "prefix", str(tmp_path))
+    candidates = mkl._candidates()
+    assert next(candidates) == str(tmp_path / "lib" / "libmkl_rt.so.3")
+    monkeypatch.setattr(mkl.sys, "prefix", str(tmp_path / "nowhere"))
+    monkeypatch.setattr(mkl.site, "getuserbase", lambda: str(tmp_path))
+    assert next(mkl._candidates()) == str(tmp_path / "lib" / "libmkl_rt.so.3")
+
+
+def test_a_library_that_does_not_load(monkeypatch, tmp_path):
+    fake = tmp_path / "libmkl_rt.so.3"
+    fake.write_bytes(b"not a library")
+    monkeypatch.setattr(mkl, "find_mkl", lambda: str(fake))
+    mkl.load_mkl.cache_clear()
+    try:
+        with pytest.raises(ImportError, match="does not load"):
+            mkl.load_mkl()
+        assert make_solver([0, 1], [0]).name != "pardiso"
+        monkeypatch.setattr(mkl, "find_mkl", lambda: None)
+        with pytest.raises(ImportError, match="pip install mkl"):
+            mkl.load_mkl()
+    finally:
+        mkl.load_mkl.cache_clear()
