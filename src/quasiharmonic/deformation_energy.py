@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.energies import Deformation, Energy, QuadraticForm
-from quasiharmonic.mesh.reference import ReferenceMesh, rest_frames
+from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import named
 
 FloatArray = NDArray[np.float64]
@@ -60,26 +60,21 @@ class DeformationEnergy:
     ) -> None:
         self.energy = energy
         self.F = np.asarray(F, dtype=np.int64)
-        surface = as_surface(V)
-        # Products of lengths must not leave the numbers' range. A power of two costs no digits.
-        exponent = int(np.frexp(np.abs(surface).max(initial=0))[1])
-        surface = np.ldexp(surface, -exponent)
-        z1, z2 = rest_frames(surface, self.F)
-        flat = np.flatnonzero(~(z1 * z2.imag > 0))
-        if flat.size:
+        shapes = rest_shapes(V, self.F)
+        if shapes.flat.size:
             raise ValueError(
-                f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh: distortion is undefined there"
+                f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
+                "distortion is undefined there"
             )
         if area is not None and not 0 < area < np.inf:
             raise ValueError(f"the area of the map must be positive, not {area}")
-        mesh = ReferenceMesh(surface, self.F, "rest")
-        total = float(mesh.m.sum())
-        scale = float(np.ldexp(1.0, -exponent)) if area is None else float(np.sqrt(total / area))
-        self.g: ComplexArray = 0.5 * scale * mesh.gamma
-        self.share: FloatArray = mesh.m / total
+        total = float(shapes.m.sum())
+        scale = 1 / shapes.unit if area is None else float(np.sqrt(total / area))
+        self.g: ComplexArray = scale * shapes.half_gradients()
+        self.share: FloatArray = shapes.m / total
         if weights is not None:
             self.share = self.share * _weights(weights, len(self.F))
-        self._det_per_area = scale**2 / mesh.m
+        self._det_per_area = scale**2 / shapes.m
         self._corners = np.ascontiguousarray(self.F.T)
 
     def deform(self, w: ComplexArray) -> Deformation:
@@ -161,16 +156,6 @@ def signed_areas(F: NDArray[np.integer], w: ComplexArray) -> FloatArray:
 def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     w0 = w[corners[0]]
     return w[corners[1]] - w0, w[corners[2]] - w0
-
-
-def as_surface(V: ArrayLike) -> FloatArray:
-    """Rest positions in space, (n, 3) float64; planar ones in the plane z = 0."""
-    positions = np.asarray(V, dtype=np.float64)
-    if positions.ndim != 2 or positions.shape[1] not in (2, 3):
-        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {positions.shape}")
-    surface = np.zeros((len(positions), 3))
-    surface[:, : positions.shape[1]] = positions
-    return surface
 
 
 def _weights(weights: ArrayLike, f: int) -> FloatArray:

@@ -38,8 +38,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.mesh.reference import rest_frames
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.mesh.shapes import rest_shapes
+from quasiharmonic.mesh.topology import boundary_edges, named
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -380,18 +380,26 @@ class MassSpring(Energy):
         Rest positions.
     F : (f, 3) array of int
         Triangles, in the order in which `Deformation` has them.
+
+    Raises
+    ------
+    ValueError
+        When rest triangles have no area.
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
-        V, F = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
-        z1, z2 = rest_frames(V, F)
-        m = 0.5 * np.abs(z1 * z2.imag)
-        self._sides = np.stack([z1 + 0j, z2 - z1, -z2])
-        self._lengths = np.abs(self._sides)
-        key = F.T * len(V) + F.T[(1, 2, 0), :]
-        boundary = boundary_edges(F, len(V))
-        single = np.isin(key, boundary[:, 0] * len(V) + boundary[:, 1])
-        self._stiffness = np.where(single, 1.0, 0.5) / m
+        F = np.asarray(F, dtype=np.int64)
+        shapes = rest_shapes(V, F)
+        if shapes.flat.size:
+            raise ValueError(
+                f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
+                "springs are shared out by area"
+            )
+        self._sides, self._lengths = shapes.sides, np.abs(shapes.sides)
+        n = int(F.max()) + 1
+        boundary = boundary_edges(F, n)
+        single = np.isin(F.T * n + F.T[(1, 2, 0), :], boundary[:, 0] * n + boundary[:, 1])
+        self._stiffness = np.where(single, 1.0, 0.5) / shapes.m
 
     def density(self, d: Deformation) -> FloatArray:
         """``Σ (l − l⁰)²/m`` over the triangle's sides, with their shares."""

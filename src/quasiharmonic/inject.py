@@ -24,7 +24,7 @@ from quasiharmonic.optimize.lbfgs import lbfgs
 from quasiharmonic.optimize.newton import newton
 from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.problem import Problem
-from quasiharmonic.result import MapResult, Stage, Status, Step
+from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.strategy import Descent, stages_of
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +46,7 @@ def injective_map(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    record: int = 0,
 ) -> MapResult:
     """Map a triangle mesh into the plane with no triangle inverted.
 
@@ -69,6 +70,8 @@ def injective_map(
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at every iteration.
+    record : int
+        Keep the map of every ``record``-th iteration in the result's ``path``; none of them by default.
 
     Returns
     -------
@@ -105,6 +108,7 @@ def injective_map(
         max_iterations=max_iterations,
         linear_solver=linear_solver,
         callback=callback,
+        record=record,
         _began=began,
     )
 
@@ -116,11 +120,12 @@ def solve(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    record: int = 0,
     _began: float | None = None,
 ) -> MapResult:
     """Solve a problem at hand; parameters and result as `injective_map` has them."""
     began = time.perf_counter() if _began is None else _began
-    search = _Search(problem, linear_solver, callback, max_iterations)
+    search = _Search(problem, linear_solver, callback, max_iterations, record)
     status = search.run(stages_of(strategy, problem))
     uv = _positions(problem, search.best_map)
     certificate = certify(problem.F, uv)
@@ -133,6 +138,7 @@ def solve(
         linear_solver=search.linear_solver,
         seconds=time.perf_counter() - began,
         xi=search.best_xi,
+        path=search.path,
     )
 
 
@@ -182,14 +188,23 @@ class _Search:
     """Runs stages one after another, keeps the best map and writes down what happened."""
 
     def __init__(
-        self, problem: Problem, linear_solver: str, callback: Callable[[Step], object] | None, budget: int
+        self,
+        problem: Problem,
+        linear_solver: str,
+        callback: Callable[[Step], object] | None,
+        budget: int,
+        record: int,
     ) -> None:
+        if record < 0:
+            raise ValueError(f"record must not be negative, but is {record}")
         self.problem = problem
         # Where rounding defeats one backend's factorisation, another's order of elimination may do.
         self.linear_solver = linear_solver
         self._spare = available() if linear_solver == "auto" else ()
         self.callback = callback
         self.budget = budget
+        self.record = record
+        self.path: list[Snapshot] = []
         self.history: list[Step] = []
         self.stages: list[Stage] = []
         # Should nothing at all be computed, every free vertex lies at the middle of the target.
@@ -274,6 +289,8 @@ class _Search:
             self._rounded |= flipped > 0
         step = Step(len(self.history), flipped, here.energy)
         self.history.append(step)
+        if self.record and step.iteration % self.record == 0:
+            self.path.append(Snapshot(step.iteration, _positions(self.problem, here.w)))
         if (flipped, step.energy) < self.best:
             self.best = flipped, step.energy
             self.best_map, self.best_xi = here.w, here.xi

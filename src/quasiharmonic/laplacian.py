@@ -84,6 +84,7 @@ class Laplacian:
         self._border = mixed
         self._border_row = np.where(outward, tail[mixed], head[mixed])
         self._border_fixed = np.where(outward, self._head[mixed], self._tail[mixed])
+        self._rim = np.flatnonzero((tail < 0) | (head < 0))
         self.solver = make_solver(indptr.astype(np.int32), indices, name=linear_solver)
 
     def factor(self, stiffness: FloatArray) -> None:
@@ -140,7 +141,7 @@ class Laplacian:
         return out
 
     def flux(self, w: ComplexArray) -> ComplexArray:
-        """``Gᵀ A G w`` at every vertex: the discrete Neumann data where the vertex is fixed (§6.2).
+        """``Gᵀ A G w`` at the fixed vertices, the discrete Neumann data (§6.2), and zero elsewhere.
 
         Parameters
         ----------
@@ -150,12 +151,14 @@ class Laplacian:
         -------
         (n,) complex128
         """
-        tail, head, n = self._tail, self._head, self.n
+        tail, head = self._tail[self._rim], self._head[self._rim]
         # Rows sum to zero, so an off-diagonal entry k of edge (i, j) adds k (wⱼ − wᵢ) to row i.
-        pull = self._stiffness * (w[head] - w[tail])
-        real = np.bincount(tail, pull.real, minlength=n) - np.bincount(head, pull.real, minlength=n)
-        imag = np.bincount(tail, pull.imag, minlength=n) - np.bincount(head, pull.imag, minlength=n)
-        return real + 1j * imag
+        pull = self._stiffness[self._rim] * (w[head] - w[tail])
+        out = np.zeros(self.n, dtype=np.complex128)
+        np.add.at(out, tail, pull)
+        np.subtract.at(out, head, pull)
+        out[self.free] = 0
+        return out
 
     def _solve(self, load: ComplexArray) -> ComplexArray:
         """One solve for both coordinates with the factor at hand; (n - k,) complex128."""

@@ -18,6 +18,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
+# Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
+_CHUNK = 8192
+
 
 class NewtonSystem:
     """The matrix of ``Σⱼ formⱼ(dp, dq)`` by the positions of the free vertices.
@@ -63,6 +66,7 @@ class NewtonSystem:
         low, high = np.where(upward, g1, g2), np.where(upward, g2, g1)
         self._side_products = _parts(low, high)
         self._corner_products = _parts(g, g)
+        self._work = np.empty(self._side_products.shape)
 
     def _pattern(self, corner: IntArray, size: int) -> None:
         """Where the blocks go."""
@@ -103,10 +107,10 @@ class NewtonSystem:
         form : QuadraticForm
             On every triangle, with its area and weight in it.
         """
-        sides, corners = _blocks(form, self._side_products), _blocks(form, self._corner_products)
-        for slot, part in zip(self._side_slots, sides, strict=True):
+        for slot, part in zip(self._side_slots, _blocks(form, self._side_products, self._work), strict=True):
             self._values[slot] = self._sum_sides @ part.ravel()
-        for slot, part in zip(self._corner_slots, (corners[0], corners[1], corners[3]), strict=True):
+        xx, xy, _, yy = _blocks(form, self._corner_products, self._work)
+        for slot, part in zip(self._corner_slots, (xx, xy, yy), strict=True):
             self._values[slot] = self._sum_corners @ part.ravel()
         self._diagonal = self._values[self._first]
 
@@ -151,26 +155,30 @@ class NewtonSystem:
         return (np.ascontiguousarray(load).view(np.float64) / diagonal).view(np.complex128)
 
 
-def _parts(g1: ComplexArray, g2: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Real and imaginary parts of ``g₁ conj(g₂)`` and of ``g₁ g₂``."""
+def _parts(g1: ComplexArray, g2: ComplexArray) -> FloatArray:
+    """Real and imaginary parts of ``g₁ conj(g₂)`` and of ``g₁ g₂``, (4, 3, f) float64."""
     turned, product = g1 * g2.conj(), g1 * g2
-    return turned.real.copy(), turned.imag.copy(), product.real.copy(), product.imag.copy()
+    return np.stack([turned.real, turned.imag, product.real, product.imag])
 
 
-def _blocks(
-    form: QuadraticForm, products: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Entries xx, xy, yx, yy of the blocks between pairs of corners i, j.
+def _blocks(form: QuadraticForm, products: FloatArray, out: FloatArray) -> FloatArray:
+    """Entries xx, xy, yx, yy of the blocks between pairs of corners i, j; (4, 3, f) float64.
 
     With dp and dq written out, the form is the real part of ``Σ Mᵢⱼ conj(dwᵢ) dwⱼ + Nᵢⱼ dwᵢ dwⱼ``.
     """
-    cr, ci, sr, si = products
-    p2, q2 = form.p2, form.q2
-    even = (form.pp + form.qq) * cr + (form.pqc.real * sr + form.pqc.imag * si)
-    odd = (form.pp - form.qq) * ci
-    real = (p2.real + q2.real) * sr + (p2.imag - q2.imag) * si + form.pq.real * cr
-    imag = (p2.imag + q2.imag) * sr + (q2.real - p2.real) * si + form.pq.imag * cr
-    return even + real, -odd - imag, odd - imag, even - real
+    for start in range(0, form.pp.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        cr, ci, sr, si = products[:, :, part]
+        p2, q2, pq, pqc = form.p2[part], form.q2[part], form.pq[part], form.pqc[part]
+        m_real = (form.pp[part] + form.qq[part]) * cr + (pqc.real * sr + pqc.imag * si)
+        m_imag = (form.pp[part] - form.qq[part]) * ci
+        n_real = (p2.real + q2.real) * sr + (p2.imag - q2.imag) * si + pq.real * cr
+        n_imag = (p2.imag + q2.imag) * sr + (q2.real - p2.real) * si + pq.imag * cr
+        out[0, :, part] = m_real + n_real
+        out[1, :, part] = -m_imag - n_imag
+        out[2, :, part] = m_imag - n_imag
+        out[3, :, part] = m_real - n_real
+    return out
 
 
 def _summation(members: IntArray, offsets: IntArray, count: int) -> csr_array:

@@ -19,6 +19,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.certificate import certify, flipped_triangles, is_injective
+from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.energies import (
     ARAP,
     MIPS,
@@ -28,7 +30,11 @@ from quasiharmonic.energies import (
     SymmetricDirichlet,
     conformal_area_blend,
 )
-from quasiharmonic.result import MapResult, Step
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.mesh.topology import named
+from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.problem import Problem
+from quasiharmonic.result import MapResult, Stage, Status, Step
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

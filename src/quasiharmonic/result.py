@@ -107,6 +107,20 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Snapshot:
+    """The map at one iteration; flips and energy are ``history[iteration]``.
+
+    Attributes
+    ----------
+    iteration : int
+    uv : (n, 2) float64
+    """
+
+    iteration: int
+    uv: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class MapResult:
     """A map of the mesh into the plane.
 
@@ -128,6 +142,8 @@ class MapResult:
         Wall time from the call to the verdict.
     xi : (f,) complex128 or None
         The anisotropy behind the map, a start for the next solve of a similar problem.
+    path : list of Snapshot
+        Maps on the way, where the caller asked to have them recorded.
     """
 
     uv: NDArray[np.float64]
@@ -138,6 +154,7 @@ class MapResult:
     linear_solver: str = ""
     seconds: float = 0.0
     xi: NDArray[np.complex128] | None = None
+    path: list[Snapshot] = field(default_factory=list)
 
     @property
     def injective(self) -> bool:

@@ -190,8 +190,9 @@ class LinearSolver(ABC):
     def _solve(self, b: Floats) -> Floats:
         """Solve for (n, k) Fortran-ordered `b`, leaving it as it is, into a new Fortran-ordered array."""
 
-    def _release(self) -> None:  # noqa: B027  (most backends have nothing to release beyond their objects)
-        """Give back what Python's memory management does not."""
+    @abstractmethod
+    def _release(self) -> None:
+        """Drop the factor and whatever the library holds."""
 
 
 def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Ints, Ints]:

@@ -17,7 +17,7 @@ def lbfgs(
     *,
     iterations: int,
 ) -> None:
-    """Descend by limited-memory BFGS with bounds.
+    """Descend by limited-memory BFGS.
 
     Parameters
     ----------
@@ -37,23 +37,30 @@ def lbfgs(
 
     # The objective's own scale is that of the target's area; SciPy's first step is of the gradient's length.
     scale = 1.0 / abs(start.value) if start.value else 1.0
-    # A box within the disk |ξ| ≤ bound.
-    side = objective.parameterization.bound / np.sqrt(2)
     known = start
 
     def evaluate(x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """The objective after ξ is clipped to its bound, which no path that leads anywhere reaches."""
         nonlocal known
         xi = x.view(np.complex128)
-        if not np.array_equal(xi, known.xi):
-            known = objective.evaluate(xi.copy())
+        inside = objective.bounded(xi)
+        if not np.array_equal(inside, known.xi):
+            known = objective.evaluate(inside.copy())
             visit(known)
-        return scale * known.value, scale * known.gradient.view(np.float64)
+        gradient = known.gradient
+        if inside is not xi:
+            # Beyond the bound only the direction of ξ counts.
+            beyond = np.flatnonzero(inside != xi)
+            unit = xi[beyond] / np.abs(xi[beyond])
+            gradient = gradient.copy()
+            gradient[beyond] -= unit * (unit.conj() * gradient[beyond]).real
+            gradient[beyond] *= np.abs(inside[beyond]) / np.abs(xi[beyond])
+        return scale * known.value, scale * gradient.view(np.float64)
 
     minimize(
         evaluate,
         start.xi.view(np.float64),
         jac=True,
         method="L-BFGS-B",
-        bounds=[(-side, side)] * (2 * start.xi.size),
         options={"maxiter": iterations, "maxfun": iterations, "maxcor": 10, "ftol": 0.0, "gtol": 0.0},
     )

@@ -1,0 +1,54 @@
+"""Every functional, parameterisation and first-order optimiser on every problem folder (§7.3, §8, §9).
+
+    python benchmarks/combinations.py FOLDER [FOLDER …] [-n ITERATIONS] [-o TABLE.csv]
+
+A folder is a problem (``input.obj`` + ``handles.txt``) or holds problems at any depth. Each combination runs alone
+from ξ = 0, on the rest mesh's corrected triangles for si-log and on equilateral ones for tanh, until the first
+injective map or for so many iterations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from quasiharmonic import Descent, Problem, io, solve
+from quasiharmonic.measures import distortion
+
+FUNCTIONALS = "neumann", "sobolev", "dirichlet", "poisson"
+PARAMETERIZATIONS = "tanh", "si-log"
+OPTIMIZERS = "vector-adam", "l-bfgs"
+
+
+def main() -> None:
+    """Write a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("-n", "--iterations", type=int, default=300)
+    parser.add_argument("-o", "--output", type=argparse.FileType("w"), default=sys.stdout)
+    options = parser.parse_args()
+    table = csv.writer(options.output)
+    table.writerow(
+        ["case", "triangles", "functional", "parameterization", "optimizer", "flips", "iterations", "seconds", "mips"]
+    )
+    folders = [path.parent for folder in options.folders for path in sorted(folder.rglob("input.obj"))]
+    for folder in folders:
+        problem = Problem(*io.read_problem(folder))
+        for functional, parameterization, optimizer in itertools.product(FUNCTIONALS, PARAMETERIZATIONS, OPTIMIZERS):
+            reference = "equilateral" if parameterization == "tanh" else "corrected"
+            stage = Descent(optimizer, parameterization, functional, reference, options.iterations)
+            result = solve(problem, strategy=[stage])
+            flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
+            mips = distortion(problem.V, problem.F, result.uv).mips if result.injective else np.nan
+            row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterization, optimizer]
+            table.writerow([*row, flips, result.iterations, f"{result.seconds:.3f}", f"{np.mean(mips):.3f}"])
+            options.output.flush()
+
+
+if __name__ == "__main__":
+    main()

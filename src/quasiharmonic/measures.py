@@ -1,0 +1,289 @@
+"""Distortion of a map, triangle by triangle and summed up (§10, §11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
+from quasiharmonic.mesh.shapes import rest_shapes
+from quasiharmonic.mesh.topology import named
+from quasiharmonic.predicates import orientation
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+
+#: Measures that `Distortion` has for every triangle, in the order in which reports list them.
+MEASURES = (
+    "sigma1",
+    "sigma2",
+    "mips",
+    "conformal",
+    "isometric",
+    "symmetric_dirichlet",
+    "arap",
+    "area_ratio",
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One measure over the surface; means and quantiles are weighted by rest area.
+
+    Attributes
+    ----------
+    mean, median, p95 : float
+        Mean, and the values below which lies half and 95 % of the area.
+    minimum, maximum : float
+        Over all triangles, however small.
+    lowest, highest : int
+        The triangles where these are attained.
+    """
+
+    mean: float
+    median: float
+    p95: float
+    minimum: float
+    maximum: float
+    lowest: int
+    highest: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """What a map does to every triangle; made by `distortion`.
+
+    The Jacobian is that of the affine map from the rest triangle, laid into the plane counterclockwise, to
+    its image. Its singular values are *signed*: ``σ₁ ≥ |σ₂|``, and ``σ₂`` has the sign of the image's
+    orientation, decided exactly. So ``det J = σ₁ σ₂``, and a triangle is inverted where ``σ₂ < 0`` and
+    has no area where ``σ₂ = 0``.
+
+    ===================== ================================= ========= ==================================
+    measure (f,) float64  formula                           scaled    where ``σ₂ ≤ 0``
+    ===================== ================================= ========= ==================================
+    `sigma1`, `sigma2`    singular values                   as given  ``σ₂`` signed
+    `mips`                σ₁/σ₂ + σ₂/σ₁ − 2                 no matter inf
+    `conformal`           σ₁/σ₂                             no matter inf
+    `isometric`           max(σ₁, 1/σ₂)                     yes       inf
+    `symmetric_dirichlet` σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4     yes       inf
+    `arap`                (σ₁ − 1)² + (σ₂ − 1)²             yes       finite, with the signed ``σ₂``
+    `area_ratio`          σ₁ σ₂                             yes       negative or 0
+    ===================== ================================= ========= ==================================
+
+    *Scaled* measures compare lengths or areas, so they are taken after the map has been scaled, as a
+    whole, to the surface's area: singular values are multiplied by `scale`. What is zero or one for an
+    isometry is so for any similarity then.
+
+    Triangles without area in the rest mesh (`flat`) have no Jacobian: everything is NaN there, and sums
+    and extremes leave them out.
+
+    Attributes
+    ----------
+    area : (f,) float64
+        Rest areas.
+    scale : float
+        ``√(rest area / Σ |image areas|)``; 1 when all images are collapsed.
+    sigma1, sigma2 : (f,) float64
+        Singular values of the map as given.
+    beltrami : (f,) complex128
+        ``μ = q/p = (∂w/∂z̄)/(∂w/∂z)``, in the frame whose real axis points from vertex 0 to vertex 1 of
+        the triangle. ``|μ| = (σ₁ − σ₂)/(σ₁ + σ₂)``: 0 where angles are kept, 1 where the image has no area,
+        more where it is inverted, ``inf`` where it is mirrored at angles kept, NaN where it is a point.
+    flat : (k,) int64
+        Triangles without area in the rest mesh.
+    flipped : (l,) int64
+        Triangles whose image is inverted or has no area, flat ones excepted.
+    """
+
+    area: FloatArray
+    scale: float
+    sigma1: FloatArray
+    sigma2: FloatArray
+    beltrami: ComplexArray
+    flat: IntArray
+    flipped: IntArray
+    _scaled: Deformation
+
+    @cached_property
+    def mips(self) -> FloatArray:
+        """The conformal measure of §10."""
+        return self._undefined(MIPS().density(self._scaled))
+
+    @cached_property
+    def conformal(self) -> FloatArray:
+        """Ratio of the singular values, at least 1."""
+        return self._undefined(_ratio(self.sigma1, self.sigma2))
+
+    @cached_property
+    def isometric(self) -> FloatArray:
+        """The larger of stretch and compression, at least 1 in the mean."""
+        return self._undefined(np.maximum(self.scale * self.sigma1, _ratio(1.0, self.scale * self.sigma2)))
+
+    @cached_property
+    def symmetric_dirichlet(self) -> FloatArray:
+        """Stretch and compression in the mean square."""
+        return self._undefined(SymmetricDirichlet().density(self._scaled))
+
+    @cached_property
+    def arap(self) -> FloatArray:
+        """Squared distance from the nearest rotation."""
+        return ARAP().density(self._scaled)
+
+    @cached_property
+    def area_ratio(self) -> FloatArray:
+        """Area of the image over the rest area, signed."""
+        return self._scaled.det
+
+    def per_triangle(self) -> dict[str, FloatArray]:
+        """Every measure by its name, (f,) float64 each, with the Beltrami coefficient's modulus last."""
+        columns: dict[str, FloatArray] = {name: getattr(self, name) for name in MEASURES}
+        return columns | {"beltrami": np.abs(self.beltrami)}
+
+    def summary(self, values: ArrayLike | None = None) -> Summary:
+        """Sum up one measure.
+
+        Parameters
+        ----------
+        values : (f,) array, optional
+            The measure, `isometric` by default; NaN counts as undefined.
+
+        Raises
+        ------
+        ValueError
+            When there is no triangle on which the measure is defined.
+        """
+        measured = np.asarray(self.isometric if values is None else values, dtype=np.float64)
+        defined = np.flatnonzero(~np.isnan(measured) & (self.area > 0))
+        if not defined.size:
+            raise ValueError("the measure is defined on no triangle")
+        value, area = measured[defined], self.area[defined]
+        order = np.argsort(value, kind="stable")
+        below = np.cumsum(area[order])
+        median, p95 = value[order[np.searchsorted(below, [0.5 * below[-1], 0.95 * below[-1]])]].tolist()
+        return Summary(
+            mean=float(np.sum(area / area.sum() * value)),
+            median=median,
+            p95=p95,
+            minimum=float(value[order[0]]),
+            maximum=float(value[order[-1]]),
+            lowest=int(defined[order[0]]),
+            highest=int(defined[order[-1]]),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Summaries of all measures and the counts, for JSON (which has no infinity: see the flipped count)."""
+        return {
+            "scale": self.scale,
+            "flat": int(self.flat.size),
+            "flipped": int(self.flipped.size),
+            **{name: self.summary(values).to_dict() for name, values in self.per_triangle().items()},
+        }
+
+    def _undefined(self, values: FloatArray) -> FloatArray:
+        """Measures of a map, NaN where there is no Jacobian."""
+        values[self.flat] = np.nan
+        return values
+
+
+def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
+    """Measure what a map does to every triangle of a surface.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles are
+        counterclockwise.
+    F : (f, 3) array of int
+        Triangles. They need not form a surface.
+    uv : (n, 2) array
+        The map, injective or not.
+
+    Returns
+    -------
+    Distortion
+        Every measure per triangle; `Distortion.summary` and `Distortion.to_dict` sum them up.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape, an index is out of range, or a coordinate is not finite.
+
+    Examples
+    --------
+    A square of side 2 stretched to a rectangle of 6 by 3: after scaling it to the square's area, by √2
+    one way and 1/√2 the other.
+
+    >>> V, F = [[0, 0], [2, 0], [2, 2], [0, 2]], [[0, 1, 2], [0, 2, 3]]
+    >>> found = distortion(V, F, [[0, 0], [6, 0], [6, 3], [0, 3]])
+    >>> found.sigma1.round(12).tolist(), found.sigma2.round(12).tolist()
+    ([3.0, 3.0], [1.5, 1.5])
+    >>> found.conformal.round(12).tolist(), found.mips.round(12).tolist()
+    ([2.0, 2.0], [0.5, 0.5])
+    >>> round(found.summary(found.isometric).maximum, 6)
+    1.414214
+    """
+    F = np.asarray(F)
+    if F.ndim != 2 or F.shape[1] != 3 or F.dtype.kind not in "iu":
+        raise ValueError(f"F must be an integer array of shape (f, 3), not {F.dtype} of shape {F.shape}")
+    V, uv = np.asarray(V, dtype=np.float64), np.asarray(uv, dtype=np.float64)
+    if uv.ndim != 2 or uv.shape[1] != 2 or len(uv) != len(V):
+        raise ValueError(f"uv must have shape ({len(V)}, 2), a position for every vertex, not {uv.shape}")
+    if F.size and not (0 <= F.min() and F.max() < len(V)):
+        raise ValueError(f"F refers to vertices beyond the {len(V)} that there are")
+    for name, array in (("V", V), ("uv", uv)):
+        bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
+        if bad.size:
+            raise ValueError(f"{name} is not finite at {named('vertex', 'vertices', bad)}")
+    # What leaves the numbers' range in extreme maps becomes inf, 0 or NaN as the formulas have it.
+    with np.errstate(all="ignore"):
+        return _measured(V, F.astype(np.int64), uv)
+
+
+def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
+    shapes = rest_shapes(V, F)
+    exponent = int(np.frexp(np.abs(uv).max(initial=0))[1])
+    unit = float(np.ldexp(1.0, exponent))
+    w = np.ldexp(uv, -exponent).view(np.complex128).ravel()
+    w0 = w[F[:, 0]]
+    d1, d2 = w[F[:, 1]] - w0, w[F[:, 2]] - w0
+    left, right = d1.real * d2.imag, d1.imag * d2.real
+    area, noise = 0.5 * (left - right), 2.0**-52 * (np.abs(left) + np.abs(right))
+    # An area that rounding may have turned over gets the sign that it has.
+    sign = orientation(*(uv[F[:, k]] for k in range(3)))
+    area = np.where(np.abs(area) <= noise, sign * noise, area)
+
+    g = shapes.half_gradients()
+    p, q = d1 * g[1].conj() + d2 * g[2].conj(), d1 * g[1] + d2 * g[2]
+    defined = shapes.m > 0
+    det = area / np.where(defined, shapes.m, np.nan)
+    sigma1 = np.abs(p) + np.abs(q)
+    sigma2 = np.where(sigma1 > 0, det / np.where(sigma1 > 0, sigma1, 1), sigma1)
+    total, image = float(shapes.m.sum()), float(np.abs(area).sum())
+    scale = float(np.sqrt(total / image)) if image > 0 and total > 0 else shapes.unit / unit
+    beltrami = np.where(p != 0, q / np.where(p != 0, p, 1), np.where(q != 0, np.inf, np.nan))
+    units = unit / shapes.unit
+    return Distortion(
+        area=shapes.m * shapes.unit**2,
+        scale=scale / units,
+        sigma1=sigma1 * units,
+        sigma2=sigma2 * units,
+        beltrami=np.where(defined, beltrami, np.nan),
+        flat=shapes.flat,
+        flipped=np.flatnonzero(defined & (sign <= 0)),
+        _scaled=Deformation(scale * p, scale * q, scale**2 * det),
+    )
+
+
+def _ratio(numerator: FloatArray | float, denominator: FloatArray) -> FloatArray:
+    """The quotient, infinite where the denominator is not positive."""
+    positive = denominator > 0
+    return np.where(positive, numerator / np.where(positive, denominator, 1), np.inf)

@@ -1,0 +1,54 @@
+"""The recorded path: the maps of every k-th iteration, and nothing at all when nobody asks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshes import boundary_of, signed_areas
+from quasiharmonic import Descent, Problem, injective_map, solve
+from quasiharmonic.surfaces import annulus
+
+
+def turned_ring():
+    V, F = annulus(12)
+    fixed = boundary_of(F)
+    target = V[fixed].copy()
+    target[np.abs(target).max(axis=1) < 0.75] *= -1
+    return V, F, fixed, target
+
+
+@pytest.mark.parametrize("k", [1, 3, 7])
+def test_every_kth_map_is_kept(k):
+    V, F, fixed, target = turned_ring()
+    result = injective_map(V, F, fixed, target, record=k)
+    assert result.iterations > 20
+    assert [s.iteration for s in result.path] == list(range(0, result.iterations + 1, k))
+    for snapshot in result.path:
+        step = result.history[snapshot.iteration]
+        assert step.iteration == snapshot.iteration
+        assert np.count_nonzero(signed_areas(F, snapshot.uv) <= 0) == step.flipped
+        np.testing.assert_array_equal(snapshot.uv[fixed], target)
+    if k == 1:
+        np.testing.assert_array_equal(result.path[-1].uv, result.uv)
+    # Each has an array of its own.
+    assert len({s.uv.ctypes.data for s in result.path}) == len(result.path)
+
+
+def test_recording_changes_nothing_and_is_off_by_default():
+    problem = Problem(*turned_ring())
+    plain, recorded = solve(problem), solve(problem, record=2)
+    assert plain.path == []
+    np.testing.assert_array_equal(plain.uv, recorded.uv)
+    assert plain.history == recorded.history
+
+
+def test_counts_on_through_the_stages():
+    stages = [Descent(iterations=4), Descent("newton", iterations=6, resume=True)]
+    result = solve(Problem(*turned_ring()), strategy=stages, record=1)
+    assert [s.iteration for s in result.path] == [s.iteration for s in result.history]
+
+
+def test_a_negative_interval_is_refused():
+    with pytest.raises(ValueError, match="record"):
+        solve(Problem(*turned_ring()), record=-1)
