@@ -190,7 +190,8 @@ class Isotropic(Energy):
         along_p, kept, along_q = _filtered(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
         mixed = 4 * kept * ab
         # Where p or q vanishes its direction does not matter: along and across are alike.
-        to_p, to_q = np.conj(d.p), np.conj(d.q)
+        to_p: ComplexArray = np.conj(d.p)
+        to_q: ComplexArray = np.conj(d.q)
         return QuadraticForm(
             pp=0.5 * (along_p + turn_p),
             qq=0.5 * (along_q + turn_q),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ MEASURES = (
     "symmetric_dirichlet",
     "arap",
     "area_ratio",
+    "shear",
 )
 
 
@@ -54,8 +54,8 @@ class Summary:
     highest: int
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return dict(vars(self))
+        """For JSON, which has no infinity: what is not finite is None."""
+        return {key: value if np.isfinite(value) else None for key, value in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +71,14 @@ class Distortion:
     measure (f,) float64  formula                           scaled    where ``σ₂ ≤ 0``
     ===================== ================================= ========= ==================================
     `sigma1`, `sigma2`    singular values                   as given  ``σ₂`` signed
-    `mips`                σ₁/σ₂ + σ₂/σ₁ − 2                 no matter inf
+    `mips`                σ₁/σ₂ + σ₂/σ₁ − 2  (§10)          no matter inf
     `conformal`           σ₁/σ₂                             no matter inf
     `isometric`           max(σ₁, 1/σ₂)                     yes       inf
     `symmetric_dirichlet` σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4     yes       inf
     `arap`                (σ₁ − 1)² + (σ₂ − 1)²             yes       finite, with the signed ``σ₂``
     `area_ratio`          σ₁ σ₂                             yes       negative or 0
+    `shear`               |μ| = (σ₁ − σ₂)/(σ₁ + σ₂)         no matter 1 or more; inf where it is mirrored
+                                                                      at angles kept, NaN at a point
     ===================== ================================= ========= ==================================
 
     *Scaled* measures compare lengths or areas, so they are taken after the map has been scaled, as a
@@ -88,89 +90,65 @@ class Distortion:
 
     Attributes
     ----------
-    area : (f,) float64
-        Rest areas.
+    share : (f,) float64
+        Rest areas over the surface's area.
     scale : float
-        ``√(rest area / Σ |image areas|)``; 1 when all images are collapsed.
+        ``√(rest area / Σ |image areas|)``; 1 when one of them is zero.
     sigma1, sigma2 : (f,) float64
         Singular values of the map as given.
     beltrami : (f,) complex128
         ``μ = q/p = (∂w/∂z̄)/(∂w/∂z)``, in the frame whose real axis points from vertex 0 to vertex 1 of
-        the triangle. ``|μ| = (σ₁ − σ₂)/(σ₁ + σ₂)``: 0 where angles are kept, 1 where the image has no area,
-        more where it is inverted, ``inf`` where it is mirrored at angles kept, NaN where it is a point.
+        the triangle; `shear` is its modulus.
     flat : (k,) int64
         Triangles without area in the rest mesh.
     flipped : (l,) int64
         Triangles whose image is inverted or has no area, flat ones excepted.
     """
 
-    area: FloatArray
+    share: FloatArray
     scale: float
     sigma1: FloatArray
     sigma2: FloatArray
+    mips: FloatArray
+    conformal: FloatArray
+    isometric: FloatArray
+    symmetric_dirichlet: FloatArray
+    arap: FloatArray
+    area_ratio: FloatArray
+    shear: FloatArray
     beltrami: ComplexArray
     flat: IntArray
     flipped: IntArray
-    _scaled: Deformation
-
-    @cached_property
-    def mips(self) -> FloatArray:
-        """The conformal measure of §10."""
-        return self._undefined(MIPS().density(self._scaled))
-
-    @cached_property
-    def conformal(self) -> FloatArray:
-        """Ratio of the singular values, at least 1."""
-        return self._undefined(_ratio(self.sigma1, self.sigma2))
-
-    @cached_property
-    def isometric(self) -> FloatArray:
-        """The larger of stretch and compression, at least 1 in the mean."""
-        return self._undefined(np.maximum(self.scale * self.sigma1, _ratio(1.0, self.scale * self.sigma2)))
-
-    @cached_property
-    def symmetric_dirichlet(self) -> FloatArray:
-        """Stretch and compression in the mean square."""
-        return self._undefined(SymmetricDirichlet().density(self._scaled))
-
-    @cached_property
-    def arap(self) -> FloatArray:
-        """Squared distance from the nearest rotation."""
-        return ARAP().density(self._scaled)
-
-    @cached_property
-    def area_ratio(self) -> FloatArray:
-        """Area of the image over the rest area, signed."""
-        return self._scaled.det
 
     def per_triangle(self) -> dict[str, FloatArray]:
-        """Every measure by its name, (f,) float64 each, with the Beltrami coefficient's modulus last."""
-        columns: dict[str, FloatArray] = {name: getattr(self, name) for name in MEASURES}
-        return columns | {"beltrami": np.abs(self.beltrami)}
+        """Every measure by its name, (f,) float64 each."""
+        return {name: getattr(self, name) for name in MEASURES}
 
-    def summary(self, values: ArrayLike | None = None) -> Summary:
+    def summary(self, measure: str) -> Summary:
         """Sum up one measure.
 
         Parameters
         ----------
-        values : (f,) array, optional
-            The measure, `isometric` by default; NaN counts as undefined.
+        measure : str
+            One of `MEASURES`.
 
         Raises
         ------
         ValueError
-            When there is no triangle on which the measure is defined.
+            When there is no such measure, or no triangle on which it is defined.
         """
-        measured = np.asarray(self.isometric if values is None else values, dtype=np.float64)
-        defined = np.flatnonzero(~np.isnan(measured) & (self.area > 0))
+        if measure not in MEASURES:
+            raise ValueError(f"measure must be one of {', '.join(MEASURES)}, not {measure!r}")
+        values = self.per_triangle()[measure]
+        defined = np.flatnonzero(~np.isnan(values))
         if not defined.size:
-            raise ValueError("the measure is defined on no triangle")
-        value, area = measured[defined], self.area[defined]
+            raise ValueError(f"{measure} is defined on no triangle")
+        value, share = values[defined], self.share[defined]
         order = np.argsort(value, kind="stable")
-        below = np.cumsum(area[order])
+        below = np.cumsum(share[order])
         median, p95 = value[order[np.searchsorted(below, [0.5 * below[-1], 0.95 * below[-1]])]].tolist()
         return Summary(
-            mean=float(np.sum(area / area.sum() * value)),
+            mean=float(np.sum(share / below[-1] * value)),
             median=median,
             p95=p95,
             minimum=float(value[order[0]]),
@@ -180,18 +158,17 @@ class Distortion:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Summaries of all measures and the counts, for JSON (which has no infinity: see the flipped count)."""
+        """Counts, and the summaries of all measures (None where undefined), for JSON."""
+        summaries = {
+            name: None if np.isnan(values).all() else self.summary(name).to_dict()
+            for name, values in self.per_triangle().items()
+        }
         return {
             "scale": self.scale,
             "flat": int(self.flat.size),
             "flipped": int(self.flipped.size),
-            **{name: self.summary(values).to_dict() for name, values in self.per_triangle().items()},
+            **summaries,
         }
-
-    def _undefined(self, values: FloatArray) -> FloatArray:
-        """Measures of a map, NaN where there is no Jacobian."""
-        values[self.flat] = np.nan
-        return values
 
 
 def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
@@ -228,7 +205,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     ([3.0, 3.0], [1.5, 1.5])
     >>> found.conformal.round(12).tolist(), found.mips.round(12).tolist()
     ([2.0, 2.0], [0.5, 0.5])
-    >>> round(found.summary(found.isometric).maximum, 6)
+    >>> round(found.summary("isometric").maximum, 6)
     1.414214
     """
     F = np.asarray(F)
@@ -237,7 +214,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     V, uv = np.asarray(V, dtype=np.float64), np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2 or len(uv) != len(V):
         raise ValueError(f"uv must have shape ({len(V)}, 2), a position for every vertex, not {uv.shape}")
-    if F.size and not (0 <= F.min() and F.max() < len(V)):
+    if F.size and not (F.min() >= 0 and F.max() < len(V)):
         raise ValueError(f"F refers to vertices beyond the {len(V)} that there are")
     for name, array in (("V", V), ("uv", uv)):
         bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
@@ -250,7 +227,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
 
 def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     shapes = rest_shapes(V, F)
-    exponent = int(np.frexp(np.abs(uv).max(initial=0))[1])
+    exponent = int(np.frexp(np.abs(uv).max(initial=0))[1]) - 1
     unit = float(np.ldexp(1.0, exponent))
     w = np.ldexp(uv, -exponent).view(np.complex128).ravel()
     w0 = w[F[:, 0]]
@@ -268,18 +245,29 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     sigma1 = np.abs(p) + np.abs(q)
     sigma2 = np.where(sigma1 > 0, det / np.where(sigma1 > 0, sigma1, 1), sigma1)
     total, image = float(shapes.m.sum()), float(np.abs(area).sum())
-    scale = float(np.sqrt(total / image)) if image > 0 and total > 0 else shapes.unit / unit
-    beltrami = np.where(p != 0, q / np.where(p != 0, p, 1), np.where(q != 0, np.inf, np.nan))
     units = unit / shapes.unit
+    # From the units of computation to the surface's area.
+    scale = float(np.sqrt(total / image)) if image > 0 and total > 0 else units
+    scaled = Deformation(scale * p, scale * q, scale * scale * det)
+    scaled1, scaled2 = scale * sigma1, scale * sigma2
+    beltrami = np.where(p != 0, q / np.where(p != 0, p, 1), np.where(q != 0, np.inf, np.nan))
+    # Comparisons with NaN are false, and would give the barriers' infinity.
+    undefined = np.where(defined, 0.0, np.nan)
     return Distortion(
-        area=shapes.m * shapes.unit**2,
+        share=shapes.m / np.float64(total),
         scale=scale / units,
         sigma1=sigma1 * units,
         sigma2=sigma2 * units,
-        beltrami=np.where(defined, beltrami, np.nan),
+        mips=MIPS().density(scaled) + undefined,
+        conformal=_ratio(scaled1, scaled2) + undefined,
+        isometric=np.maximum(scaled1, _ratio(1.0, scaled2)) + undefined,
+        symmetric_dirichlet=SymmetricDirichlet().density(scaled) + undefined,
+        arap=ARAP().density(scaled),
+        area_ratio=scaled.det,
+        shear=np.abs(beltrami) + undefined,
+        beltrami=beltrami + undefined,
         flat=shapes.flat,
         flipped=np.flatnonzero(defined & (sign <= 0)),
-        _scaled=Deformation(scale * p, scale * q, scale**2 * det),
     )
 
 

@@ -129,7 +129,7 @@ def polish(
     >>> import numpy as np
     >>> from quasiharmonic.surfaces import disk
     >>> V, F = disk(6)
-    >>> turn = 2.0 * (1 - V[:, 0] ** 2 - V[:, 1] ** 2)
+    >>> turn = 1.0 * (1 - V[:, 0] ** 2 - V[:, 1] ** 2)
     >>> twisted = np.stack(
     ...     [V[:, 0] * np.cos(turn) - V[:, 1] * np.sin(turn), V[:, 0] * np.sin(turn) + V[:, 1] * np.cos(turn)], axis=1
     ... )

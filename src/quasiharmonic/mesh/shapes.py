@@ -72,7 +72,7 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer]) -> RestShapes:
     positions = np.asarray(V, dtype=np.float64)
     if positions.ndim != 2 or positions.shape[1] not in (2, 3):
         raise ValueError(f"V must have shape (n, 2) or (n, 3), not {positions.shape}")
-    exponent = int(np.frexp(np.abs(positions).max(initial=0))[1])
+    exponent = int(np.frexp(np.abs(positions).max(initial=0))[1]) - 1
     surface = np.zeros((len(positions), 3))
     surface[:, : positions.shape[1]] = np.ldexp(positions, -exponent)
     z1, z2 = rest_frames(surface, F)

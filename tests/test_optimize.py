@@ -1,0 +1,188 @@
+"""The optimisers: what each of them must do, against brute force and differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from meshes import lift, random_xi
+from test_inject import star_problem, turned_ring
+
+from quasiharmonic import Descent, Problem, solve
+from quasiharmonic.functionals import beltrami_energy
+from quasiharmonic.objective import Objective
+from quasiharmonic.optimize.alternating import alternating, own_tensor
+from quasiharmonic.optimize.lbfgs import lbfgs
+from quasiharmonic.optimize.newton import _gather, _Model, newton
+from quasiharmonic.optimize.vector_adam import vector_adam
+from quasiharmonic.strategy import STRATEGIES, stages_of
+from quasiharmonic.tensor import PARAMETERIZATIONS, TANH
+
+BOTH = list(PARAMETERIZATIONS)
+
+
+def path(method, objective, start=None, **settings):
+    """The values of V₃ along a descent, the start's included."""
+    start = start or objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex))
+    seen = [start]
+    method(objective, start, seen.append, **settings)
+    return seen
+
+
+@pytest.mark.parametrize("name", BOTH)
+class TestParameterization:
+    def test_invert(self, name, rng):
+        p = PARAMETERIZATIONS[name]
+        xi = rng.standard_normal(50) + 1j * rng.standard_normal(50)
+        np.testing.assert_allclose(p.invert(p.field(xi).mu), xi, rtol=1e-11)
+        assert p.invert(np.zeros(1, dtype=complex))[0] == 0
+        outside = p.invert(np.array([1.0 + 0j, -3j]))
+        assert np.all(np.isfinite(outside.view(float)))
+        assert np.all(np.abs(outside) <= p.bound * (1 + 1e-15))
+
+    def test_bend_is_the_derivative_of_the_slope(self, name):
+        p = PARAMETERIZATIONS[name]
+        rho, h = np.linspace(0.1, 4, 20), 1e-5
+        slope = (p.radial(rho + h)[2] - p.radial(rho - h)[2]) / (2 * h)
+        np.testing.assert_allclose(p.bend(rho), slope, rtol=1e-6, atol=1e-9)
+
+
+class TestAlternating:
+    def test_own_tensor_is_the_best_one(self, rng):
+        """No other tensor has a lower energy for the map, on positive and on inverted triangles."""
+        problem = Problem(*star_problem(n=80))
+        mesh = problem.mesh("equilateral")
+        w = rng.standard_normal(problem.n) + 1j * rng.standard_normal(problem.n)
+        dw = mesh.derivatives(w)
+        best = beltrami_energy(mesh, TANH.field(TANH.invert(own_tensor(dw))), dw)
+        inverted = -dw.area[dw.area < 0].sum()
+        assert inverted > 0
+        assert best == pytest.approx(2 * inverted, rel=1e-6)
+        for seed in range(20):
+            other = TANH.field(TANH.invert(own_tensor(dw)) + random_xi(problem.F, 0.05, seed))
+            assert beltrami_energy(mesh, other, dw) > best
+
+    def test_lowers_the_energy(self):
+        seen = path(alternating, Objective(Problem(*star_problem())), iterations=10)
+        assert np.all(np.diff([i.dirichlet for i in seen]) <= 1e-12)
+        assert len(seen) == 11
+
+
+@pytest.mark.parametrize("name", BOTH)
+@pytest.mark.parametrize("reference", ["equilateral", "rest"])
+class TestNewton:
+    def test_second_derivatives_against_differences(self, name, reference):
+        """dᵀ(K − Bᵀ H⁻¹ B)d is the second derivative of V₃(ξ), the map following."""
+        objective = Objective(Problem(*star_problem(n=80)), parameterization=name, reference=reference)
+        xi = random_xi(objective.problem.F)
+        h = 1e-4
+        for seed in range(3):
+            d = random_xi(objective.problem.F, 1.0, seed + 10)
+            ahead, behind = objective.evaluate(xi + h * d), objective.evaluate(xi - h * d)
+            here = objective.evaluate(xi)
+            second = (ahead.dirichlet - 2 * here.dirichlet + behind.dirichlet) / h**2
+            model = _Model(here)
+            alpha, beta = (model.unit.conj() * d).real, (model.unit.conj() * d).imag
+            bent = model.K[0] * alpha**2 + 2 * model.K[1] * alpha * beta + model.K[2] * beta**2
+            along, across = model.B
+            load = _gather(here, along[0] * alpha + across[0] * beta, along[1] * alpha + across[1] * beta)
+            load[objective.problem.fixed] = 0
+            follow = np.vdot(load, objective.laplacian.respond(load)).real
+            assert bent.sum() - follow == pytest.approx(second, rel=1e-4)
+            slope = (ahead.dirichlet - behind.dirichlet) / (2 * h)
+            assert model.g[0] @ alpha + model.g[1] @ beta == pytest.approx(slope, rel=1e-6)
+            assert np.vdot(here.gradient, d).real == pytest.approx(slope, rel=1e-6)
+
+    def test_descends(self, name, reference):
+        objective = Objective(Problem(*star_problem(depth=0.3)), parameterization=name, reference=reference)
+        values = [i.dirichlet for i in path(newton, objective, iterations=15)]
+        assert np.all(np.diff(values) < 0)
+        assert values[-1] < 0.05 * values[0]
+
+    def test_starts_from_zero_where_polar_coordinates_do_not(self, name, reference):
+        objective = Objective(Problem(*star_problem(n=80)), parameterization=name, reference=reference)
+        model = _Model(objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex)))
+        for part in (*model.K, *model.g, *model.B[0], *model.B[1]):
+            assert np.all(np.isfinite(part))
+
+
+def test_newton_converges_fast_near_a_solution():
+    """Where first order methods crawl: to 1e-10 of the area within a few steps."""
+    problem = Problem(*star_problem(depth=0.4))
+    objective = Objective(problem)
+    start = path(vector_adam, objective, iterations=40, schedule=((0, 0.2),))[-1]
+    energies = [i.energy for i in path(newton, objective, start, iterations=40)]
+    assert min(energies) < 1e-10
+
+
+@pytest.mark.parametrize("functional", ["neumann", "sobolev", "dirichlet"])
+def test_lbfgs_descends(functional):
+    objective = Objective(Problem(*star_problem()), functional)
+    values = [i.value for i in path(lbfgs, objective, iterations=30)]
+    assert min(values) < 0.1 * values[0]
+
+
+def test_lbfgs_stays_within_the_bound():
+    objective = Objective(Problem(*turned_ring(180)))
+    start = objective.evaluate(TANH.bound * np.exp(1j * np.arange(len(objective.problem.F))))
+    for iterate in path(lbfgs, objective, start, iterations=10):
+        assert np.abs(iterate.xi).max() <= TANH.bound * (1 + 1e-12)
+
+
+def test_vector_adam_steps_are_of_the_schedules_length():
+    """The first step of every triangle that feels a force is exactly that long."""
+    objective = Objective(Problem(*star_problem()))
+    first = path(vector_adam, objective, iterations=1, schedule=((0, 0.37),))[1]
+    np.testing.assert_allclose(np.abs(first.xi), 0.37, rtol=1e-9)
+
+
+def test_vector_adam_ignores_the_frames():
+    """Turning triangles' corners turns their ξ and changes nothing else."""
+    V, F, fixed, target = star_problem()
+    turned = np.where((np.arange(len(F)) % 2)[:, None], np.roll(F, -1, axis=1), F)
+    a, b = (solve(Problem(V, G, fixed, target)) for G in (F, turned))
+    np.testing.assert_allclose(a.uv, b.uv, atol=1e-9)
+
+
+class TestStrategy:
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ({"optimizer": "sgd"}, "optimizer must be one of vector-adam, l-bfgs, newton, alternating, not 'sgd'"),
+            ({"parameterization": "log"}, "parameterization must be one of tanh, si-log"),
+            ({"functional": "v3"}, "functional must be one of dirichlet"),
+            ({"reference": "square"}, "reference must be one of"),
+            ({"iterations": 0}, "iterations must be at least 1"),
+        ],
+    )
+    def test_wrong_words(self, arguments, words):
+        with pytest.raises(ValueError, match=words):
+            Descent(**arguments)
+
+    def test_names(self):
+        problem = Problem(*star_problem(n=60))
+        for name in STRATEGIES:
+            assert all(isinstance(stage, Descent) for stage in stages_of(name, problem))
+        with pytest.raises(ValueError, match="strategy must be one of speed, quality"):
+            stages_of("haste", problem)
+        with pytest.raises(ValueError, match="no stages"):
+            stages_of([], problem)
+
+    def test_pins_are_met_with_si_log_first(self):
+        V, F, fixed, target = star_problem(n=60)
+        inner = int(np.setdiff1d(np.arange(len(V)), fixed)[0])
+        pinned = Problem(V, F, np.append(fixed, inner), np.vstack([target, [[0, 0]]]))
+        assert stages_of("speed", pinned)[0].parameterization == "si-log"
+        assert stages_of("speed", Problem(V, F, fixed, target))[0].parameterization == "tanh"
+
+    def test_quality_keeps_angles_better(self):
+        """The si-log map's mean angle distortion is below tanh's, as in the paper's Figure 8."""
+        V, F, fixed, target = star_problem(depth=0.35, n=800)
+        problem = Problem(lift(V[:, :2]), F, fixed, target)
+        mesh = problem.mesh("rest")
+
+        def mips(strategy):
+            w = np.ascontiguousarray(solve(problem, strategy=strategy).uv).view(complex).ravel()
+            p, q, _ = mesh.derivatives(w)
+            return np.average(4 * np.abs(q) ** 2 / (np.abs(p) ** 2 - np.abs(q) ** 2), weights=mesh.m)
+
+        assert mips("quality") < mips("speed")
