@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meshes import lift, random_xi
-from test_inject import star_problem, turned_ring
 
+from meshes import lift, random_xi
 from quasiharmonic import Descent, Problem, solve
 from quasiharmonic.functionals import beltrami_energy
 from quasiharmonic.objective import Objective
@@ -16,6 +15,7 @@ from quasiharmonic.optimize.newton import _gather, _Model, newton
 from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.strategy import STRATEGIES, stages_of
 from quasiharmonic.tensor import PARAMETERIZATIONS, TANH
+from test_inject import star_problem, turned_ring
 
 BOTH = list(PARAMETERIZATIONS)
 

@@ -212,12 +212,14 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     if F.ndim != 2 or F.shape[1] != 3 or F.dtype.kind not in "iu":
         raise ValueError(f"F must be an integer array of shape (f, 3), not {F.dtype} of shape {F.shape}")
     V, uv = np.asarray(V, dtype=np.float64), np.asarray(uv, dtype=np.float64)
-    if uv.ndim != 2 or uv.shape[1] != 2 or len(uv) != len(V):
+    if V.ndim != 2 or V.shape[1] not in (2, 3):
+        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
+    if uv.shape != (len(V), 2):
         raise ValueError(f"uv must have shape ({len(V)}, 2), a position for every vertex, not {uv.shape}")
     if F.size and not (F.min() >= 0 and F.max() < len(V)):
         raise ValueError(f"F refers to vertices beyond the {len(V)} that there are")
     for name, array in (("V", V), ("uv", uv)):
-        bad = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
+        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
         if bad.size:
             raise ValueError(f"{name} is not finite at {named('vertex', 'vertices', bad)}")
     # What leaves the numbers' range in extreme maps becomes inf, 0 or NaN as the formulas have it.

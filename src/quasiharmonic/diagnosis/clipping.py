@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..predicates import orientation
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Point = tuple[int, int]
@@ -137,16 +135,13 @@ class Walls:
 
     Parameters
     ----------
-    positions : (k, 2) float64
-        Points, finite.
     ends : (m, 2) int64
-        The segments, as pairs of points.
+        The segments, as pairs of points of the lattice.
     lattice : Lattice
-        The same points as integers.
     """
 
-    def __init__(self, positions: FloatArray, ends: IntArray, lattice: Lattice) -> None:
-        self._positions, self._ends, self._lattice = positions, ends, lattice
+    def __init__(self, ends: IntArray, lattice: Lattice) -> None:
+        self._ends, self._lattice = ends, lattice
         corners = lattice.near[ends]
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
 
@@ -189,10 +184,10 @@ class Walls:
         here = self._lattice.near[eye]
         low, high = np.minimum(near.min(axis=0), here), np.maximum(near.max(axis=0), here)
         met = ((self._low <= high + _MARGIN) & (self._high >= low - _MARGIN)).all(axis=1)
-        ends = self._ends[met]
-        side = orientation(self._positions[eye], self._positions[ends[:, 0]], self._positions[ends[:, 1]])
-        ends = np.where((side < 0)[:, None], ends[:, ::-1], ends)
-        return ends[side != 0]
+        ends = self._ends[met & (self._ends != eye).all(axis=1)]
+        p, q = self._lattice.near[ends.T] - here
+        turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
+        return np.where(turned[:, None], ends[:, ::-1], ends)
 
     def _split(
         self, area: Convex, near: FloatArray, eye: int, walls: IntArray
@@ -206,31 +201,39 @@ class Walls:
         walls : (m, 2) int64
             The walls that may still be in the way of these parts.
         """
-        points = self._lattice.points
         here = self._lattice.near[eye]
-        p, q = self._lattice.near[walls].transpose(1, 0, 2)
-        right = _cross(p - here, near - here)
-        left = _cross(q - here, near - here)
+        p, q = self._lattice.near[walls.T]
+        right, left = _cross(p - here, near - here), _cross(q - here, near - here)
         front = _cross(q - p, near[None] - p[:, None])
         in_the_way = (
-            (right.max(axis=1, initial=-np.inf) > -_MARGIN)
-            & (left.min(axis=1, initial=np.inf) < _MARGIN)
-            & (front.min(axis=1, initial=np.inf) < _MARGIN)
+            (right.max(axis=1) > -_MARGIN) & (left.min(axis=1) < _MARGIN) & (front.min(axis=1) < _MARGIN)
         )
-        # The walls that hide most corners first: a wall that hides all ends the search here.
+        # The walls that hide most corners first: one that hides them all leaves nothing to look at.
         hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
         walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]
+        points = self._lattice.points
         for k, (i, j) in enumerate(walls.tolist()):
-            first, second = line(points[eye], points[i]), line(points[eye], points[j])
-            across = line(points[i], points[j])
-            beside = area.cut(first)
-            ahead = beside and beside.cut(reverse(second))
-            if ahead is None or ahead.cut(reverse(across)) is None:
-                continue
-            assert beside is not None
-            parts = [area.cut(reverse(first)), beside.cut(second), ahead.cut(across)]
-            return [part for part in parts if part is not None], walls[k + 1 :]
+            parts = _past(area, points[eye], points[i], points[j])
+            if parts is not None:
+                return parts, walls[k + 1 :]
         return None, walls[:0]
+
+
+def _past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
+    """The parts of an area that are not in the shadow of a wall, or None if the whole area is not."""
+    across = line(p, q)
+    side = across[0] * eye[0] + across[1] * eye[1] + across[2]
+    if side == 0:
+        return None
+    if side < 0:
+        p, q, across = q, p, reverse(across)
+    first, second = line(eye, p), line(eye, q)
+    beside = area.cut(first)
+    ahead = beside and beside.cut(reverse(second))
+    if beside is None or ahead is None or ahead.cut(reverse(across)) is None:
+        return None
+    parts = [area.cut(reverse(first)), beside.cut(second), ahead.cut(across)]
+    return [part for part in parts if part is not None]
 
 
 def _cross(u: FloatArray, v: FloatArray) -> FloatArray:

@@ -136,7 +136,7 @@ class Sight:
         self._fixture = fixture
         self._corner = Corners(problem, curves)
         ends = fixture.row[np.concatenate([curves.ends, chords])]
-        self._walls = Walls(problem.target, ends, fixture.lattice)
+        self._walls = Walls(ends, fixture.lattice)
 
     def hidden(self, star: Star) -> Obstruction | None:
         """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it."""

@@ -102,7 +102,8 @@ class ReferenceMesh:
         # m ∇hᵢᵀ 𝒜 ∇hⱼ. It has no scale, so tiny and huge triangles are on a par.
         gx, gy = (1j * opposite).real, (1j * opposite).imag
         gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
-        self._edge_stiffness = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
+        per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
+        self._edge_stiffness = np.broadcast_to(per_entry, (3, 3, f))
 
     def edge_stiffness(self, a: FloatArray) -> FloatArray:
         """Off-diagonal entries of every triangle's ``Gᵀ A G``.
@@ -117,10 +118,7 @@ class ReferenceMesh:
         (3, f) float64
             For the edges (0,1), (1,2), (2,0) of each triangle.
         """
-        B = self._edge_stiffness
-        if B.shape[2] == 1:
-            return B[:, :, 0] @ a
-        return np.einsum("eaf,af->ef", B, a)
+        return np.einsum("eaf,af->ef", self._edge_stiffness, a)
 
     def derivatives(self, w: ComplexArray) -> Derivatives:
         """Differentiate a complex map ``w = u + i v`` (n,) complex128 on every triangle."""

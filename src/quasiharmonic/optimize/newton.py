@@ -152,7 +152,7 @@ class _Model:
         y1 = -(self.g[0] + (along[0].conj() * dp + along[1].conj() * dq).real)
         y2 = -(self.g[1] + (across[0].conj() * dp + across[1].conj() * dq).real)
         alpha, beta = (k22 * y1 - k12 * y2) / det, (k11 * y2 - k12 * y1) / det
-        predicted = -0.5 * float(np.dot(self.g[0], alpha) + np.dot(self.g[1], beta))
+        predicted = -0.5 * float((self.g[0] * alpha + self.g[1] * beta).sum())
         return (alpha + 1j * beta) * self.unit, predicted
 
 
