@@ -10,7 +10,7 @@ import pytest
 import quasiharmonic
 import quasiharmonic.linsolve
 from meshes import bend, boundary_of, lift, signed_areas
-from quasiharmonic import Descent, Problem, Status, injective_map, solve
+from quasiharmonic import Descent, Problem, Status, injective_map, quasi_harmonic_map, solve
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
@@ -292,6 +292,14 @@ def test_second_solve_of_a_moved_problem_agrees_with_a_fresh_one():
     again = solve(problem.moved(target[:, ::-1] * [1, -1]))
     fresh = injective_map(V, F, fixed, target[:, ::-1] * [1, -1])
     np.testing.assert_array_equal(again.uv, fresh.uv)
+
+
+@pytest.mark.parametrize("strategy", ["speed", "quality"])
+def test_the_tensors_give_the_map_back(strategy):
+    problem = Problem(*star_problem())
+    result = solve(problem, strategy=strategy)
+    again = quasi_harmonic_map(problem, result.mu, reference=result.reference)
+    np.testing.assert_allclose(again, result.uv, atol=1e-9)
 
 
 def test_public_names_are_lazy_and_complete():

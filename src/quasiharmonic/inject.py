@@ -26,6 +26,7 @@ from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.strategy import Descent, stages_of
+from quasiharmonic.tensor import TANH, TensorField
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -137,19 +138,28 @@ def solve(
         history=search.history,
         linear_solver=search.linear_solver,
         seconds=time.perf_counter() - began,
-        xi=search.best_xi,
+        mu=search.best_field.mu if search.best_field is not None else None,
+        reference=search.best_reference,
         path=search.path,
     )
 
 
-def quasi_harmonic_map(problem: Problem, xi: ComplexArray | None = None, *, linear_solver: str = "auto") -> FloatArray:
+def quasi_harmonic_map(
+    problem: Problem,
+    mu: ComplexArray | None = None,
+    *,
+    reference: Reference = "equilateral",
+    linear_solver: str = "auto",
+) -> FloatArray:
     """The map of a tensor field (eq. 12): Tutte's embedding where no field is given.
 
     Parameters
     ----------
     problem : Problem
-    xi : (f,) complex128, optional
-        The field, in the tanh parameterisation; zero by default.
+    mu : (f,) complex128, optional
+        Beltrami coefficients of the tensors, below 1 in modulus; zero by default.
+    reference : {"equilateral", "rest", "corrected"}
+        The triangles in whose frames they are expressed, unless the problem itself names others.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
@@ -157,15 +167,16 @@ def quasi_harmonic_map(problem: Problem, xi: ComplexArray | None = None, *, line
     -------
     (n, 2) float64
         Positions, the fixed vertices exactly at their target. Injective only where the target is convex
-        or ξ is right.
+        or μ is right.
 
     Raises
     ------
     quasiharmonic.linsolve.NotPositiveDefinite
         When rounding leaves no positive definite Laplacian.
     """
-    start = np.zeros(len(problem.F), dtype=np.complex128) if xi is None else xi
-    return _positions(problem, Objective(problem, linear_solver=linear_solver).evaluate(start).w)
+    objective = Objective(problem, reference=reference, linear_solver=linear_solver)
+    xi = np.zeros(len(problem.F), dtype=np.complex128) if mu is None else TANH.invert(mu)
+    return _positions(problem, objective.evaluate(xi).w)
 
 
 def _positions(problem: Problem, w: ComplexArray) -> FloatArray:
@@ -209,7 +220,8 @@ class _Search:
         self.stages: list[Stage] = []
         # Should nothing at all be computed, every free vertex lies at the middle of the target.
         self.best_map = np.zeros(problem.n, dtype=np.complex128)
-        self.best_xi: ComplexArray | None = None
+        self.best_field: TensorField | None = None
+        self.best_reference: Reference = "equilateral"
         self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
         self._rounded = False
@@ -293,7 +305,7 @@ class _Search:
             self.path.append(Snapshot(step.iteration, _positions(self.problem, here.w)))
         if (flipped, step.energy) < self.best:
             self.best = flipped, step.energy
-            self.best_map, self.best_xi = here.w, here.xi
+            self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.mesh.kind
         if self.deepest is None or here.energy < self.deepest.energy:
             self.deepest = here
         if self.callback is not None:

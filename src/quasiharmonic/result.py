@@ -140,8 +140,11 @@ class MapResult:
         The backend that solved the linear systems.
     seconds : float
         Wall time from the call to the verdict.
-    xi : (f,) complex128 or None
-        The anisotropy behind the map, a start for the next solve of a similar problem.
+    mu : (f,) complex128 or None
+        Beltrami coefficients of the tensors whose quasi-harmonic map this is (`quasi_harmonic_map` gives it
+        back), where a tensor field made it.
+    reference : str
+        The triangles in whose frames they are expressed.
     path : list of Snapshot
         Maps on the way, where the caller asked to have them recorded.
     """
@@ -153,7 +156,8 @@ class MapResult:
     history: list[Step] = field(default_factory=list)
     linear_solver: str = ""
     seconds: float = 0.0
-    xi: NDArray[np.complex128] | None = None
+    mu: NDArray[np.complex128] | None = None
+    reference: str = "equilateral"
     path: list[Snapshot] = field(default_factory=list)
 
     @property
