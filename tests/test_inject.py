@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from fractions import Fraction
 
 import numpy as np
@@ -125,6 +126,11 @@ class TestPromises:
         np.testing.assert_array_equal(first.uv, second.uv)
         assert [s.energy for s in first.history] == [s.energy for s in second.history]
 
+    def test_problem_survives_pickling(self):
+        problem = Problem(*star_problem())
+        first = solve(problem)
+        np.testing.assert_array_equal(solve(pickle.loads(pickle.dumps(problem))).uv, first.uv)
+
     def test_same_from_other_dtypes_and_layouts(self):
         V, F, fixed, target = star_problem()
         V, target = V.astype(np.float32), target.astype(np.float32)
@@ -134,7 +140,7 @@ class TestPromises:
         other = injective_map(strided[::2, 1:], F.astype(np.uint32), fixed.astype(np.int32), np.asfortranarray(target))
         np.testing.assert_array_equal(plain.uv, other.uv)
 
-    @pytest.mark.parametrize("scale", [1e-150, 1e-12, 1e12, 1e150])
+    @pytest.mark.parametrize("scale", [1e-200, 1e-12, 1e12, 1e150])
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     def test_scale_of_rest_and_target_do_not_matter(self, scale, reference):
         V, F, fixed, target = star_problem()
@@ -178,18 +184,33 @@ class TestPromises:
 class TestNoMap:
     def test_wrong_winding(self):
         V, F, fixed, target = star_problem(n=80)
-        result = injective_map(V, F, fixed, target * [1, -1], max_iterations=30)
+        result = injective_map(V, F, fixed, target * [1, -1])
         assert not result.injective
-        assert result.status is not Status.INJECTIVE
+        assert result.status is Status.IMPOSSIBLE
+        assert "wound the wrong way" in result.status.value
+        assert result.iterations <= 1
         assert np.all(np.isfinite(result.uv))
         assert len(result.certificate.flipped) > 0
         np.testing.assert_array_equal(result.uv[fixed], target * [1, -1])
 
-    def test_all_in_one_point(self):
+    @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
+    @pytest.mark.parametrize("squash", [(0, 0), (1, 0), (1, 1e-200), (1e-300, 1e-300)])
+    def test_target_without_area(self, squash, reference):
         V, F, fixed, target = star_problem(n=80)
-        result = injective_map(V, F, fixed, np.zeros_like(target), max_iterations=5)
-        assert result.certificate.degenerate.size == len(F)
-        assert not result.injective
+        for shift in (0, 3):
+            result = injective_map(V, F, fixed, target * squash + shift, reference=reference)
+            assert result.status is not Status.OUT_OF_ITERATIONS
+            # Any area at all will do, as long as the doubles around it are fine enough.
+            assert result.injective == (squash[1] > 0 and not shift)
+
+    def test_no_vertex_is_free(self):
+        """A reversed corner triangle: two triangles, all four vertices fixed."""
+        result = injective_map(
+            [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]], range(4), [[0, 0], [1, 0], [-0.2, 0.5], [0, 1]]
+        )
+        assert result.certificate.flipped.tolist() == [1]
+        assert result.status is Status.SETTLED
+        assert result.iterations < 1000
 
     def test_settles_at_a_positive_energy(self):
         """Two pins of one triangle swapped so that it is inverted whatever the others do."""
@@ -202,6 +223,11 @@ class TestNoMap:
         assert result.status is Status.SETTLED
         assert result.history[-1].energy > 1e-3
         assert all(stage.kept or stage.flipped[0] == stage.flipped[1] for stage in result.stages)
+
+    @pytest.mark.parametrize("wrong", [0, -5, 2.5, "many", np.nan])
+    def test_wrong_number_of_iterations(self, wrong):
+        with pytest.raises(ValueError, match="max_iterations must be a whole number"):
+            injective_map(*star_problem(n=60), max_iterations=wrong)
 
     def test_out_of_iterations(self):
         result = injective_map(*turned_ring(180), max_iterations=3)

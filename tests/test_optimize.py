@@ -151,7 +151,12 @@ class TestStrategy:
             ({"parameterization": "log"}, "parameterization must be one of tanh, si-log"),
             ({"functional": "v3"}, "functional must be one of dirichlet"),
             ({"reference": "square"}, "reference must be one of"),
-            ({"iterations": 0}, "iterations must be at least 1"),
+            ({"iterations": 0}, "iterations must be a whole number of at least 1"),
+            ({"iterations": 2.5}, "iterations must be a whole number"),
+            ({"schedule": "abc"}, "schedule must be pairs"),
+            ({"schedule": [(5, -1)]}, "schedule must be pairs"),
+            ({"schedule": [(5, 1), (5, 2)]}, "schedule must be pairs"),
+            ({"schedule": [(0, np.nan)]}, "schedule must be pairs"),
         ],
     )
     def test_wrong_words(self, arguments, words):
@@ -164,8 +169,9 @@ class TestStrategy:
             assert all(isinstance(stage, Descent) for stage in stages_of(name, problem))
         with pytest.raises(ValueError, match="strategy must be one of speed, quality"):
             stages_of("haste", problem)
-        with pytest.raises(ValueError, match="no stages"):
-            stages_of([], problem)
+        for wrong in ([], 3, ["speed"]):
+            with pytest.raises(ValueError, match="or a list of Descent"):
+                stages_of(wrong, problem)
 
     def test_pins_are_met_with_si_log_first(self):
         V, F, fixed, target = star_problem(n=60)

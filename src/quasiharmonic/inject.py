@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,6 +127,8 @@ def solve(
 ) -> MapResult:
     """Solve a problem at hand; parameters and result as `injective_map` has them."""
     began = time.perf_counter() if _began is None else _began
+    if not isinstance(max_iterations, Integral) or max_iterations < 1:
+        raise ValueError(f"max_iterations must be a whole number of at least 1, not {max_iterations!r}")
     search = _Search(problem, linear_solver, callback, max_iterations, record)
     status = search.run(stages_of(strategy, problem))
     uv = _positions(problem, search.best_map)
@@ -229,7 +232,9 @@ class _Search:
         self._marked = 0
 
     def run(self, stages: Sequence[Descent]) -> Status:
-        """Run stages until one finds an injective map; the status of the last one that ran."""
+        """Run stages until one finds an injective map; why the search ended."""
+        if not self.problem.encloses_area:
+            stages = [replace(stages[0], iterations=1)]
         status = Status.OUT_OF_ITERATIONS
         try:
             for stage in stages:
@@ -237,11 +242,18 @@ class _Search:
                 while status is Status.UNSOLVABLE and self._spare and self._left > 0:
                     self.linear_solver = self._spare[0]
                     status = self._descend(replace(stage, resume=True))
-                if status is Status.INJECTIVE or self._left <= 0:
+                if status is Status.INJECTIVE:
+                    return status
+                if self._left <= 0:
                     break
+            else:
+                # Every stage has done what it could.
+                status = Status.SETTLED if status is Status.OUT_OF_ITERATIONS else status
         except KeyboardInterrupt:
             return Status.INTERRUPTED
-        return Status.ROUNDED if self._rounded and status is not Status.INJECTIVE else status
+        if not self.problem.encloses_area:
+            return Status.IMPOSSIBLE
+        return Status.ROUNDED if self._rounded else status
 
     @property
     def _left(self) -> int:
@@ -250,7 +262,7 @@ class _Search:
 
     def _descend(self, stage: Descent) -> Status:
         """Run one stage."""
-        before, done, began = self.best, max(len(self.history), 1), time.perf_counter()
+        before, done, began = None, max(len(self.history), 1), time.perf_counter()
         self._mark, self._marked = (len(self.problem.F) + 1, np.inf), len(self.history)
         try:
             objective = Objective(
@@ -260,6 +272,8 @@ class _Search:
             if self.linear_solver in self._spare:
                 self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
             start = objective.evaluate(self._start(objective, stage.resume))
+            # The first map of all is what the first stage begins with.
+            before = self.best if self.history else (start.flipped, start.energy)
             self._visit(start)
             _METHODS[stage.optimizer](objective, start, self._visit, stage, min(stage.iterations, self._left))
             status = Status.OUT_OF_ITERATIONS
@@ -273,8 +287,8 @@ class _Search:
                     name=stage.name,
                     iterations=max(len(self.history) - done, 0),
                     seconds=time.perf_counter() - began,
-                    flipped=(before[0], self.best[0]),
-                    energy=(before[1], self.best[1]),
+                    flipped=((before or self.best)[0], self.best[0]),
+                    energy=((before or self.best)[1], self.best[1]),
                     kept=self.best != before,
                 )
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,8 +76,14 @@ class Problem:
             _positive_areas(self.V, self.F)
         self.fixed = _fixed(fixed, len(self.V), self.edges)
         self.target = _target(target, len(self.fixed))
+        for array in (self.V, self.F, self.fixed, self.target):
+            array.flags.writeable = False
         self._laplacians: dict[str, Laplacian] = {}
         self._meshes: dict[Reference, ReferenceMesh] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Factorisations live in a library's memory and stay behind when a problem is pickled.
+        return {**self.__dict__, "_laplacians": {}}
 
     def moved(self, target: ArrayLike) -> Problem:
         """The same problem with its fixed vertices elsewhere.
@@ -91,8 +97,10 @@ class Problem:
         """
         other = object.__new__(Problem)
         other.__dict__.update(self.__dict__)
-        other.__dict__.pop("frame", None)
+        for of_target in ("frame", "encloses_area"):
+            other.__dict__.pop(of_target, None)
         other.target = _target(target, len(self.fixed))
+        other.target.flags.writeable = False
         return other
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
@@ -102,9 +110,14 @@ class Problem:
         return self._laplacians[linear_solver]
 
     def mesh(self, kind: Reference) -> ReferenceMesh:
-        """The mesh with reference triangles of some kind, built once and kept."""
+        """The mesh with reference triangles of some kind, built once and kept.
+
+        In units near the rest mesh's size, a power of two, so that no area leaves the numbers' range; the
+        functionals have no scale.
+        """
         if kind not in self._meshes:
-            self._meshes[kind] = ReferenceMesh(self.V, self.F, kind)
+            exponent = int(np.frexp(np.max(np.abs(self.V)))[1])
+            self._meshes[kind] = ReferenceMesh(np.ldexp(self.V, -exponent), self.F, kind)
         return self._meshes[kind]
 
     @cached_property
@@ -116,6 +129,18 @@ class Problem:
     def pins(self) -> IntArray:
         """Fixed vertices that are not on the boundary, ascending."""
         return np.setdiff1d(self.fixed, self.edges.boundary)
+
+    @cached_property
+    def encloses_area(self) -> bool:
+        """Whether the target's boundary may enclose a positive area, as the triangles of an injective map add up to.
+
+        False only where it certainly does not: all positions are equal, or the boundary is wound the wrong way.
+        """
+        w = np.zeros(self.n, dtype=np.complex128)
+        w[self.fixed] = self.frame.inward(self.target)
+        area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in self.loops)
+        # The frame is of unit size, so rounding stays far below this.
+        return area > -1e-12 and bool(np.any(self.target != self.target[0]))
 
     @property
     def n(self) -> int:
@@ -150,19 +175,28 @@ class Frame:
         return np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent) + self.centre
 
 
+def _array(name: str, values: ArrayLike) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name} is not an array: its rows differ in length") from error
+
+
 def _real(name: str, values: ArrayLike) -> FloatArray:
-    array = np.asarray(values)
+    array = _array(name, values)
     if array.dtype.kind not in "iufb":
         raise ValueError(f"{name} must hold real numbers, not {array.dtype}")
     return np.array(array, dtype=np.float64, order="C")
 
 
 def _indices(name: str, values: ArrayLike) -> IntArray:
-    array = np.asarray(values)
+    array = _array(name, values)
     if array.size == 0:
         array = array.astype(np.int64)
     if array.dtype.kind not in "iu":
         raise ValueError(f"{name} must hold integer vertex indices, not {array.dtype}")
+    if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
+        raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
     return np.array(array, dtype=np.int64, order="C")
 
 
@@ -177,7 +211,8 @@ def _finite(name: str, one: str, values: FloatArray) -> None:
 def _in_range(name: str, indices: IntArray, n: int) -> None:
     bad = np.unique(indices[(indices < 0) | (indices >= n)])
     if bad.size:
-        raise ValueError(f"{name} refers to {named('vertex', 'vertices', bad)}, but there are only {n} (0 … {n - 1})")
+        there = f"only vertices 0 … {n - 1}" if n else "no vertices"
+        raise ValueError(f"{name} refers to {named('vertex', 'vertices', bad)}, but there are {there}")
 
 
 def _vertices(V: ArrayLike) -> FloatArray:
@@ -218,11 +253,10 @@ def _surface(F: IntArray, n: int) -> Edges:
         )
     if not found.boundary.size:
         raise ValueError("the surface is closed: it has no boundary to place; cut it open first")
-    labels = components(F, n)
-    if labels.max() > 0:
-        first = np.unique(labels, return_index=True)[1]
+    if components(F, n).any():
+        first = np.unique(components(F, n))
         raise ValueError(
-            f"the mesh has {labels.max() + 1} components, the first ones around {named('vertex', 'vertices', first)}: "
+            f"the mesh has {first.size} components, the first ones around {named('vertex', 'vertices', first)}: "
             "map them one at a time"
         )
     return found
@@ -243,7 +277,7 @@ def _positive_areas(V: FloatArray, F: IntArray) -> None:
     if flat.size:
         raise ValueError(
             f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh; "
-            "pass reference='equilateral' to map it all the same"
+            "choose the reference 'equilateral' to map it all the same"
         )
 
 

@@ -21,6 +21,10 @@ class Status(Enum):
         "Some triangles stay inverted and the energy has settled at a positive value: "
         "no map was found, and perhaps this mesh and this target admit none."
     )
+    IMPOSSIBLE = (
+        "No injective map exists: the area that the target's boundary encloses, counterclockwise for this mesh, is "
+        "not positive. Where the target is wound the wrong way, reflect it or reverse the triangles."
+    )
     OUT_OF_ITERATIONS = (
         "Some triangles were still inverted after the last iteration. "
         "The energy was still falling: allow more iterations."
@@ -57,7 +61,7 @@ class Stage:
     name : str
         What ran, in words a log can show.
     iterations : int
-        Evaluations of the objective, the first one included only in the first stage.
+        Evaluations of the objective; the very first one of all, the start, is not counted.
     seconds : float
     flipped : tuple of int
         Triangles not strictly positive before and after.

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal, get_args, get_type_hints
+
+import numpy as np
 
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
@@ -14,6 +17,8 @@ from quasiharmonic.problem import Problem
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
 # The longer way that si-log's ξ has to go to the same tensor wants longer steps.
 SI_LOG_STEPS = ((0, 0.5),)
+# Until it settles or the caller's iterations are spent.
+_NO_END = 10**9
 
 
 @dataclass(frozen=True)
@@ -57,8 +62,17 @@ class Descent:
             words, given = get_args(hint), getattr(self, name)
             if words and all(isinstance(word, str) for word in words) and given not in words:
                 raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
-        if self.iterations < 1:
-            raise ValueError(f"iterations must be at least 1, not {self.iterations}")
+        if not isinstance(self.iterations, Integral) or self.iterations < 1:
+            raise ValueError(f"iterations must be a whole number of at least 1, not {self.iterations!r}")
+        try:
+            times, lengths = np.array([*zip(*self.steps, strict=True)], dtype=np.float64)
+        except (TypeError, ValueError):
+            times, lengths = np.zeros(2), np.zeros(2)
+        if np.any(np.diff(times) <= 0) or not np.all((lengths > 0) & np.isfinite(lengths)):
+            raise ValueError(
+                "schedule must be pairs (iteration, step length), iterations ascending and lengths positive, "
+                f"not {self.schedule!r}"
+            )
 
     @property
     def name(self) -> str:
@@ -81,16 +95,13 @@ def speed(problem: Problem) -> list[Descent]:
     grows slowly towards it, and tanh never gets there. Newton rights the last few triangles where short Adam
     steps would take hundreds.
     """
-    tanh = [
-        Descent(iterations=100),
-        Descent("newton", iterations=60, resume=True),
-        Descent(schedule=((0, 0.05), (200, 0.01)), resume=True),
-    ]
+    tanh = [Descent(iterations=100), Descent("newton", iterations=60, resume=True)]
     si_log = [
-        Descent(parameterization="si-log", iterations=1000),
+        Descent(parameterization="si-log", iterations=600),
         Descent("newton", parameterization="si-log", iterations=60, resume=True),
     ]
-    return si_log + tanh if problem.pins.size else tanh + si_log
+    last = [Descent(iterations=_NO_END, schedule=((0, 0.05), (200, 0.01)), resume=True)]
+    return (si_log + tanh if problem.pins.size else tanh + si_log) + last
 
 
 def quality(problem: Problem) -> list[Descent]:
@@ -117,6 +128,10 @@ def stages_of(strategy: str | Sequence[Descent], problem: Problem) -> Sequence[D
         if strategy not in STRATEGIES:
             raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
         return STRATEGIES[strategy](problem)
-    if not strategy:
-        raise ValueError("the strategy has no stages")
-    return strategy
+    try:
+        stages = list(strategy)
+    except TypeError:
+        stages = [strategy]
+    if not stages or not all(isinstance(stage, Descent) for stage in stages):
+        raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+    return stages

@@ -18,7 +18,7 @@ _INTERVAL = 0.1
 @contextmanager
 def line() -> Iterator[Callable[[Step], None] | None]:
     """Give a callback that shows a solver's steps, or none where standard error is not a terminal."""
-    if not sys.stderr.isatty():
+    if sys.stderr is None or not sys.stderr.isatty():
         yield None
         return
     shown = 0.0

@@ -128,15 +128,26 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
 
 
 def components(F: NDArray[np.integer], n: int) -> IntArray:
-    """Label of the connected component of every vertex, (n,) int64; a vertex without triangle is its own."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
+    """Label of the connected component of every vertex, (n,) int64: its smallest vertex.
 
-    F = np.asarray(F)
+    A vertex without triangle is a component of its own.
+    """
+    # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
+    # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
+    # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
+    F = np.asarray(F, dtype=np.int64)
     # Two edges of a triangle connect its three vertices.
     tail, head = F[:, (0, 1)].ravel(), F[:, (1, 2)].ravel()
-    graph = csr_array((np.ones(tail.size, dtype=np.int8), (tail, head)), shape=(n, n))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    label = np.arange(n)
+    while True:
+        one, other = label[tail], label[head]
+        apart = one != other
+        if not apart.any():
+            return label
+        tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
+        np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
+        while not np.array_equal(label, root := label[label]):
+            label = root
 
 
 def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:

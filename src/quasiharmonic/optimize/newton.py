@@ -25,12 +25,16 @@ from quasiharmonic.energies import QuadraticForm
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.newton_system import NewtonSystem
 from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.optimize import Stop
+from quasiharmonic.result import Status
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _FIRST_DAMPING = 1e-2
 _MOST_DAMPING = 1e12
+# Of the stiffest triangle: what a triangle that has shrunk to a point resists a change of its ξ with.
+_LEAST = 1e-100
 
 
 def newton(
@@ -50,10 +54,12 @@ def newton(
     visit : callable
         Called with every accepted iterate; raises `Stop` to end.
     iterations : int
-        Steps to try at most. Ends earlier where no step lowers the energy any more.
+        Steps to try at most.
 
     Raises
     ------
+    Stop
+        When no step lowers the energy any more.
     quasiharmonic.linsolve.NotPositiveDefinite
         When rounding leaves no positive definite Laplacian.
     """
@@ -77,7 +83,7 @@ def newton(
             visit(here)
             model = _Model(here)
         elif damping > _MOST_DAMPING:
-            return
+            raise Stop(Status.SETTLED)
 
 
 class _Model:
@@ -123,7 +129,7 @@ class _Model:
         # An inverted triangle may have a concave block: reflect it, and keep it away from zero.
         mean, half = 0.5 * (k11 + k22), np.hypot(0.5 * (k11 - k22), k12)
         high, low = np.abs(mean + half), np.abs(mean - half)
-        floor = 1e-10 * np.maximum(high, low) + np.finfo(np.float64).tiny
+        floor = 1e-10 * np.maximum(high, low) + _LEAST * high.max()
         high, low = np.maximum(high, floor), np.maximum(low, floor)
         # The eigenvectors stay: the deviator is scaled to the new half difference, of either sign.
         swapped = np.abs(mean - half) > np.abs(mean + half)
