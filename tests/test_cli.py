@@ -168,6 +168,85 @@ class TestRefuses:
         assert stop.value.code == 2
         assert "-o" in capsys.readouterr().err
 
+    def test_outputs_that_would_destroy_something(self, star, tmp_path, capsys):
+        before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+        out = tmp_path / "out.obj"
+        for extra in (
+            ("--json", out),
+            ("--json", star),
+            ("--plot", out),
+            ("--plot", tmp_path / "p.pdf"),
+            ("--fixed", tmp_path / "handles.txt", "--json", tmp_path / "handles.txt"),
+            ("--plot", tmp_path / "x.png", "--json", tmp_path / "x.png"),
+        ):
+            assert run("map", star, "-o", out, *extra) == 2
+            assert re.search("replace|also the file|as .png", capsys.readouterr().err)
+            assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+        assert run("check", star, "--json", star) == 2
+        assert run("map", star, "-o", star) == 0
+
+    def test_messages_name_the_file_and_how_it_counts(self, tmp_path, capsys):
+        _, V, F, _ = bad_meshes()[0]
+        problem = write_problem(tmp_path, V, F, np.arange(3), np.zeros((3, 2)), handles=False)
+        assert run("map", problem, "-o", tmp_path / "out.obj") == 2
+        assert "input.obj" in (said := capsys.readouterr().err)
+        assert "(counting from 0)" in said
+        assert run("map", problem, "-o", tmp_path / "out.obj", "--reference", "equilateral") in (0, 1)
+
+
+class TestReportFails:
+    """What goes wrong once the map is written must not claim that nothing was."""
+
+    def test_full_standard_output(self, star, tmp_path):
+        if not Path("/dev/full").exists():
+            pytest.skip("no /dev/full on this system")
+        command = [sys.executable, "-m", "quasiharmonic", "map", str(star), "-o", str(tmp_path / "o.obj")]
+        with open("/dev/full", "w") as full:
+            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+        assert done.returncode == 1
+        assert "is written, but the report failed" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert run("check", tmp_path / "o.obj") == 0
+
+    def test_interrupt_while_drawing(self, star, tmp_path, capsys, monkeypatch):
+        def interrupt(*arguments, **more):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("quasiharmonic.plot.save_map_figure", interrupt)
+        assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 1
+        assert "o.obj is written; interrupted" in capsys.readouterr().err
+
+    def test_interrupt_before_there_is_a_map(self, star, tmp_path, capsys, monkeypatch):
+        def interrupt(self, xi):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("quasiharmonic.objective.Objective.evaluate", interrupt)
+        assert run("map", star, "-o", tmp_path / "o.obj") == 2
+        assert "nothing was written" in capsys.readouterr().err
+        assert not (tmp_path / "o.obj").exists()
+
+    def test_ascii_console(self, star, tmp_path):
+        command = [sys.executable, "-m", "quasiharmonic", "check", str(star)]
+        plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+        done = subprocess.run(command, capture_output=True, env=plain)
+        assert done.returncode == 1
+        assert done.stdout.isascii()
+
+    @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
+    def test_closed_standard_error(self, star, tmp_path):
+        command = f"{sys.executable} -m quasiharmonic map {star} -o {tmp_path / 'o.obj'} 2>&-"
+        assert subprocess.run(command, shell=True, capture_output=True).returncode == 0
+
+    def test_no_first_map_to_draw(self, star, tmp_path, monkeypatch):
+        from quasiharmonic.linsolve import NotPositiveDefinite
+
+        def fail(*arguments, **more):
+            raise NotPositiveDefinite("as asked")
+
+        monkeypatch.setattr("quasiharmonic.inject.quasi_harmonic_map", fail)
+        assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 0
+        assert (tmp_path / "p.png").exists()
+
 
 class TestCheck:
     def test_statuses(self, star, tmp_path, capsys):

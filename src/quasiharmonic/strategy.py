@@ -128,10 +128,7 @@ def stages_of(strategy: str | Sequence[Descent], problem: Problem) -> Sequence[D
         if strategy not in STRATEGIES:
             raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
         return STRATEGIES[strategy](problem)
-    try:
-        stages = list(strategy)
-    except TypeError:
-        stages = [strategy]
+    stages = list(strategy) if isinstance(strategy, Sequence) else []
     if not stages or not all(isinstance(stage, Descent) for stage in stages):
         raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
     return stages

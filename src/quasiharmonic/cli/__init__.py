@@ -1,16 +1,20 @@
 """The command ``qhm``.
 
 Exit status 0: what was asked for holds, and a written file is certified injective. 1: a map was written
-or judged that is not injective. 2: the input or the call is wrong, and nothing was written.
+or judged that is not injective, or a map was written and the report about it failed. 2: the input or the
+call is wrong, and nothing was written.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 
 from . import check, demo, map
+from .report import ReportError
 
 COMMANDS = (map, check, demo)
 
@@ -23,17 +27,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments after the command's name; those of the process by default.
     """
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that cannot show a sign gets another; a report must not fail for that.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(argv)
     run: Callable[[argparse.Namespace], int] = options.run
     try:
         return run(options)
-    except (ValueError, OSError, ImportError) as error:
+    except ReportError as error:
+        return _fail(options.command, str(error), 1)
+    except (ValueError, OSError, ImportError, ArithmeticError) as error:
         # Wrong input of any kind: the library's messages name the elements and what to do.
-        print(f"qhm {options.command}: {error}", file=sys.stderr)
-        return 2
+        return _fail(options.command, str(error), 2)
     except KeyboardInterrupt:
-        print(f"qhm {options.command}: interrupted, nothing was written", file=sys.stderr)
-        return 2
+        return _fail(options.command, "interrupted, nothing was written", 2)
+
+
+def _fail(command: str, message: str, status: int) -> int:
+    print(f"qhm {command}: {message}", file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except (OSError, AttributeError):
+        # Whoever read standard output has gone: keep the interpreter from tripping over it again at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return status
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -13,7 +13,7 @@ def add_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE", help="write the report as JSON; - for standard output")
 
 
-def positive(text: str) -> int:
+def count(text: str) -> int:
     """Read a whole number of at least 1; for argparse."""
     value = int(text)
     if value < 1:

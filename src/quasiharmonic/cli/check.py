@@ -44,6 +44,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.json not in (None, "-"):
         io.check_writable(options.json)
+        if Path(options.json).resolve() == options.input.resolve():
+            raise ValueError(f"--json {options.json} would replace the input file")
     mesh = io.read_mesh(options.input)
     uv = io.map_of(mesh)
     if options.precision == "float32":

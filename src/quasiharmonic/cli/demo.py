@@ -35,14 +35,18 @@ def run(options: argparse.Namespace) -> int:
     from . import map, report
 
     folder: Path = options.output
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"cannot make the folder {folder}: {error.strerror}") from error
     V, F = surfaces.cat()
     (loop,) = boundary_loops(F, len(V))
     problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
     result = map.search(problem, "speed", 2000, "auto")
     certificate = map.write(folder / "demo.obj", io.MeshData(V, F), result)
-    map.draw(folder / "demo.png", problem, result, certificate)
-    facts = {**result.to_dict(), **report.verdict(certificate), **report.sizes(problem)}
-    report.emit(facts, str(folder / "demo.json"), report.of_map(result, certificate, folder / "demo.obj"))
-    print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}")
+    with report.after_writing(folder / "demo.obj"):
+        map.draw(folder / "demo.png", problem, result, certificate)
+        facts = {**result.to_dict(), **report.verdict(certificate), **report.sizes(problem)}
+        report.emit(facts, str(folder / "demo.json"), report.of_map(result, certificate, folder / "demo.obj"))
+        print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}")
     return 0 if certificate.injective else 1

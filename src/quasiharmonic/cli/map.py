@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
     )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
-    solver.add_argument("--max-iterations", type=arguments.positive, default=2000, metavar="N")
+    solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N")
     solver.add_argument("--linear-solver", default="auto", choices=("auto", "pardiso", "cholmod", "qdldl", "superlu"))
     parser.set_defaults(run=run)
 
@@ -50,31 +50,33 @@ def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
     from quasiharmonic.problem import Problem
+    from quasiharmonic.result import Status
 
     from . import report
 
     began = time.perf_counter()
-    io.check_output(options.output)
-    for other in (options.plot, None if options.json == "-" else options.json):
-        if other is not None:
-            io.check_writable(other)
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
+    report.check_outputs(options.output, options.plot, options.json, inputs=(mesh_path, fixed_path))
     mesh = io.read_mesh(mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
-    problem = Problem(*io.problem_arrays(mesh, fixed), reference=options.reference)
+    with report.about(mesh_path):
+        problem = Problem(*io.problem_arrays(mesh, fixed), reference=options.reference)
     result = search(problem, options.strategy, options.max_iterations, options.linear_solver)
+    if result.status is Status.INTERRUPTED and not result.history:
+        raise KeyboardInterrupt
     certificate = write(options.output, mesh, result)
-    if options.plot is not None:
-        draw(options.plot, problem, result, certificate)
-    facts = {
-        **result.to_dict(),
-        **report.verdict(certificate),
-        **report.sizes(problem),
-        "input": str(options.input),
-        "output": str(options.output),
-        "seconds_in_all": time.perf_counter() - began,
-    }
-    report.emit(facts, options.json, report.of_map(result, certificate, options.output))
+    with report.after_writing(options.output):
+        if options.plot is not None:
+            draw(options.plot, problem, result, certificate)
+        facts = {
+            **result.to_dict(),
+            **report.verdict(certificate),
+            **report.sizes(problem),
+            "input": str(options.input),
+            "output": str(options.output),
+            "seconds_in_all": time.perf_counter() - began,
+        }
+        report.emit(facts, options.json, report.of_map(result, certificate, options.output))
     return 0 if certificate.injective else 1
 
 
@@ -105,15 +107,12 @@ def draw(path: Path, problem: Problem, result: MapResult, certificate: Certifica
     import numpy as np
 
     from quasiharmonic.inject import quasi_harmonic_map
+    from quasiharmonic.linsolve import NotPositiveDefinite
     from quasiharmonic.plot import save_map_figure
 
+    try:
+        tutte = quasi_harmonic_map(problem, linear_solver=result.linear_solver)
+    except NotPositiveDefinite:
+        tutte = None
     inverted = np.concatenate([certificate.flipped, certificate.degenerate])
-    save_map_figure(
-        path,
-        problem.V,
-        problem.F,
-        result.uv,
-        quasi_harmonic_map(problem, linear_solver=result.linear_solver),
-        flipped=inverted,
-        fixed=problem.fixed,
-    )
+    save_map_figure(path, problem.V, problem.F, result.uv, tutte, flipped=inverted, fixed=problem.fixed)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,18 +36,71 @@ def of_map(result: MapResult, certificate: Certificate, output: Path) -> str:
     lines = [f"wrote {output}: {certificate.summary()}"]
     if not certificate.injective:
         lines.append(result.status.value)
-    lines.append(f"{result.iterations} iterations, {result.seconds:.3g} s, {result.linear_solver}")
+    plural = "" if result.iterations == 1 else "s"
+    lines.append(f"{result.iterations} iteration{plural}, {result.seconds:.3g} s, {result.linear_solver}")
     return "\n".join(lines)
 
 
 def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
     """Print the sentences, write the JSON; with ``--json -`` standard output holds the JSON alone."""
     if destination == "-":
-        print(json.dumps(facts, allow_nan=False))
-        print(text, file=sys.stderr)
+        print(json.dumps(facts, allow_nan=False), flush=True)
+        print(text, file=sys.stderr, flush=True)
         return
     if destination is not None:
         from quasiharmonic.io import write_whole
 
         write_whole(destination, json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
-    print(text)
+    print(text, flush=True)
+
+
+def check_outputs(map_path: Path, plot: Path | None, json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """Say before any work that something could not be written, or would be written over something else.
+
+    Raises
+    ------
+    ValueError, OSError
+        When a path cannot be written, two outputs are the same file, or a picture or a report would replace
+        an input. (The map may: reading is done by then.)
+    """
+    from quasiharmonic import io
+
+    io.check_output(map_path)
+    if plot is not None and plot.suffix.lower() != ".png":
+        raise ValueError(f"--plot {plot}: pictures are written as .png")
+    taken = {map_path.resolve(): "the map (-o)"}
+    kept = {path.resolve() for path in inputs if path is not None}
+    others = (("--plot", plot), ("--json", None if json_path in (None, "-") else Path(str(json_path))))
+    for option, path in others:
+        if path is None:
+            continue
+        io.check_writable(path)
+        if path.resolve() in kept:
+            raise ValueError(f"{option} {path} would replace an input file")
+        if path.resolve() in taken:
+            raise ValueError(f"{option} {path} is also the file of {taken[path.resolve()]}")
+        taken[path.resolve()] = option
+
+
+@contextmanager
+def about(source: Path) -> Iterator[None]:
+    """Tell of which file a message about a mesh speaks, and how it counts."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{source}: {error} (counting from 0)") from error
+
+
+class ReportError(Exception):
+    """The map is written, but what should be told about it could not be."""
+
+
+@contextmanager
+def after_writing(output: Path) -> Iterator[None]:
+    """Keep what goes wrong from here on from claiming that nothing was written."""
+    try:
+        yield
+    except (ValueError, OSError, ArithmeticError, ImportError) as error:
+        raise ReportError(f"{output} is written, but the report failed: {error}") from error
+    except KeyboardInterrupt:
+        raise ReportError(f"{output} is written; interrupted before the report") from None

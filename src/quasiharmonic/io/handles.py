@@ -105,8 +105,8 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
     if mesh.FT is None:
         raise MeshFileError(
             mesh.source,
-            "has no texture coordinates, so nothing says where the fixed vertices go",
-            remedy="write it with uv coordinates, which OBJ has as vt",
+            "has no faces that refer to texture coordinates, so nothing says where the fixed vertices go",
+            remedy="write it with uv coordinates, in OBJ vt lines and faces like 1/1 2/2 3/3",
         )
     if fixed is None:
         fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))

@@ -1,0 +1,221 @@
+"""Problems without a map, each for a reason of its own, and the small meshes they are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+from meshes import boundary_of
+
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.problem import Problem
+from quasiharmonic.surfaces import annulus, disk, grid
+
+# A corridor around three sides of a square: nobody sees from one end to the other.
+U = [[0, 0], [9, 0], [9, 9], [6, 9], [6, 3], [3, 3], [3, 9], [0, 9]]
+
+
+def circle(n, radius=1.0, turns=1):
+    t = 2 * np.pi * turns * np.arange(n) / n
+    return radius * np.stack([np.cos(t), np.sin(t)], axis=1)
+
+
+def spread(polygon, n):
+    """``n`` points on a polygon: its corners, and others halfway along its longest sides."""
+    points = [np.asarray(p, dtype=float) for p in polygon]
+    while len(points) < n:
+        k = int(np.argmax([np.linalg.norm(points[k] - points[k - 1]) for k in range(len(points))]))
+        points.insert(k, (points[k] + points[k - 1]) / 2)
+    return np.array(points)
+
+
+def spiral(n, turns, width=0.6):
+    """A band that winds around itself without touching, as a polygon with ``2 n`` corners."""
+    t = np.linspace(0, 2 * np.pi * turns, n)
+    outward = np.stack([np.cos(t), np.sin(t)], axis=1)
+    middle = 1 + t[:, None] / (2 * np.pi)
+    return np.concatenate([(middle + width / 2) * outward, ((middle - width / 2) * outward)[::-1]])
+
+
+def wheel(n):
+    """A hub ``n`` in a ring of ``n``, each two neighbours of which form a triangle with it."""
+    i = np.arange(n)
+    return np.concatenate([circle(n), np.zeros((1, 2))]), np.stack([i, (i + 1) % n, np.full(n, n)], axis=1)
+
+
+def loose_wheel(n):
+    """As `wheel`, with a vertex ``n + 1 + i`` inside each triangle: the hub has none with a boundary edge."""
+    V, F = wheel(n)
+    a, b, c = F.T
+    k = n + 1 + np.arange(n)
+    parts = [np.stack(t, axis=1) for t in ((a, b, k), (b, c, k), (c, a, k))]
+    return np.concatenate([V, V[F].mean(axis=1)]), np.concatenate(parts)
+
+
+def two_wheels():
+    """A ring of 8 with the chord 0, 4 and a hub on either side, 8 to its right and 9 to its left."""
+    rings = [[0, 1, 2, 3, 4], [4, 5, 6, 7, 0]]
+    V = np.concatenate([circle(8), [circle(8)[ring].mean(axis=0) for ring in rings]])
+    return V, np.array([(r[k - 1], r[k], hub) for hub, r in enumerate(rings, start=8) for k in range(5)])
+
+
+def eared():
+    """A square whose corner 1 is an ear, behind the chord 0, 2; vertex 4 is in the middle of the rest."""
+    return np.array([[0, 0], [4, 0], [4, 4], [0, 4], [1, 3.0]]), np.array([[0, 1, 2], [0, 2, 4], [2, 3, 4], [3, 0, 4]])
+
+
+def handle(n=6):
+    """A torus of ``n`` by ``n`` cells without one cell: one boundary loop, and a handle."""
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    here, right, up, across = (((i + a) % n) * n + (j + b) % n for a, b in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    F = np.stack([here, right, across, here, across, up], axis=1).reshape(-1, 3)
+    a, b = 2 * np.pi * i / n, 2 * np.pi * j / n
+    return np.stack([(2 + np.cos(b)) * np.cos(a), (2 + np.cos(b)) * np.sin(a), np.sin(b)], axis=1), F[2:]
+
+
+def moved(mesh, at=None, pins=()):
+    """The boundary (the first few vertices, or those named) and the pins of a planar mesh elsewhere."""
+    V, F = mesh
+    where = np.array(V[:, :2])
+    for vertex, position in at.items() if isinstance(at, dict) else enumerate(at or []):
+        where[vertex] = position
+    fixed = np.concatenate([boundary_of(F), np.asarray(pins, dtype=int)])
+    return Problem(V, F, fixed, where[fixed], reference="equilateral")
+
+
+def onto(mesh, *targets):
+    """The loops of a mesh, in the order of `boundary_loops`, onto polygons of as many corners."""
+    V, F = mesh
+    where = np.full((len(V), 2), np.nan)
+    for loop, target in zip(boundary_loops(F, len(V)), targets, strict=True):
+        where[loop] = np.asarray(target, dtype=float)
+    fixed = boundary_of(F)
+    return Problem(V, F, fixed, where[fixed], reference="equilateral")
+
+
+RING = annulus(4)  # loops of 24 and 8
+CELLS = grid(6, 6)  # vertex i + 7 j at (i / 6, j / 6)
+HOUSE = [[4, 0], [4, 6], [2, 7], [0, 6], [0, 0]]  # goes on above the chord of two wheels
+OUTER, HOLE = 4 * circle(24), circle(8)[::-1]
+
+# name: (problem, kind, what it forbids, elements to be found in the obstruction)
+OBSTRUCTED = {
+    "collapsed boundary edge": (
+        moved(wheel(5), {1: circle(5)[0]}),
+        ("COLLAPSED_EDGE", "INJECTIVE", {"edges": [[0, 1]]}),
+    ),
+    "collapsed pinned edge": (
+        moved(CELLS, {16: [0.4, 0.4], 17: [0.4, 0.4]}, pins=[16, 17]),
+        ("COLLAPSED_EDGE", "INJECTIVE", {"edges": [[16, 17]]}),
+    ),
+    "inverted ear": (
+        moved(eared(), {1: [1, 2]}),
+        ("INVERTED_TRIANGLE", "INJECTIVE", {"triangles": [0], "split": [[2, 0]]}),
+    ),
+    "flat ear": (
+        moved(eared(), {1: [2, 2]}),
+        ("INVERTED_TRIANGLE", "INJECTIVE", {"triangles": [0], "split": [[2, 0]]}),
+    ),
+    "chord over a notch": (
+        moved(two_wheels(), [[0, 0], [1, 3], [2, 4], [3, 3], *HOUSE]),
+        ("CHORD", "INJECTIVE", {"edges": [[0, 4]], "split": [[0, 4]]}),
+    ),
+    "patch inside out": (
+        moved(two_wheels(), [[0, 0], [1, 3], [2, 4], [3, 3], *HOUSE]),
+        ("INVERTED_PATCH", "INJECTIVE", {"triangles": [0, 1, 2, 3, 4], "split": [[4, 0]]}),
+    ),
+    "chord touches a corner": (
+        moved(two_wheels(), [[0, 0], [1, -1], [2, 0], [3, -1], *HOUSE]),
+        ("CHORD", "INJECTIVE", {"split": [[0, 4]]}),
+    ),
+    "chord along the boundary": (
+        moved(two_wheels(), [[0, 0], [1, -1], [2, 0], [3, 0], *HOUSE]),
+        ("CHORD", "INJECTIVE", {"split": [[0, 4]]}),
+    ),
+    "pinned edges cross": (
+        moved(CELLS, {15: [0.4, 0.4], 16: [0.6, 0.6], 31: [0.4, 0.6], 32: [0.6, 0.4]}, pins=[15, 16, 31, 32]),
+        ("CHORD", "INJECTIVE", {"edges": [[31, 32], [15, 16]], "split": [[31, 32]]}),
+    ),
+    "pin on a pinned edge": (
+        moved(CELLS, {15: [0.25, 0.5], 16: [0.75, 0.5], 32: [0.5, 0.5]}, pins=[15, 16, 32]),
+        ("CHORD", "INJECTIVE", {"vertices": [15, 16, 32], "split": [[15, 16]]}),
+    ),
+    "pin outside": (
+        moved(CELLS, {24: [1.5, 0.5]}, pins=[24]),
+        ("PIN", "INJECTIVE", {"vertices": [24]}),
+    ),
+    "pin on the boundary": (
+        moved(CELLS, {24: [1.0, 0.3]}, pins=[24]),
+        ("PIN", "INJECTIVE", {"vertices": [24]}),
+    ),
+    "pins together": (
+        moved(CELLS, {16: [0.5, 0.4], 32: [0.5, 0.4]}, pins=[16, 32]),
+        ("PIN", "INJECTIVE", {"vertices": [16, 32]}),
+    ),
+    "pin in the hole": (
+        moved(annulus(8), {18: [0.1, 0.1]}, pins=[18]),
+        ("PIN", "INJECTIVE", {"vertices": [18]}),
+    ),
+    "no kernel": (
+        moved(wheel(8), U),
+        ("HALF_PLANES", "INJECTIVE", {"vertices": [8]}),
+    ),
+    "no kernel, target crossed": (
+        moved(wheel(8), [[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, -2], [0, -2]]),
+        ("HALF_PLANES", "INJECTIVE", {"vertices": [8]}),
+    ),
+    "nothing sees all": (
+        moved(loose_wheel(8), U),
+        ("HIDDEN", "INJECTIVE", {}),
+    ),
+    "too few edges across": (
+        onto(disk(3), spiral(9, 1.5)),
+        ("LINK_DISTANCE", "INJECTIVE", {}),
+    ),
+    "mirrored": (
+        onto(disk(3), circle(18)[::-1]),
+        ("REVERSED", "INJECTIVE", {"loops": [0]}),
+    ),
+    "mirrored, with a hole": (
+        onto(RING, OUTER[::-1], HOLE[::-1]),
+        ("REVERSED", "INJECTIVE", {"loops": [0, 1]}),
+    ),
+    "figure of eight": (
+        onto(disk(3), np.stack([np.sin(2 * np.pi * np.arange(18) / 18 + 0.1), np.sin(4 * np.pi * np.arange(18) / 18 + 0.2)], axis=1)),
+        ("TURNING_NUMBER", "INJECTIVE", {"loops": [0]}),
+    ),
+    "negative pocket": (
+        onto(disk(3), [*spread([[0, 0], [8, 0], [8, 8], [5, 8]], 14), [3, 9], [3, 10], [5, 10], [4, 7]]),
+        ("NEGATIVE_WINDING", "INJECTIVE", {"loops": [0]}),
+    ),
+    "on a line": (
+        onto(disk(3), np.stack([np.cos(np.arange(18)), np.zeros(18)], axis=1)),
+        ("SIGNED_AREA", "INJECTIVE", {"loops": [0]}),
+    ),
+    "whisker": (
+        onto(disk(3), [*spread([[0, 0], [8, 0], [8, 8], [5, 8]], 15), [5, 9], [5, 8.5], [0, 8]]),
+        ("TURNING_NUMBER", "INJECTIVE", {"loops": [0]}),
+    ),
+    "handle": (
+        onto(handle(), circle(4)),
+        ("GENUS", "INJECTIVE", {}),
+    ),
+    "hole outside": (
+        onto(RING, OUTER, HOLE + [9, 0]),
+        ("NESTING", "INJECTIVE", {"loops": [1]}),
+    ),
+    "two outer loops": (
+        onto(RING, OUTER, HOLE[::-1] + [9, 0]),
+        ("NESTING", "INJECTIVE", {"loops": [0, 1]}),
+    ),
+    "hole wound as an island": (
+        onto(RING, OUTER, HOLE[::-1]),
+        ("NESTING", "UNBRANCHED", {"loops": [1]}),
+    ),
+    "wound twice": (
+        onto(disk(3), circle(18, turns=2) * (2 + np.cos(2 * np.pi * np.arange(18) / 18))[:, None]),
+        ("TURNING_NUMBER", "UNBRANCHED", {"loops": [0]}),
+    ),
+    "band over itself": (
+        onto(grid(12, 2), np.concatenate([circle(13, 2, 13 / 11)[:13], [[0, 0]] * 0])) if False else None,
+        None,
+    ),
+}

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Problem, certify
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import campaign
+import problems
+
+FEASIBLE = ["noise", "jam", "flow", "swirl", "pins", "spiral", "comb", "maze", "limbs", "carved"]
+
+
+@pytest.mark.parametrize("family", problems.FAMILIES)
+@pytest.mark.parametrize("difficulty", [0.0, 0.55, 1.0])
+def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, difficulty):
+    case = problems.make(family, 3, difficulty, triangles=150)
+    problem = Problem(case.V, case.F, case.fixed, case.target)
+    assert 20 <= len(case.F) <= 700
+    assert 1 <= len(problem.loops) <= 4
+    assert case.feasible == (family in FEASIBLE)
+    if case.V.shape[1] == 2:
+        assert certify(case.F, case.V).injective
+    if case.feasible:
+        certificate = certify(case.F, case.hidden)
+        assert certificate.injective
+        assert certificate.bijective == case.simple
+        np.testing.assert_array_equal(case.hidden[case.fixed], case.target)
+
+
+@pytest.mark.parametrize("family", problems.FAMILIES)
+def test_a_name_is_all_that_goes_into_a_problem(family):
+    first = problems.make(family, 5, 0.7, triangles=100)
+    again = problems.make(*problems.parse(first.name), triangles=100)
+    for one, other in zip(first[:4], again[:4], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(first.target, problems.make(family, 6, 0.7, triangles=100).target)
+
+
+def test_pins_lie_inside():
+    case = problems.make("pins", 1, 0.5, triangles=200)
+    assert Problem(case.V, case.F, case.fixed, case.target).pins.size > 0
+
+
+def test_rest_meshes_come_with_slivers_and_wild_areas():
+    ratios, angles = [], []
+    for seed in range(30):
+        case = problems.make("flow", seed, 1.0, triangles=60)
+        V = np.column_stack([case.V, np.zeros((len(case.V), 3 - case.V.shape[1]))])
+        a, b, c = V[case.F].transpose(1, 0, 2)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        longest = np.max([((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+        ratios.append(area.max() / area.min())
+        angles.append((area / longest).min())
+    assert max(ratios) > 1e9
+    assert min(angles) < 1e-5
+
+
+def test_unknown_families_are_refused():
+    with pytest.raises(ValueError, match="no family 'mace'"):
+        problems.parse("mace:1:0.5")
+
+
+def test_names_cover_all_families_and_difficulties():
+    names = [problems.parse(name) for name in campaign.names(1600, list(problems.FAMILIES))]
+    assert len(set(names)) == 1600
+    for family in problems.FAMILIES:
+        hard = np.array([difficulty for f, _, difficulty in names if f == family])
+        counts = np.histogram(hard, bins=5, range=(0, 1))[0]
+        assert counts.min() >= 18
+
+
+def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
+    output = tmp_path / "results.jsonl"
+    todo = list(campaign.names(3, ["swirl", "limbs", "comb"]))
+    started = campaign.campaign(todo, output, limit=60)
+    first = next(started)
+    started.close()
+    assert first["name"] == todo[0]
+    # A kill in the middle of a line.
+    with output.open("a") as file:
+        file.write('{"name": "comb:0')
+    rest = list(campaign.campaign(todo, output, limit=60))
+    assert [record["name"] for record in rest] == todo[1:]
+    assert [record["name"] for record in campaign.read(output)] == todo
+    assert list(campaign.campaign(todo, output)) == []
+
+    campaign.main(["--summary", str(output)])
+    text = capsys.readouterr().out
+    assert "limbs" in text
+    assert "among 3 problems" in text
+
+
+def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch):
+    start = campaign._Worker._start
+
+    def impatient(worker):
+        start(worker)
+        worker.spare = -60.0
+
+    monkeypatch.setattr(campaign._Worker, "_start", impatient)
+    [record] = campaign.campaign(["swirl:0:0.5"], tmp_path / "results.jsonl", limit=1)
+    assert record["outcome"] == "timeout"
+    assert campaign.failed(record)
+
+
+@pytest.mark.parametrize(
+    ("trouble", "outcome"),
+    [("raise KeyError('lost')", "exception"), ("__import__('warnings').warn('hm')", "warning")],
+)
+def test_what_goes_wrong_is_recorded(monkeypatch, trouble, outcome):
+    solve = campaign.solve
+
+    def troubled(*args, **options):
+        exec(trouble)
+        return solve(*args, **options)
+
+    monkeypatch.setattr(campaign, "solve", troubled)
+    record = campaign.run("swirl:0:0.1")
+    assert record["outcome"] == outcome
+    assert campaign.failed(record)
+    assert "--case swirl:0:0.1" in campaign.summary([record])
+    json.dumps(record, allow_nan=False)
+
+
+def test_without_a_known_solution_no_map_is_no_failure():
+    assert not campaign.failed({"outcome": "not injective", "feasible": False})
+    assert campaign.failed({"outcome": "not injective", "feasible": True})

@@ -1,0 +1,200 @@
+"""Energies on a mesh and their second derivatives in vertex positions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshes import bend, boundary_of, lift, surfaces
+from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
+from quasiharmonic.derivatives import derivative_error
+from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.measures import distortion
+from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.springs import MassSpring
+from quasiharmonic.surfaces import grid, random_delaunay
+
+
+def name_of(energy):
+    return type(energy).__name__
+
+
+def as_complex(uv):
+    return uv[:, 0] + 1j * uv[:, 1]
+
+
+def bowl(n=60):
+    V, F = random_delaunay(n, seed=5)
+    return lift(V), F, as_complex(bend(V))
+
+
+@pytest.mark.parametrize(
+    "energy", [MIPS(), SymmetricDirichlet(), ARAP(), AreaPreserving()], ids=lambda e: type(e).__name__
+)
+def test_gradient_by_positions(energy):
+    V, F, w = bowl()
+    E = DeformationEnergy(V, F, energy, area=3.0)
+    assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6
+
+
+def test_gradient_of_springs():
+    V, F, w = bowl()
+    E = DeformationEnergy(V, F, MassSpring(V, F))
+    assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "V", "F"), surfaces())
+def test_the_mean_is_that_of_the_measures(name, V, F):
+    uv = bend(V[:, :2])
+    found = distortion(V, F, uv)
+    w = as_complex(uv)
+    area = float(signed_areas(F, w).sum())
+    for energy, measure in ((MIPS(), "mips"), (SymmetricDirichlet(), "symmetric_dirichlet"), (ARAP(), "arap")):
+        assert DeformationEnergy(V, F, energy, area=area).value(w) == pytest.approx(
+            found.summary(measure).mean, rel=1e-12
+        )
+
+
+def test_scale_of_map_and_surface_do_not_matter_when_normalised():
+    V, F, w = bowl()
+    area = float(signed_areas(F, w).sum())
+    values = [
+        DeformationEnergy(a * V, F, SymmetricDirichlet(), area=b**2 * area).value(b * w)
+        for a, b in ((1, 1), (1e5, 1), (1, 1e-6), (1e150, 1e-120), (1e-170, 1e140))
+    ]
+    assert values == pytest.approx([values[0]] * 5, rel=1e-12)
+
+
+def test_without_an_area_maps_are_measured_as_they_are():
+    V, F = grid(3, 3)
+    w = as_complex(V)
+    E = DeformationEnergy(100 * V, F, AreaPreserving())
+    assert E.value(100 * w) == pytest.approx(0, abs=1e-20)
+    assert E.value(200 * w) == pytest.approx(9)
+
+
+def test_weights(rng):
+    V, F, w = bowl()
+    weights = rng.random(len(F))
+    E = DeformationEnergy(V, F, MIPS(), weights=weights)
+    found = distortion(V, F, np.stack([w.real, w.imag], axis=1))
+    assert E.value(w) == pytest.approx(np.sum(weights * found.share * found.mips))
+    assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6
+
+
+def test_a_clockwise_planar_mesh_is_a_surface_seen_from_behind():
+    V, F = grid(4, 4)
+    mirrored = V * [-1, 1]
+    assert DeformationEnergy(mirrored, F, ARAP()).value(as_complex(V)) == pytest.approx(0, abs=1e-20)
+
+
+def test_inverted_triangles():
+    V, F, w = bowl()
+    mirrored = np.conj(w)
+    assert DeformationEnergy(V, F, MIPS()).value(mirrored) == np.inf
+    assert np.isfinite(DeformationEnergy(V, F, ARAP()).value(mirrored))
+
+
+def test_malformed_input():
+    V, F = grid(2, 2)
+    flat = V.copy()
+    flat[:, 1] = 0
+    with pytest.raises(ValueError, match=r"triangles 0, 1, 2, 3, 4, … \(8 in all\) of zero area in the rest mesh"):
+        DeformationEnergy(flat, F, MIPS())
+    for area in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="area of the map must be positive"):
+            DeformationEnergy(V, F, MIPS(), area=area)
+    with pytest.raises(ValueError, match=r"weights must have shape \(8,\)"):
+        DeformationEnergy(V, F, MIPS(), weights=np.ones(3))
+    with pytest.raises(ValueError, match="negative or not finite at triangle 2"):
+        DeformationEnergy(V, F, MIPS(), weights=[1, 1, -1, 1, 1, 1, 1, 1])
+    with pytest.raises(ValueError, match="V must have shape"):
+        DeformationEnergy(V[:, :1], F, MIPS())
+
+
+def test_steps_to_collapse_are_the_first_zeros_of_the_areas(rng):
+    V, F, w = bowl(200)
+    E = DeformationEnergy(V, F, MIPS())
+    # Steps of very different sizes, so that all branches of the formula occur.
+    step = (rng.standard_normal(w.size) + 1j * rng.standard_normal(w.size)) * 10.0 ** rng.integers(-9, 2, w.size)
+    found = E.steps_to_collapse(w, step)
+    for t, face in zip(found, F, strict=True):
+        (a, b, c), (da, db, dc) = w[face], step[face]
+        d, e, dd, de = b - a, c - a, db - da, dc - da
+        cross = lambda x, y: (np.conj(x) * y).imag  # noqa: E731
+        roots = np.roots([cross(dd, de), cross(d, de) + cross(dd, e), cross(d, e)])
+        ahead = [r.real for r in roots if abs(r.imag) < 1e-12 * abs(r) and r.real > 0]
+        assert t == pytest.approx(min(ahead, default=np.inf), rel=1e-6)
+    assert np.isinf(found).any()
+    assert np.isfinite(found).any()
+
+
+def test_collapse_of_shapes_that_only_grow_or_stand_still():
+    V, F = grid(2, 2)
+    w = as_complex(V)
+    E = DeformationEnergy(V, F, MIPS())
+    assert np.all(np.isinf(E.steps_to_collapse(w, np.zeros_like(w))))
+    assert np.all(np.isinf(E.steps_to_collapse(w, w)))
+    np.testing.assert_allclose(E.steps_to_collapse(w, -w), 1, rtol=1e-7)
+
+
+@pytest.mark.parametrize("energy", [MIPS(), SymmetricDirichlet(), ARAP()], ids=name_of)
+def test_the_system_is_the_second_derivative(energy):
+    V, F, w = bowl()
+    fixed = boundary_of(F)
+    E = DeformationEnergy(V, F, energy, area=2.0)
+    system = NewtonSystem(F, E.g, len(V), fixed)
+    assert set(system.free) == set(range(len(V))) - set(fixed)
+    system.assemble(E.curvature_of(E.deform(w), negative=1.0))
+    H = system.matrix().toarray()
+    np.testing.assert_array_equal(H, H.T)
+
+    def gradient(x):
+        moved = w.copy()
+        moved[system.free] += x.view(np.complex128)
+        return E.gradient(moved)[system.free].view(np.float64)
+
+    # Differences relative to the size of the mesh, not of the displacement, which is zero.
+    h = 1e-6
+    differences = np.array([(gradient(h * e) - gradient(-h * e)) / (2 * h) for e in np.eye(2 * system.free.size)])
+    assert np.abs(differences - H).max() < 1e-6 * np.abs(H).max()
+
+
+def test_projected_systems_are_semidefinite_and_solved():
+    V, F, w = bowl()
+    E = DeformationEnergy(V, F, MIPS(), area=2.0)
+    system = NewtonSystem(F, E.g, len(V), boundary_of(F))
+    for negative in (0.0, -1.0):
+        system.assemble(E.curvature_of(E.deform(w), negative=negative))
+        H = system.matrix().toarray()
+        assert np.linalg.eigvalsh(H).min() > 0
+        load = E.gradient(w)[system.free]
+        for shift in (0.0, 1e-3):
+            system.factor(shift)
+            raised = H + shift * np.diag(np.diag(H))
+            np.testing.assert_allclose(raised @ system.solve(load).view(np.float64), load.view(np.float64), atol=1e-12)
+        np.testing.assert_allclose(system.solve_diagonal(load).view(np.float64), load.view(np.float64) / np.diag(H))
+
+
+def test_indefinite_and_empty_systems():
+    V, F, w = bowl()
+    E = DeformationEnergy(V, F, MIPS())
+    system = NewtonSystem(F, E.g, len(V), boundary_of(F))
+    form = E.curvature_of(E.deform(w)).scaled(np.full(len(F), -1.0))
+    system.assemble(form)
+    # Diagonal entries that are not positive are taken for vertices without curvature.
+    with pytest.raises(NotPositiveDefinite):
+        system.factor()
+    nothing = np.zeros(len(F))
+    none = np.zeros(len(F), dtype=complex)
+    system.assemble(QuadraticForm(nothing, nothing, none, none, none, none))
+    system.factor()
+    load = E.gradient(w)[system.free]
+    np.testing.assert_array_equal(system.solve(load), load)
+    np.testing.assert_array_equal(system.solve_diagonal(load), load)
+
+    rigid = NewtonSystem(F, E.g, len(V), np.arange(len(V)))
+    rigid.assemble(form)
+    rigid.factor()
+    assert rigid.solve(load[:0]).size == 0

@@ -1,0 +1,311 @@
+"""Polish: less distortion, injective at every step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshes import bend, boundary_of, lift
+from quasiharmonic import polishing
+from quasiharmonic.certificate import is_injective
+from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, conformal_area_blend
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.measures import distortion
+from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.polishing import ENERGIES, polish, polish_map
+from quasiharmonic.problem import Problem
+from quasiharmonic.result import Status
+from quasiharmonic.springs import MassSpring
+from quasiharmonic.surfaces import annulus, disk, random_delaunay
+
+
+def twisted(V, turns=0.2):
+    """Turn points by an angle that falls to zero on the unit circle."""
+    angle = 2 * np.pi * turns * (1 - V[:, 0] ** 2 - V[:, 1] ** 2)
+    z = (V[:, 0] + 1j * V[:, 1]) * np.exp(1j * angle)
+    return np.stack([z.real, z.imag], axis=1)
+
+
+def shrunken(rings=12, power=8):
+    """A disk drawn together at its centre: the inmost triangles have rings^(2 - 2 power) of their area."""
+    V, F = disk(rings)
+    return V, F, V * np.linalg.norm(V, axis=1, keepdims=True) ** (power - 1)
+
+
+def bowl():
+    V, F = random_delaunay(150, seed=3)
+    return lift(V), F, twisted(V), boundary_of(F)
+
+
+def energies_of(result):
+    return np.array([step.energy for step in result.history])
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_falls_at_every_step_and_converges(energy):
+    V, F, uv, fixed = bowl()
+    result = polish(V, F, uv, fixed=fixed, energy=energy, tolerance=1e-8)
+    assert result.status is Status.POLISHED
+    assert result.injective
+    assert is_injective(F, result.uv)
+    assert np.all(np.diff(energies_of(result)) < 0)
+    np.testing.assert_array_equal(result.uv[fixed], uv[fixed])
+    # A local minimum: nothing near it is better, up to what was left to gain.
+    rng = np.random.default_rng(0)
+    free = np.setdiff1d(np.arange(len(V)), fixed)
+    for size in (1e-3, 1e-2):
+        moved = result.uv.copy()
+        moved[free] += size * rng.standard_normal((free.size, 2)) * 0.05
+        there = polish(V, F, moved, fixed=fixed, energy=energy, max_iterations=0)
+        assert there.history[0].energy > result.history[-1].energy * (1 - 1e-6)
+
+
+def test_energies_are_means_of_the_measures():
+    V, F, uv, fixed = bowl()
+    for energy in ("mips", "symmetric-dirichlet"):
+        result = polish(V, F, uv, fixed=fixed, energy=energy)
+        name = energy.replace("-", "_")
+        assert result.history[0].energy == pytest.approx(distortion(V, F, uv).summary(name).mean)
+        assert result.history[-1].energy == pytest.approx(distortion(V, F, result.uv).summary(name).mean)
+        (stage,) = result.stages
+        assert stage.energy == (result.history[0].energy, result.history[-1].energy)
+        assert stage.iterations == len(result.history) - 1
+        assert stage.name == f"polish, {energy}"
+
+
+def test_every_map_on_the_way_is_injective():
+    V, F, uv = shrunken()
+    fixed = boundary_of(F)
+    for steps in range(6):
+        result = polish(V, F, uv, fixed=fixed, max_iterations=steps)
+        assert is_injective(F, result.uv)
+        assert len(result.history) == steps + 1
+        assert result.status is Status.STILL_FALLING
+        np.testing.assert_array_equal(result.uv[fixed], uv[fixed])
+
+
+@pytest.mark.parametrize("energy", ["symmetric-dirichlet", "blend", "arap"])
+def test_triangles_of_almost_no_area_recover(energy):
+    V, F, uv = shrunken()
+    assert distortion(V, F, uv).area_ratio.min() < 1e-14
+    result = polish(V, F, uv, fixed=boundary_of(F), energy=energy, tolerance=1e-10)
+    assert result.status is Status.POLISHED
+    np.testing.assert_allclose(result.uv, V, atol=1e-6)
+
+
+def test_thin_as_a_thread():
+    # Rows at heights 1e-0 … 1e-11: images of 1e-24 of the area next to those of order one.
+    V, F, uv = shrunken(rings=12, power=12)
+    assert distortion(V, F, uv).area_ratio.min() < 1e-22
+    result = polish(V, F, uv, fixed=boundary_of(F), energy="mips")
+    assert result.injective
+    assert result.history[-1].energy < 0.01 * result.history[0].energy
+
+
+def test_a_perfect_map_stays():
+    V, F = random_delaunay(60)
+    for energy in ENERGIES:
+        result = polish(V, F, 3 * V, fixed=boundary_of(F), energy=energy)
+        assert result.status is Status.POLISHED
+        np.testing.assert_allclose(result.uv, 3 * V, atol=1e-12)
+
+
+def test_pins_and_inner_loops_stay():
+    V, F = annulus(12)
+    pin = int(np.argmin(np.linalg.norm(V - [0.75, 0.1], axis=1)))
+    uv = bend(V)
+    fixed = np.append(boundary_of(F), pin)
+    result = polish(V, F, uv, fixed=fixed[::-1])
+    assert result.status is Status.POLISHED
+    np.testing.assert_array_equal(result.uv[fixed], uv[fixed])
+    free = polish(V, F, uv, fixed=fixed[:-1])
+    assert not np.array_equal(free.uv[pin], uv[pin])
+    assert free.history[-1].energy < result.history[-1].energy
+
+
+def test_nothing_to_move():
+    V, F = disk(1)
+    result = polish(V, F, V, fixed=np.arange(len(V)))
+    assert result.status is Status.POLISHED
+    np.testing.assert_array_equal(result.uv, V)
+
+
+@pytest.mark.parametrize("power", [-600, 0, 600])
+def test_scales_of_map_and_surface_change_nothing(power):
+    V, F, uv, fixed = bowl()
+    expected = polish(V, F, uv, fixed=fixed, max_iterations=4)
+    found = polish(np.ldexp(V, -power), F, np.ldexp(uv, power), fixed=fixed, max_iterations=4)
+    np.testing.assert_array_equal(np.ldexp(found.uv, -power), expected.uv)
+
+
+def test_a_turn_and_an_offset_change_next_to_nothing():
+    V, F, uv, fixed = bowl()
+    turn = np.array([[0.6, 0.8], [-0.8, 0.6]])
+    expected = polish(V, F, uv, fixed=fixed, tolerance=1e-10)
+    found = polish(V[:, [1, 2, 0]], F, uv @ turn + [1000, -500], fixed=fixed, tolerance=1e-10)
+    assert found.status is Status.POLISHED
+    np.testing.assert_allclose(found.uv, expected.uv @ turn + [1000, -500], atol=1e-5)
+
+
+def test_is_deterministic_and_leaves_its_input_alone():
+    V, F, uv, fixed = bowl()
+    before = [x.copy() for x in (V, F, uv, fixed)]
+    for x in (V, F, uv, fixed):
+        x.flags.writeable = False
+    first, second = (polish(V, F, uv, fixed=fixed) for _ in range(2))
+    np.testing.assert_array_equal(first.uv, second.uv)
+    assert energies_of(first).tolist() == energies_of(second).tolist()
+    for x, y in zip((V, F, uv, fixed), before, strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert not np.shares_memory(first.uv, uv)
+
+
+def test_weights_shift_the_distortion():
+    V, F, uv, fixed = bowl()
+    left = V[F].mean(axis=1)[:, 0] < 0
+    plain = polish(V, F, uv, fixed=fixed)
+    weighted = polish(V, F, uv, fixed=fixed, weights=np.where(left, 100.0, 1.0))
+
+    def on_the_left(result):
+        found = distortion(V, F, result.uv)
+        return np.sum((found.share * found.symmetric_dirichlet)[left])
+
+    assert weighted.injective
+    assert on_the_left(weighted) < on_the_left(plain)
+
+
+def test_an_energy_of_ones_own():
+    V, F, uv, fixed = bowl()
+    by_name = polish(V, F, uv, fixed=fixed, energy="blend")
+    by_hand = polish(V, F, uv, fixed=fixed, energy=conformal_area_blend(1 / 128))
+    np.testing.assert_array_equal(by_hand.uv, by_name.uv)
+    assert by_hand.stages[0].name == "polish, Combination"
+    areas = polish(V, F, uv, fixed=fixed, energy=conformal_area_blend(1.0), max_iterations=200)
+    assert distortion(V, F, areas.uv).area_ratio.std() < 0.5 * distortion(V, F, uv).area_ratio.std()
+
+
+def test_for_a_problem_at_hand():
+    V, F, uv, fixed = bowl()
+    expected = polish(V, F, uv, fixed=fixed, energy="mips")
+    found = polish_map(Problem(V, F, fixed, np.zeros((fixed.size, 2))), uv, energy="mips")
+    np.testing.assert_array_equal(found.uv, expected.uv)
+
+
+@pytest.mark.parametrize("linear_solver", ["superlu", "qdldl"])
+def test_other_linear_solvers(linear_solver):
+    V, F, uv, fixed = bowl()
+    expected = polish(V, F, uv, fixed=fixed, tolerance=1e-9)
+    found = polish(V, F, uv, fixed=fixed, tolerance=1e-9, linear_solver=linear_solver)
+    assert found.linear_solver == linear_solver
+    np.testing.assert_allclose(found.uv, expected.uv, atol=1e-6)
+
+
+def test_steps_are_reported_as_they_happen():
+    V, F, uv, fixed = bowl()
+    seen = []
+    result = polish(V, F, uv, fixed=fixed, callback=seen.append)
+    assert seen == result.history
+    assert [step.iteration for step in seen] == list(range(len(seen)))
+    assert {step.flipped for step in seen} == {0}
+
+
+def test_interruption_keeps_the_best_map():
+    V, F, uv, fixed = bowl()
+
+    def interrupt(step):
+        if step.iteration == 2:
+            raise KeyboardInterrupt
+
+    result = polish(V, F, uv, fixed=fixed, callback=interrupt)
+    expected = polish(V, F, uv, fixed=fixed, max_iterations=2)
+    assert result.status is Status.INTERRUPTED
+    np.testing.assert_array_equal(result.uv, expected.uv)
+    assert result.injective
+
+
+def test_what_the_exact_test_refuses_is_not_taken(monkeypatch):
+    V, F, uv, fixed = bowl()
+    full = polish(V, F, uv, fixed=fixed, max_iterations=1)
+    asked = []
+
+    def strict(F, uv):
+        asked.append(uv)
+        return len(asked) == 3
+
+    monkeypatch.setattr(polishing, "is_injective", strict)
+    result = polish(V, F, uv, fixed=fixed, max_iterations=1)
+    # Refused twice, halved twice.
+    np.testing.assert_allclose(result.uv - uv, (asked[0] - uv) / 4, atol=1e-14)
+    np.testing.assert_array_equal(result.uv, asked[2])
+    assert np.abs(full.uv - uv).max() >= np.abs(asked[0] - uv).max()
+    monkeypatch.setattr(polishing, "is_injective", lambda F, uv: False)
+    result = polish(V, F, uv, fixed=fixed)
+    assert result.status is Status.EXHAUSTED
+    np.testing.assert_array_equal(result.uv, uv)
+
+
+def test_without_factorisations_it_still_descends(monkeypatch):
+    V, F, uv, fixed = bowl()
+    shifts = []
+
+    def refuse(self, shift=0.0):
+        shifts.append(shift)
+        if shift < 1e-7:
+            raise NotPositiveDefinite("refused")
+        return factor(self, shift)
+
+    factor = NewtonSystem.factor
+    monkeypatch.setattr(NewtonSystem, "factor", refuse)
+    raised = polish(V, F, uv, fixed=fixed)
+    assert raised.status is Status.POLISHED
+    assert shifts[:4] == [1e-15, 1e-12, 1e-9, 1e-6]
+
+    def never(self, shift=0.0):
+        raise NotPositiveDefinite("refused")
+
+    monkeypatch.setattr(NewtonSystem, "factor", never)
+    result = polish(V, F, uv, fixed=fixed, max_iterations=5)
+    assert result.injective
+    assert np.all(np.diff(energies_of(result)) < 0)
+
+
+def test_starts_that_are_not_injective():
+    V, F, uv, fixed = bowl()
+    moved = uv.copy()
+    inner = int(np.setdiff1d(np.arange(len(V)), fixed)[0])
+    moved[inner] = 5, 5
+    with pytest.raises(ValueError, match=r"uv is not injective: triangles \d+, .* inverted or without area"):
+        polish(V, F, moved, fixed=fixed)
+    moved[inner] = np.nan, 0
+    with pytest.raises(ValueError, match="uv is not finite at vertex"):
+        polish(V, F, moved, fixed=fixed)
+
+
+def test_malformed_input():
+    V, F, uv, fixed = bowl()
+    flat = V.copy()
+    flat[F[7]] = flat[F[7, 0]]
+    with pytest.raises(ValueError, match="of zero area in the rest mesh"):
+        polish(flat, F, uv, fixed=fixed)
+    with pytest.raises(ValueError, match=r"boundary vertex .* not in fixed"):
+        polish(V, F, uv, fixed=fixed[1:])
+    with pytest.raises(ValueError, match="fixed refers to vertex"):
+        polish(V, F, uv, fixed=np.append(fixed, len(V)))
+    with pytest.raises(ValueError, match=r"uv must have shape \(150, 2\)"):
+        polish(V, F, uv[:-1], fixed=fixed)
+    with pytest.raises(ValueError, match="energy must be one of symmetric-dirichlet, mips"):
+        polish(V, F, uv, fixed=fixed, energy="beauty")
+    for energy in (ARAP(), AreaPreserving(), MassSpring(V, F)):
+        with pytest.raises(ValueError, match=f"{type(energy).__name__} is no barrier"):
+            polish(V, F, uv, fixed=fixed, energy=energy)
+    weights = np.ones(len(F))
+    weights[3] = 0
+    with pytest.raises(ValueError, match="weight is not positive at triangle 3"):
+        polish(V, F, uv, fixed=fixed, weights=weights)
+    with pytest.raises(ValueError, match="weights must have shape"):
+        polish(V, F, uv, fixed=fixed, weights=weights[4:])
+
+
+def test_barriers_may_come_as_objects():
+    V, F, uv, fixed = bowl()
+    assert polish(V, F, uv, fixed=fixed, energy=MIPS()).status is Status.POLISHED
