@@ -142,7 +142,8 @@ class Certificate:
         """Say in a sentence or two what is certified, or what is wrong and where."""
         further = [r.text for r in self.reasons if r.kind is not Obstacle.NOT_INJECTIVE]
         if self.injective:
-            said = f"Injective: all {self.triangles} triangles are positive."
+            all_of_them = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
+            said = f"Injective: {all_of_them} positive."
         elif self.triangles:
             counted = _counted(self.flipped, self.degenerate, self.nonfinite)
             said = f"Not injective: of {self.triangles} triangles, {counted}."

@@ -128,7 +128,8 @@ def stages_of(strategy: str | Sequence[Descent], problem: Problem) -> Sequence[D
         if strategy not in STRATEGIES:
             raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
         return STRATEGIES[strategy](problem)
-    stages = list(strategy) if isinstance(strategy, Sequence) else []
-    if not stages or not all(isinstance(stage, Descent) for stage in stages):
+    given = list(strategy) if isinstance(strategy, Sequence) else []
+    stages = [stage for stage in given if isinstance(stage, Descent)]
+    if not stages or len(stages) < len(given):
         raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
     return stages
