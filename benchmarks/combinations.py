@@ -1,6 +1,6 @@
 """Every functional, parameterisation and first-order optimiser on every problem folder (§7.3, §8, §9).
 
-    python benchmarks/combinations.py FOLDER [FOLDER …] [-n ITERATIONS] [-o TABLE.csv]
+    python benchmarks/combinations.py FOLDER [FOLDER …] [-n ITERATIONS] [--newton STEPS] [-o TABLE.csv]
 
 A folder is a problem (``input.obj`` + ``handles.txt``) or holds problems at any depth. Each combination runs alone
 from ξ = 0, on the rest mesh's corrected triangles for si-log and on equilateral ones for tanh, until the first
@@ -30,6 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("-n", "--iterations", type=int, default=300)
+    parser.add_argument("--newton", type=int, default=0, help="Newton steps on V₃ for what flips are left after that")
     parser.add_argument("-o", "--output", type=argparse.FileType("w"), default=sys.stdout)
     options = parser.parse_args()
     table = csv.writer(options.output)
@@ -42,7 +43,12 @@ def main() -> None:
         for functional, parameterization, optimizer in itertools.product(FUNCTIONALS, PARAMETERIZATIONS, OPTIMIZERS):
             reference = "equilateral" if parameterization == "tanh" else "corrected"
             stage = Descent(optimizer, parameterization, functional, reference, options.iterations)
-            result = solve(problem, strategy=[stage])
+            stages = [stage]
+            if options.newton:
+                stages.append(
+                    Descent("newton", parameterization, reference=reference, iterations=options.newton, resume=True)
+                )
+            result = solve(problem, strategy=stages)
             flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
             mips = distortion(problem.V, problem.F, result.uv).mips if result.injective else np.nan
             row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterization, optimizer]

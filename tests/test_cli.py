@@ -248,6 +248,32 @@ class TestReportFails:
         assert (tmp_path / "p.png").exists()
 
 
+class TestPolish:
+    def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):
+        first, polished = tmp_path / "first.obj", tmp_path / "polished.obj"
+        assert run("map", star, "-o", first) == 0
+        assert run("polish", first, "-o", polished, "--energy", "mips", "--json", tmp_path / "r.json") == 0
+        facts = json.loads((tmp_path / "r.json").read_text())
+        assert facts["distortion"]["mips"]["mean"] < facts["distortion_before"]["mips"]["mean"]
+        assert run("check", polished) == 0
+        both = tmp_path / "both.obj"
+        assert run("map", star, "-o", both, "--polish", "mips") == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(both)), io.map_of(io.read_mesh(polished)))
+
+    def test_refuses_a_map_with_flips(self, star, tmp_path, capsys):
+        assert run("polish", star, "-o", tmp_path / "o.obj") == 2
+        assert "injective" in capsys.readouterr().err
+        assert not (tmp_path / "o.obj").exists()
+
+    def test_names_are_those_of_the_library(self):
+        from quasiharmonic import linsolve
+        from quasiharmonic.cli import arguments
+        from quasiharmonic.polishing import ENERGIES
+
+        assert set(arguments.ENERGIES) == set(ENERGIES)
+        assert set(arguments.LINEAR_SOLVERS) - {"auto"} == set(linsolve._BACKENDS)
+
+
 class TestCheck:
     def test_statuses(self, star, tmp_path, capsys):
         assert run("check", star) == 1

@@ -8,6 +8,7 @@ import pytest
 from meshes import bend, boundary_of, lift
 from quasiharmonic import polishing
 from quasiharmonic.certificate import is_injective
+from quasiharmonic.deformation_energy import signed_areas
 from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, conformal_area_blend
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.measures import distortion
@@ -100,6 +101,20 @@ def test_thin_as_a_thread():
     result = polish(V, F, uv, fixed=boundary_of(F), energy="mips")
     assert result.injective
     assert result.history[-1].energy < 0.01 * result.history[0].energy
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_an_area_lost_in_rounding(energy):
+    # The last triangle's area is ε²/2, which is 0 in floating point and positive exactly.
+    e = 2.0**-52
+    uv = np.array([[0, 0], [2, 0], [1 + e, 1], [1, 1 - e]])
+    F = np.array([[0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    V = np.array([[0, 0], [2, 0], [1, 2], [1, 0.7]])
+    assert signed_areas(F, uv.view(complex).ravel())[2] == 0
+    assert is_injective(F, uv)
+    result = polish(V, F, uv, fixed=[0, 1, 2], energy=energy)
+    assert result.status is Status.POLISHED
+    assert distortion(V, F, result.uv).area_ratio.min() > 0.1
 
 
 def test_a_perfect_map_stays():

@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .certificate import Certificate, certify, flipped_triangles, is_injective
+    from .energies import Energy
     from .inject import injective_map, quasi_harmonic_map, solve
+    from .measures import Distortion, distortion
+    from .polishing import polish
     from .problem import Problem
     from .result import MapResult, Stage, Status, Step
     from .strategy import Descent
@@ -20,15 +23,19 @@ __version__ = "0.1.0"
 _HOME = {
     "Certificate": "certificate",
     "Descent": "strategy",
+    "Distortion": "measures",
+    "Energy": "energies",
     "MapResult": "result",
     "Problem": "problem",
     "Stage": "result",
     "Status": "result",
     "Step": "result",
     "certify": "certificate",
+    "distortion": "measures",
     "flipped_triangles": "certificate",
     "injective_map": "inject",
     "is_injective": "certificate",
+    "polish": "polishing",
     "quasi_harmonic_map": "inject",
     "solve": "inject",
 }
@@ -36,15 +43,19 @@ _HOME = {
 __all__ = [
     "Certificate",
     "Descent",
+    "Distortion",
+    "Energy",
     "MapResult",
     "Problem",
     "Stage",
     "Status",
     "Step",
     "certify",
+    "distortion",
     "flipped_triangles",
     "injective_map",
     "is_injective",
+    "polish",
     "quasi_harmonic_map",
     "solve",
 ]

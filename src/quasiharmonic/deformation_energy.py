@@ -130,7 +130,8 @@ class DeformationEnergy:
         Returns
         -------
         (f,) float64
-            Positive, ``inf`` where it never does. Exact up to the rounding of the areas.
+            Positive; ``inf`` where it never does, and where the area of ``w`` itself is lost in rounding, so
+            that only the exact test can say.
         """
         d1, d2 = _edges(self._corners, w)
         e1, e2 = _edges(self._corners, direction)
@@ -144,7 +145,7 @@ class DeformationEnergy:
         first = np.full(c0.shape, np.inf)
         first[falls] = 2 * c0[falls] / (root - c1)[falls]
         first[rises] = (c1 + root)[rises] / (-2 * c2[rises])
-        return np.where(c0 > 0, first, 0.0)
+        return np.where(c0 > 0, first, np.inf)
 
 
 def signed_areas(F: NDArray[np.integer], w: ComplexArray) -> FloatArray:

@@ -19,7 +19,7 @@ energy              in singular values     φ, with D = det J = a − b         
 `ARAP`              Σ (σᵢ − 1)²            2 (√a − 1)² + 2b                                E₁, §11.1.1
 `AreaPreserving`    (σ₁σ₂ − 1)²            (D − 1)²                                        E₂, §11.1.2
 `AreaBarrier`       σ₁σ₂ + 1/(σ₁σ₂) − 2    (D − 1)²/D                                      E_a, §10.2
-`MassSpring`        lengths of the sides   not isotropic                                   E₃, §11.1.3
+`MassSpring`        lengths of the sides   not isotropic; in `quasiharmonic.springs`       E₃, §11.1.3
 ==================  =====================  ==============================================  ===========
 
 All are zero at isometries (MIPS at similarities) and nowhere negative. All but MIPS compare lengths, so
@@ -36,10 +36,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import boundary_edges, named
+from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -186,7 +183,7 @@ class Isotropic(Energy):
         aa, ab, bb = self.bends(d)
         turn_p, turn_q = 2 * slope_a, 2 * slope_b
         along_p, along_q = turn_p + 4 * d.a * aa, turn_q + 4 * d.b * bb
-        turn_p, turn_q = _damped(turn_p, negative), _damped(turn_q, negative)
+        turn_p, turn_q = damped(turn_p, negative), damped(turn_q, negative)
         along_p, kept, along_q = _filtered(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
         mixed = 4 * kept * ab
         # Where p or q vanishes its direction does not matter: along and across are alike.
@@ -195,14 +192,15 @@ class Isotropic(Energy):
         return QuadraticForm(
             pp=0.5 * (along_p + turn_p),
             qq=0.5 * (along_q + turn_q),
-            p2=0.5 * (along_p - turn_p) * _inverse(d.a) * to_p**2,
-            q2=0.5 * (along_q - turn_q) * _inverse(d.b) * to_q**2,
+            p2=0.5 * (along_p - turn_p) * inverse(d.a) * to_p**2,
+            q2=0.5 * (along_q - turn_q) * inverse(d.b) * to_q**2,
             pq=mixed * to_p * to_q,
             pqc=mixed * to_p * d.q,
         )
 
 
-def _damped(eigenvalue: FloatArray, negative: float) -> FloatArray:
+def damped(eigenvalue: FloatArray, negative: float) -> FloatArray:
+    """Eigenvalues with the negative ones multiplied by ``negative``."""
     return np.where(eigenvalue < 0, negative * eigenvalue, eigenvalue)
 
 
@@ -216,9 +214,9 @@ def _filtered(
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     radius = np.sqrt(half**2 + xy**2)
     # Eigenvalues mean ± radius, projectors ½ (1 ± K/radius) with K the traceless part.
-    upper, lower = _damped(mean + radius, negative), _damped(mean - radius, negative)
+    upper, lower = damped(mean + radius, negative), damped(mean - radius, negative)
     centre = 0.5 * (upper + lower)
-    kept = 0.5 * (upper - lower) * _inverse(radius)
+    kept = 0.5 * (upper - lower) * inverse(radius)
     return centre + kept * half, kept, centre - kept * half
 
 
@@ -279,12 +277,12 @@ class ARAP(Isotropic):
 
     def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 − 2/√a, 2``; at p = 0, where there is a kink, the pull to either side is left out."""
-        return 2 - 2 * _inverse(np.sqrt(d.a)), np.full(d.b.shape, 2.0)
+        return 2 - 2 * inverse(np.sqrt(d.a)), np.full(d.b.shape, 2.0)
 
     def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``a^(−3/2), 0, 0``."""
         zero = np.zeros(d.b.shape)
-        return _inverse(np.sqrt(d.a)) ** 3, zero, zero
+        return inverse(np.sqrt(d.a)) ** 3, zero, zero
 
 
 class AreaPreserving(Isotropic):
@@ -369,72 +367,6 @@ def conformal_area_blend(theta: float = 1 / 128) -> Combination:
     return Combination((1 - theta, MIPS()), (theta, AreaBarrier()))
 
 
-class MassSpring(Energy):
-    """Springs along the edges, ``Σ (l − l⁰)²`` over the edges of the mesh (E₃, §11.1.3).
-
-    A sum over edges, unlike the other energies: it depends on the triangulation, and zigzag folds cost it
-    nothing. Each triangle carries half of its interior edges and the whole of its boundary edges.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) array
-        Rest positions.
-    F : (f, 3) array of int
-        Triangles, in the order in which `Deformation` has them.
-
-    Raises
-    ------
-    ValueError
-        When rest triangles have no area.
-    """
-
-    def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
-        F = np.asarray(F, dtype=np.int64)
-        shapes = rest_shapes(V, F)
-        if shapes.flat.size:
-            raise ValueError(
-                f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
-                "springs are shared out by area"
-            )
-        self._sides, self._lengths = shapes.sides, np.abs(shapes.sides)
-        n = int(F.max()) + 1
-        boundary = boundary_edges(F, n)
-        single = np.isin(F.T * n + F.T[(1, 2, 0), :], boundary[:, 0] * n + boundary[:, 1])
-        self._stiffness = np.where(single, 1.0, 0.5) / shapes.m
-
-    def density(self, d: Deformation) -> FloatArray:
-        """``Σ (l − l⁰)²/m`` over the triangle's sides, with their shares."""
-        _, length = self._images(d)
-        return np.sum(self._stiffness * (length - self._lengths) ** 2, axis=0)
-
-    def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives by p and q; a side of no length has a kink and pulls nowhere."""
-        side, length = self._images(d)
-        pull = 2 * self._stiffness * (1 - self._lengths * _inverse(length)) * side
-        return np.sum(pull * self._sides.conj(), axis=0), np.sum(pull * self._sides, axis=0)
-
-    def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivative; what is negative is what a compressed spring has across itself."""
-        side, length = self._images(d)
-        along, across = 2 * self._stiffness, 2 * self._stiffness * (1 - self._lengths * _inverse(length))
-        across = _damped(across, negative)
-        # Of a side's change ds = dp z + dq z̄: along |ds|² of its part along the side, across |ds|² of the rest.
-        z, zz = self._sides, self._lengths**2
-        both, turn = 0.5 * (along + across), 0.5 * (along - across) * (np.conj(side) * _inverse(length)) ** 2
-        return QuadraticForm(
-            pp=np.sum(both * zz, axis=0),
-            qq=np.sum(both * zz, axis=0),
-            p2=np.sum(turn * z**2, axis=0),
-            q2=np.sum(turn * z.conj() ** 2, axis=0),
-            pq=np.sum(2 * turn * zz, axis=0),
-            pqc=np.sum(2 * both * z**2, axis=0),
-        )
-
-    def _images(self, d: Deformation) -> tuple[ComplexArray, FloatArray]:
-        side = d.p * self._sides + d.q * self._sides.conj()
-        return side, np.abs(side)
-
-
 def _positive(det: FloatArray) -> FloatArray:
     """The determinants, NaN where there is no barrier energy."""
     return np.where(det > 0, det, np.nan)
@@ -444,6 +376,6 @@ def _where_positive(det: FloatArray, value: FloatArray) -> FloatArray:
     return np.where(det > 0, value, np.inf)
 
 
-def _inverse(x: FloatArray) -> FloatArray:
+def inverse(x: FloatArray) -> FloatArray:
     """``1/x``, and 0 at 0."""
     return np.where(x > 0, 1 / np.where(x > 0, x, 1), 0.0)

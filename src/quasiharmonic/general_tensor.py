@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array, diags_array
 
 from quasiharmonic.mesh.operators import operators
-from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.mesh.topology import named
 from quasiharmonic.problem import Problem
 
@@ -237,7 +237,7 @@ def edge_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Refe
         When A has another shape or is not elliptic.
     """
     A = _elliptic(A, len(problem.F))
-    mesh, w = problem.mesh(problem.reference or reference), _complex(uv)
+    mesh, w = ReferenceMesh(problem.V, problem.F, problem.reference or reference), _complex(uv)
     tail, head = problem.F.T.ravel(), problem.F.T[(1, 2, 0), :].ravel()
     outer = np.flatnonzero(~np.isin(tail * problem.n + head, head * problem.n + tail))
     corner, triangle = np.divmod(outer, len(problem.F))

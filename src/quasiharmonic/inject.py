@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.certificate import certify, flipped_triangles
+from quasiharmonic.energies import Energy
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.objective import Iterate, Objective
@@ -24,6 +25,7 @@ from quasiharmonic.optimize.alternating import alternating, own_tensor
 from quasiharmonic.optimize.lbfgs import lbfgs
 from quasiharmonic.optimize.newton import newton
 from quasiharmonic.optimize.vector_adam import vector_adam
+from quasiharmonic.polishing import energy_named, polish_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.strategy import Descent, stages_of
@@ -45,6 +47,7 @@ def injective_map(
     *,
     reference: Reference | None = None,
     strategy: str | Sequence[Descent] = "speed",
+    polish: str | Energy | None = None,
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -66,8 +69,10 @@ def injective_map(
         Shape of the triangles in which gradients are taken (§9.3), whatever the strategy would choose.
     strategy : {"speed", "quality"} or sequence of Descent
         ``"speed"`` finds a map soonest; ``"quality"`` takes longer and keeps angles; or stages of one's own.
+    polish : str or Energy, optional
+        Once injective, lower this distortion energy; see `quasiharmonic.polish` for the names.
     max_iterations : int
-        Linear solves to spend at most.
+        Linear solves to spend at most on finding the map.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
@@ -107,6 +112,7 @@ def injective_map(
     return solve(
         problem,
         strategy=strategy,
+        polish=polish,
         max_iterations=max_iterations,
         linear_solver=linear_solver,
         callback=callback,
@@ -119,6 +125,7 @@ def solve(
     problem: Problem,
     *,
     strategy: str | Sequence[Descent] = "speed",
+    polish: str | Energy | None = None,
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -129,22 +136,32 @@ def solve(
     began = time.perf_counter() if _began is None else _began
     if not isinstance(max_iterations, Integral) or max_iterations < 1:
         raise ValueError(f"max_iterations must be a whole number of at least 1, not {max_iterations!r}")
+    lower = None if polish is None else energy_named(polish)
     search = _Search(problem, linear_solver, callback, max_iterations, record)
     status = search.run(stages_of(strategy, problem))
     uv = _positions(problem, search.best_map)
     certificate = certify(problem.F, uv)
-    return MapResult(
+    field = search.best_field
+    result = MapResult(
         uv=uv,
         status=Status.INJECTIVE if certificate.injective else status,
         certificate=certificate,
         stages=search.stages,
         history=search.history,
-        linear_solver=search.linear_solver,
-        seconds=time.perf_counter() - began,
-        mu=search.best_field.mu if search.best_field is not None else None,
-        reference=search.best_reference,
         path=search.path,
+        linear_solver=search.linear_solver,
+        mu=None if field is None else field.mu,
+        reference=search.best_reference,
     )
+    if lower is not None and result.injective:
+        polished = polish_map(problem, uv, energy=lower, linear_solver=search.linear_solver, callback=callback)
+        result = replace(
+            polished,
+            stages=result.stages + polished.stages,
+            history=result.history + polished.history,
+            path=result.path,
+        )
+    return replace(result, seconds=time.perf_counter() - began)
 
 
 def quasi_harmonic_map(

@@ -192,7 +192,8 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     Raises
     ------
     ValueError
-        When an array has the wrong shape, an index is out of range, or a coordinate is not finite.
+        When an array has the wrong shape, there are no triangles, an index is out of range, or a coordinate
+        is not finite.
 
     Examples
     --------
@@ -211,12 +212,14 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     F = np.asarray(F)
     if F.ndim != 2 or F.shape[1] != 3 or F.dtype.kind not in "iu":
         raise ValueError(f"F must be an integer array of shape (f, 3), not {F.dtype} of shape {F.shape}")
+    if not F.size:
+        raise ValueError("the mesh has no triangles")
     V, uv = np.asarray(V, dtype=np.float64), np.asarray(uv, dtype=np.float64)
     if V.ndim != 2 or V.shape[1] not in (2, 3):
         raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
     if uv.shape != (len(V), 2):
         raise ValueError(f"uv must have shape ({len(V)}, 2), a position for every vertex, not {uv.shape}")
-    if F.size and not (F.min() >= 0 and F.max() < len(V)):
+    if not (F.min() >= 0 and F.max() < len(V)):
         raise ValueError(f"F refers to vertices beyond the {len(V)} that there are")
     for name, array in (("V", V), ("uv", uv)):
         bad = np.flatnonzero(~np.isfinite(array).all(axis=1))

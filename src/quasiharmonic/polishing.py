@@ -51,7 +51,7 @@ ENERGIES: dict[str, Energy] = {
 _FRACTION = 0.9
 # Of the decrease that the gradient promises (Armijo's condition).
 _SUFFICIENT = 1e-4
-# The step is halved this often before the direction is given up.
+# The step is halved, and then doubled, this often before the direction is given up.
 _HALVINGS = 30
 # Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
 # by the first, and where triangles span many orders of magnitude they are as small as that.
@@ -71,7 +71,7 @@ def polish(
     fixed: ArrayLike,
     energy: str | Energy = "symmetric-dirichlet",
     weights: ArrayLike | None = None,
-    max_iterations: int = 100,
+    max_iterations: int = 200,
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -159,7 +159,7 @@ def polish_map(
     *,
     energy: str | Energy = "symmetric-dirichlet",
     weights: ArrayLike | None = None,
-    max_iterations: int = 100,
+    max_iterations: int = 200,
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -170,12 +170,14 @@ def polish_map(
     The problem's ``fixed`` vertices stay where they are in ``uv``; its ``target`` is not looked at.
     """
     began = time.perf_counter() if _began is None else _began
-    chosen = _energy(energy)
+    chosen = energy_named(energy)
     start = _start(problem, uv)
     if weights is not None and not np.all(np.asarray(weights) > 0):
         bad = np.flatnonzero(~(np.asarray(weights) > 0))
         raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
-    descent = _Descent(problem, start, chosen, weights, linear_solver)
+    # What leaves the numbers' range is met by comparisons: it is never below anything.
+    with np.errstate(all="ignore"):
+        descent = _Descent(problem, start, chosen, weights, linear_solver)
     history: list[Step] = []
 
     def report() -> None:
@@ -187,7 +189,6 @@ def polish_map(
     try:
         report()
         for _ in range(max_iterations):
-            # What leaves the numbers' range is met by comparisons: it is never below anything.
             with np.errstate(all="ignore"):
                 outcome = descent.step(tolerance)
             report()
@@ -219,7 +220,8 @@ def polish_map(
     )
 
 
-def _energy(energy: str | Energy) -> Energy:
+def energy_named(energy: str | Energy) -> Energy:
+    """Look an energy up by its name, and refuse what a polish cannot lower."""
     if isinstance(energy, str):
         if energy not in ENERGIES:
             raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}")
@@ -237,6 +239,9 @@ def _start(problem: Problem, uv: ArrayLike) -> FloatArray:
     start = np.array(uv, dtype=np.float64)
     if start.shape != (problem.n, 2):
         raise ValueError(f"uv must have shape ({problem.n}, 2), a position for every vertex, not {start.shape}")
+    broken = np.flatnonzero(~np.isfinite(start).all(axis=1))
+    if broken.size:
+        raise ValueError(f"uv is not finite at {named('vertex', 'vertices', broken)}")
     flipped = flipped_triangles(problem.F, start)
     if flipped.size:
         raise ValueError(
@@ -277,8 +282,8 @@ class _Descent:
         gradient = self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
         # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
-            direction, promise = self._direction(gradient, negative)
-            small = 0.5 * promise <= tolerance * (self.value + _NOTHING)
+            direction, promise, newton = self._direction(gradient, negative)
+            small = newton and 0.5 * promise <= tolerance * (self.value + _NOTHING)
             if small and negative < 0 and self._cut:
                 continue  # the reflected model is pessimistic: only the clamped one may declare an end
             before = self.value
@@ -290,8 +295,10 @@ class _Descent:
                 return Status.EXHAUSTED if self._idle >= _PATIENCE else None
         return Status.EXHAUSTED
 
-    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float]:
-        """Newton's direction and the rate at which the energy falls along it: the squared decrement."""
+    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
+        """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
+        or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
+        """
         self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
         for shift in _SHIFTS:
             try:
@@ -301,9 +308,9 @@ class _Descent:
                 continue
             promise = -_dot(gradient, direction)
             if promise >= 0:
-                return direction, promise
+                return direction, promise, True
         direction = self.system.solve_diagonal(-gradient)
-        return direction, -_dot(gradient, direction)
+        return direction, -_dot(gradient, direction), False
 
     def _search(self, direction: ComplexArray, promise: float) -> bool:
         """Move along a direction, as far as is good; False where no step lowers the energy enough."""
@@ -313,11 +320,13 @@ class _Descent:
         full[self.system.free] = direction
         limit = _FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
         start, before = self.w, self.value
-        t = min(1.0, limit)
-        for _ in range(_HALVINGS):
-            if self._accept(start + t * full, before - _SUFFICIENT * t * promise):
+        longest = min(1.0, limit)
+        halved = longest * 0.5 ** np.arange(_HALVINGS)
+        # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
+        doubled = 2.0 ** np.arange(1, _HALVINGS)
+        for t in (*halved, *doubled[doubled <= limit]):
+            if self._accept(start + t * full, before - _SUFFICIENT * min(t, 1.0) * promise):
                 break
-            t /= 2
         else:
             return False
         self._cut = t < 1

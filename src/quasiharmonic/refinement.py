@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .mesh.topology import edges as sort_edges
+from quasiharmonic.mesh.topology import edges as sort_edges
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -82,7 +82,8 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     Raises
     ------
     ValueError
-        When a pair is not an edge of the mesh, or is on its boundary and ``boundary`` is false.
+        When a pair is not an edge of the mesh, or is on its boundary and ``boundary`` is false; when
+        indices are no integers, have the wrong shape or refer to no vertex.
 
     Examples
     --------
@@ -92,9 +93,11 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     ([[4, 0, 1], [4, 2, 3], [4, 1, 2], [4, 3, 0]], [0, 1, 0, 1])
     """
     V = np.array(V, dtype=np.float64)
-    F = np.array(F, dtype=np.int64).reshape(-1, 3)
+    F = _indices("F", F, 3)
     n = len(V)
-    wanted = np.unique(np.sort(np.array(edges, dtype=np.int64).reshape(-1, 2), axis=1), axis=0)
+    if F.size and (F.min() < 0 or F.max() >= n):
+        raise ValueError(f"F refers to a vertex outside 0 … {n - 1}")
+    wanted = np.unique(np.sort(_indices("edges", edges, 2), axis=1), axis=0)
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
     _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
@@ -112,14 +115,14 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
 
 
 def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, IntArray]:
-    """Replace triangles by their parts; ``middle`` (f, 3) has the midpoints opposite to the corners.
+    r"""Replace triangles by their parts; ``middle`` (f, 3) has the midpoints opposite to the corners.
 
     Drawn with the midpoints p, q, r opposite to a, b, c:
 
             c                c                 c
-           /|\\              / \\               / \\
-          / | \\            q---p             q---p
-         /  |  \\          / `-. \\           / \\ / \\
+           /|\              / \               / \
+          / | \            q---p             q---p
+         /  |  \          / `-. \           / \ / \
         a---r---b        a-----`-b         a---r---b
     """
     count = (middle >= 0).sum(axis=1)
@@ -151,10 +154,16 @@ def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, 
 
 
 def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
-    """Distances of vertices; halved first and by `hypot`, so that none overflows."""
-    half = V[i] / 2 - V[j] / 2
-    lengths: FloatArray = np.hypot.reduce(half, axis=1)
+    """A quarter of the distances of vertices, which no coordinates make overflow."""
+    lengths: FloatArray = np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
     return lengths
+
+
+def _indices(name: str, values: ArrayLike, width: int) -> IntArray:
+    array = np.asarray(values)
+    if array.size and (array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != width):
+        raise ValueError(f"{name} must hold integers in shape (k, {width}), not {array.dtype} {array.shape}")
+    return np.array(array, dtype=np.int64).reshape(-1, width)
 
 
 def _refuse(wanted: IntArray, known: IntArray, n: int, why: str) -> None:

@@ -13,10 +13,10 @@ import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 
-from . import check, demo, map
+from . import check, demo, map, polish
 from .report import ReportError
 
-COMMANDS = (map, check, demo)
+COMMANDS = (map, polish, check, demo)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,10 +7,19 @@ from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
+# Those of quasiharmonic.polishing and quasiharmonic.linsolve, which are not imported to say them.
+ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap"
+LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "qdldl", "superlu"
+
 
 def add_report(parser: argparse.ArgumentParser) -> None:
     """``--json``."""
     parser.add_argument("--json", metavar="FILE", help="write the report as JSON; - for standard output")
+
+
+def add_linear_solver(parser: argparse._ActionsContainer) -> None:
+    """``--linear-solver``."""
+    parser.add_argument("--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the best present)")
 
 
 def count(text: str) -> int:

@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     V, F = surfaces.cat()
     (loop,) = boundary_loops(F, len(V))
     problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
-    result = map.search(problem, "speed", 2000, "auto")
+    result = map.search(problem, "speed", None, 2000, "auto")
     certificate = map.write(folder / "demo.obj", io.MeshData(V, F), result)
     with report.after_writing(folder / "demo.obj"):
         map.draw(folder / "demo.png", problem, result, certificate)

@@ -36,13 +36,16 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the rest surface, the start and the map")
     arguments.add_report(parser)
+    parser.add_argument(
+        "--polish", choices=arguments.ENERGIES, metavar="ENERGY", help="then lower distortion: %(choices)s"
+    )
     solver = parser.add_argument_group("how it is solved")
     solver.add_argument(
         "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
     )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
-    solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N")
-    solver.add_argument("--linear-solver", default="auto", choices=("auto", "pardiso", "cholmod", "qdldl", "superlu"))
+    solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    arguments.add_linear_solver(solver)
     parser.set_defaults(run=run)
 
 
@@ -61,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     with report.about(mesh_path):
         problem = Problem(*io.problem_arrays(mesh, fixed), reference=options.reference)
-    result = search(problem, options.strategy, options.max_iterations, options.linear_solver)
+    result = search(problem, options.strategy, options.polish, options.max_iterations, options.linear_solver)
     if result.status is Status.INTERRUPTED and not result.history:
         raise KeyboardInterrupt
     certificate = write(options.output, mesh, result)
@@ -80,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if certificate.injective else 1
 
 
-def search(problem: Problem, strategy: str, max_iterations: int, linear_solver: str) -> MapResult:
+def search(problem: Problem, strategy: str, polish: str | None, max_iterations: int, linear_solver: str) -> MapResult:
     """Solve with progress on the terminal."""
     from quasiharmonic.inject import solve
 
@@ -88,7 +91,12 @@ def search(problem: Problem, strategy: str, max_iterations: int, linear_solver: 
 
     with progress.line() as show:
         return solve(
-            problem, strategy=strategy, max_iterations=max_iterations, linear_solver=linear_solver, callback=show
+            problem,
+            strategy=strategy,
+            polish=polish,
+            max_iterations=max_iterations,
+            linear_solver=linear_solver,
+            callback=show,
         )
 
 

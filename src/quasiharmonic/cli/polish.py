@@ -1,0 +1,75 @@
+"""``qhm polish``: an injective map in a file → one of less distortion."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "polish",
+        help="lower the distortion of an injective map, which stays injective",
+        description="Lower the distortion of the injective map that the input's texture coordinates (vt) give.",
+        epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
+        "that is not injective included), nothing written.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with an injective map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
+    )
+    parser.add_argument(
+        "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=200, metavar="N", help="(default: 200)")
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, polish, write, judge, report."""
+    from quasiharmonic import io
+    from quasiharmonic.measures import distortion
+    from quasiharmonic.polishing import polish_map
+    from quasiharmonic.problem import Problem
+
+    from . import map, progress, report
+
+    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed))
+    mesh = io.read_mesh(options.input)
+    uv = io.map_of(mesh)
+    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
+    with report.about(options.input):
+        problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
+        with progress.line() as show:
+            result = polish_map(
+                problem,
+                uv,
+                energy=options.energy,
+                max_iterations=options.max_iterations,
+                linear_solver=options.linear_solver,
+                callback=show,
+            )
+    certificate = map.write(options.output, mesh, result)
+    with report.after_writing(options.output):
+        before, after = (distortion(problem.V, problem.F, w).to_dict() for w in (uv, result.uv))
+        facts = {
+            **result.to_dict(),
+            **report.verdict(certificate),
+            **report.sizes(problem),
+            "input": str(options.input),
+            "output": str(options.output),
+            "distortion_before": before,
+            "distortion": after,
+        }
+        report.emit(facts, options.json, f"{report.of_map(result, certificate, options.output)}\n{result.status.value}")
+    return 0 if certificate.injective else 1
