@@ -532,6 +532,7 @@ def test_pardiso_leaves_the_number_of_threads_alone():
         (-1, RuntimeError, "phase 22 with error -1: input inconsistent"),
         (-77, RuntimeError, "phase 22 with error -77: unknown error"),
         (-4, NotPositiveDefinite, "PARDISO met a pivot"),
+        (1, NotPositiveDefinite, "PARDISO met a pivot"),
     ],
 )
 def test_pardiso_errors(monkeypatch, code, kind, message):

@@ -120,7 +120,8 @@ class _Handle:
     def check(self, phase: int, b: Floats | None = None, x: Floats | None = None) -> None:
         """Run one phase and turn its error code into an exception."""
         code = self._call(phase, b, x)
-        if code in _NOT_POSITIVE_DEFINITE:
+        # Positive codes are not documented; seen where a pivot came out negative.
+        if code in _NOT_POSITIVE_DEFINITE or (code > 0 and phase == _FACTOR):
             raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a pivot that is not positive")
         if code:
             text = f"MKL PARDISO failed in phase {phase} with error {code}: {_ERRORS.get(code, 'unknown error')}"
