@@ -50,9 +50,9 @@ def main() -> None:
                 )
             result = solve(problem, strategy=stages)
             flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
-            mips = distortion(problem.V, problem.F, result.uv).mips if result.injective else np.nan
+            mips = distortion(problem.V, problem.F, result.uv).summary("mips").mean if result.injective else np.nan
             row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterization, optimizer]
-            table.writerow([*row, flips, result.iterations, f"{result.seconds:.3f}", f"{np.mean(mips):.3f}"])
+            table.writerow([*row, flips, result.iterations, f"{result.seconds:.3f}", f"{mips:.3f}"])
             options.output.flush()
 
 
