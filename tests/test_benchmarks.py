@@ -99,15 +99,19 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
 
 def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch):
     start = campaign._Worker._start
+    spares = [-30.0, 30.0]
 
     def impatient(worker):
         start(worker)
-        worker.spare = -60.0
+        worker.spare = spares.pop(0)
 
     monkeypatch.setattr(campaign._Worker, "_start", impatient)
-    [record] = campaign.campaign(["swirl:0:0.5"], tmp_path / "results.jsonl", limit=1)
-    assert record["outcome"] == "timeout"
-    assert campaign.failed(record)
+    # 45 000 triangles, not to be solved within the first second.
+    todo = ["pins:96:0.831", "swirl:0:0.1"]
+    first, second = campaign.campaign(todo, tmp_path / "results.jsonl", limit=30)
+    assert first["outcome"] == "timeout"
+    assert campaign.failed(first)
+    assert second["outcome"] == "injective"
 
 
 @pytest.mark.parametrize(
@@ -127,6 +131,16 @@ def test_what_goes_wrong_is_recorded(monkeypatch, trouble, outcome):
     assert campaign.failed(record)
     assert "--case swirl:0:0.1" in campaign.summary([record])
     json.dumps(record, allow_nan=False)
+
+
+def test_a_generator_that_fails_is_a_failure_with_a_summary(monkeypatch):
+    def broken(rng, difficulty, size):
+        raise AssertionError("no solution")
+
+    monkeypatch.setitem(problems.FAMILIES, "maze", broken)
+    record = campaign.run("maze:0:0.1")
+    assert record["outcome"] == "exception"
+    assert "exception: AssertionError('no solution')" in campaign.summary([record])
 
 
 def test_without_a_known_solution_no_map_is_no_failure():

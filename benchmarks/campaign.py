@@ -1,0 +1,323 @@
+"""Thousands of generated problems, unattended: what is solved, how soon, and what is not.
+
+    python benchmarks/campaign.py -n 10000 -o results.jsonl [--families maze,pins] [-j 2]
+    python benchmarks/campaign.py --summary results.jsonl
+    python benchmarks/campaign.py --case maze:7:0.8
+
+A campaign writes one line of JSON a problem as soon as that is done, and skips what the file already has: it may be
+interrupted or killed at any moment and started again. Problems are solved in processes of their own, so that a crash or
+a hang is one more result. A *failure* is a problem with a known solution and no certified injective map, and
+whatever raises, warns, returns numbers that are not finite, crashes or exceeds its time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from problems import FAMILIES, Case, make, parse
+from quasiharmonic import Problem, solve
+
+Record = dict[str, Any]
+
+BANDS = 5
+# Outcomes that are failures whether or not a solution is known to exist.
+_ALWAYS = "exception", "warning", "not finite", "crash", "timeout"
+
+
+def names(count: int, families: Sequence[str]) -> Iterator[str]:
+    """Names of the first problems of a campaign: families in turn, difficulties spread evenly."""
+    for i in range(count):
+        seed, family = divmod(i, len(families))
+        # Multiples of the golden ratio fill the unit interval evenly, however many there are.
+        difficulty = round((0.5 + seed * 0.6180339887498949) % 1.0, 3)
+        yield f"{families[family]}:{seed}:{difficulty!r}"
+
+
+def run(name: str, *, strategy: str = "speed", max_iterations: int = 2000) -> Record:
+    """Make and solve one problem; never raises but for what ends the process."""
+    family, seed, difficulty = parse(name)
+    record: Record = {"name": name, "strategy": strategy, "family": family, "difficulty": difficulty}
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        try:
+            began = time.perf_counter()
+            case = make(family, seed, difficulty)
+            record |= {"feasible": case.feasible, "simple": case.simple}
+            record |= {"triangles": len(case.F), "making": round(time.perf_counter() - began, 4)}
+            record |= _solved(case, strategy, max_iterations)
+        except Exception as error:
+            record |= {"outcome": "exception", "message": repr(error), "trace": traceback.format_exc(limit=-4)}
+    if warned and record["outcome"] in ("injective", "not injective"):
+        record |= {"outcome": "warning", "message": str(warned[0].message)}
+    return record
+
+
+def _solved(case: Case, strategy: str, max_iterations: int) -> Record:
+    began = time.perf_counter()
+    problem = Problem(case.V, case.F, case.fixed, case.target)
+    result = solve(problem, strategy=strategy, max_iterations=max_iterations)
+    seconds = time.perf_counter() - began
+    verdict = "injective" if result.injective else "not injective"
+    energy = min((step.energy for step in result.history), default=np.nan)
+    return {
+        "outcome": verdict if np.isfinite(result.uv).all() else "not finite",
+        "status": result.status.name.lower(),
+        "flipped": len(result.certificate.flipped) + len(result.certificate.degenerate),
+        "bijective": result.certificate.bijective,
+        "iterations": result.iterations,
+        "energy": energy if np.isfinite(energy) else None,
+        "seconds": round(seconds, 4),
+        "loops": len(problem.loops),
+        "pins": len(problem.pins),
+        "interior": problem.n - len(case.fixed),
+        "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
+    }
+
+
+def failed(record: Record) -> bool:
+    """Whether a record is a failure."""
+    return record["outcome"] in _ALWAYS or (bool(record.get("feasible")) and record["outcome"] != "injective")
+
+
+def _serve(pipe: Connection, options: dict[str, Any]) -> None:
+    """Solve what comes through a pipe, in a process of its own."""
+    # Ctrl-C reaches the whole group; the parent decides what becomes of this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    while True:
+        try:
+            name = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(run(name, **options))
+
+
+class _Worker:
+    """A process that solves one problem after another, and is replaced when it crashes or hangs."""
+
+    def __init__(self, limit: float, options: dict[str, Any]) -> None:
+        self.limit, self.options = limit, options
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, self.options), daemon=True)
+        self.process.start()
+        theirs.close()
+        # A process imports its libraries before its first answer; that is not the problem's time.
+        self.spare = 30.0
+
+    def ask(self, name: str) -> None:
+        self.name, self.deadline = name, time.monotonic() + self.limit + self.spare
+        self.pipe.send(name)
+
+    def answer(self) -> Record | None:
+        """The record of the problem asked for, or None while it is being solved."""
+        try:
+            if self.pipe.poll():
+                self.spare = 0.0
+                return self.pipe.recv()
+        except (EOFError, OSError):
+            return self._replaced("crash", f"exit code {self.process.exitcode}")
+        if time.monotonic() > self.deadline:
+            return self._replaced("timeout", f"over {self.limit:g} s")
+        return None
+
+    def _replaced(self, outcome: str, message: str) -> Record:
+        self.stop()
+        self._start()
+        family, _, difficulty = parse(self.name)
+        record = {"name": self.name, "strategy": self.options["strategy"], "family": family, "difficulty": difficulty}
+        return record | {"outcome": outcome, "message": message}
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def campaign(
+    todo: Sequence[str], output: Path, *, processes: int = 1, limit: float = 120.0, **options: Any
+) -> Iterator[Record]:
+    """Solve what ``output`` does not have yet, append every record to it and yield it.
+
+    Parameters
+    ----------
+    todo : sequence of str
+        Names of problems.
+    output : path
+        A file of records, one a line; need not exist.
+    processes : int
+    limit : float
+        Seconds for one problem.
+    **options
+        As `run` takes them.
+    """
+    options = {"strategy": "speed"} | options
+    done = {record["name"] for record in read(output)}
+    left = [name for name in todo if name not in done][::-1]
+    workers = [_Worker(limit, options) for _ in range(min(processes, len(left)))]
+    try:
+        # A line that a kill has cut short stays alone, and is not read.
+        torn = output.exists() and output.stat().st_size > 0 and output.read_bytes()[-1:] != b"\n"
+        with output.open("a", encoding="utf-8") as file:
+            file.write("\n" * torn)
+            idle, busy = workers[:], list[_Worker]()
+            while left or busy:
+                while left and idle:
+                    busy.append(idle.pop())
+                    busy[-1].ask(left.pop())
+                wait([worker.pipe for worker in busy], timeout=1.0)
+                for worker in busy[:]:
+                    record = worker.answer()
+                    if record is not None:
+                        busy.remove(worker)
+                        idle.append(worker)
+                        file.write(json.dumps(record, allow_nan=False) + "\n")
+                        file.flush()
+                        yield record
+    finally:
+        for worker in workers:
+            worker.stop()
+
+
+def read(path: Path) -> list[Record]:
+    """Records of a file, the last one for every name; lines cut short are left out."""
+    records: dict[str, Record] = {}
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                record = json.loads(line)
+                records[record["name"]] = record
+            except (json.JSONDecodeError, KeyError, TypeError):
+                continue
+    return list(records.values())
+
+
+def summary(records: Sequence[Record]) -> str:
+    """Success by family and difficulty, effort, stages, and the failures with how to run them again."""
+    edges = [f"{b / BANDS:.1f}–{(b + 1) / BANDS:.1f}" for b in range(BANDS)]
+    head = f"{'family':10}" + "".join(f"{edge:>12}" for edge in edges)
+    lines = [
+        head + f"{'all':>12}{'iterations':>13}{'seconds':>15}",
+        " " * len(head) + f"{'':12}{'50 %  95 %':>13}{'50 %  95 %':>15}",
+    ]
+    groups: dict[str, list[Record]] = defaultdict(list)
+    for record in records:
+        groups[record["family"]].append(record)
+    feasible = [r for r in records if r.get("feasible")]
+    for family in [f for f in FAMILIES if f in groups]:
+        lines.append(_row(family + ("" if any(r.get("feasible") for r in groups[family]) else " ?"), groups[family]))
+    lines += [
+        _row("feasible", feasible),
+        _row("  simple", [r for r in feasible if r["simple"]]),
+        "",
+        "?: nobody knows which of these have a solution.",
+        "",
+    ]
+    last = Counter(r["stages"][-1][0] if r.get("stages") else "-" for r in records if r["outcome"] == "injective")
+    which = Counter(f"{len(r['stages'])}" for r in records if r["outcome"] == "injective")
+    lines += ["found by stage: " + ", ".join(f"{k}: {n}" for k, n in sorted(which.items()))]
+    lines += ["which was: " + "; ".join(f"{k}: {n}" for k, n in last.most_common())]
+    lines += [
+        "outcomes: " + ", ".join(f"{k}: {n}" for k, n in Counter(r["outcome"] for r in records).most_common()),
+        "",
+    ]
+    failures = [r for r in records if failed(r)]
+    lines.append(
+        f"{len(failures)} failures among {len(records)} problems, {len(feasible)} of them known to be feasible"
+    )
+    for r in failures:
+        lines.append(f"  python benchmarks/campaign.py --case {r['name']} --strategy {r['strategy']}  # {_story(r)}")
+    return "\n".join(lines)
+
+
+def _row(title: str, records: Sequence[Record]) -> str:
+    cells = []
+    for band in range(BANDS):
+        cells.append([r for r in records if min(int(r["difficulty"] * BANDS), BANDS - 1) == band])
+    shares = [f"{sum(r['outcome'] == 'injective' for r in cell)}/{len(cell)}" for cell in [*cells, records]]
+    won = [r for r in records if r["outcome"] == "injective"]
+    effort = ["-", "-"]
+    if won:
+        effort = [
+            "{:.0f} {:5.0f}".format(*np.percentile([r["iterations"] for r in won], [50, 95])),
+            "{:.3f} {:6.3f}".format(*np.percentile([r["seconds"] for r in won], [50, 95])),
+        ]
+    return f"{title:10}" + "".join(f"{share:>12}" for share in shares) + f"{effort[0]:>13}{effort[1]:>15}"
+
+
+def _story(record: Record) -> str:
+    """What became of a failure, in a few words."""
+    if "stages" not in record:
+        return f"{record['outcome']}: {record.get('message', '')}"
+    course = ", ".join(f"{before}→{after} ({count})" for _, count, before, after, _ in record["stages"])
+    energy = record["energy"]
+    tail = f", V₃/area {energy:.1e}" if energy is not None else ""
+    return f"{record['outcome']}, {record['triangles']} triangles, flips by stage (iterations): {course}{tail}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run, summarise or repeat; 1 when there is a failure among the problems looked at."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-n", "--count", type=int, default=1000, help="problems of the campaign (%(default)s)")
+    parser.add_argument("-o", "--output", type=Path, default=Path("results.jsonl"), help="records (%(default)s)")
+    parser.add_argument("--families", default=",".join(FAMILIES), help="separated by commas (all)")
+    parser.add_argument("--strategy", default="speed", help="speed or quality (%(default)s)")
+    parser.add_argument("--max-iterations", type=int, default=2000, help="linear solves a problem (%(default)s)")
+    parser.add_argument("-j", "--processes", type=int, default=1, help="problems at a time (%(default)s)")
+    parser.add_argument("--limit", type=float, default=120.0, help="seconds a problem (%(default)s)")
+    parser.add_argument("--summary", type=Path, metavar="RESULTS", help="summarise records and end")
+    parser.add_argument("--case", action="append", metavar="NAME", help="run just this problem, e.g. maze:7:0.8")
+    options = parser.parse_args(arguments)
+    families = options.families.split(",")
+    unknown = [family for family in families if family not in FAMILIES]
+    if unknown:
+        parser.error(f"no family {', '.join(unknown)}; there are {', '.join(FAMILIES)}")
+
+    if options.summary:
+        records = read(options.summary)
+    elif options.case:
+        records = [run(name, strategy=options.strategy, max_iterations=options.max_iterations) for name in options.case]
+        print(*(json.dumps(record, indent=1) for record in records), sep="\n")
+        return int(any(map(failed, records)))
+    else:
+        todo = list(names(options.count, families))
+        try:
+            for i, record in enumerate(
+                campaign(
+                    todo,
+                    options.output,
+                    processes=options.processes,
+                    limit=options.limit,
+                    strategy=options.strategy,
+                    max_iterations=options.max_iterations,
+                )
+            ):
+                if failed(record):
+                    print(f"{record['name']}: {_story(record)}", file=sys.stderr)
+                elif i % 500 == 499:
+                    print(f"{i + 1} done", file=sys.stderr)
+        except KeyboardInterrupt:
+            print("interrupted; the same command goes on from here", file=sys.stderr)
+        records = read(options.output)
+    print(summary(records))
+    return int(any(map(failed, records)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
