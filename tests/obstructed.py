@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from meshes import boundary_of
 
+from meshes import boundary_of
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
@@ -75,7 +75,7 @@ def moved(mesh, at=None, pins=()):
     """The boundary (the first few vertices, or those named) and the pins of a planar mesh elsewhere."""
     V, F = mesh
     where = np.array(V[:, :2])
-    for vertex, position in at.items() if isinstance(at, dict) else enumerate(at or []):
+    for vertex, position in at.items() if isinstance(at, dict) else enumerate([] if at is None else at):
         where[vertex] = position
     fixed = np.concatenate([boundary_of(F), np.asarray(pins, dtype=int)])
     return Problem(V, F, fixed, where[fixed], reference="equilateral")
@@ -94,6 +94,9 @@ def onto(mesh, *targets):
 RING = annulus(4)  # loops of 24 and 8
 CELLS = grid(6, 6)  # vertex i + 7 j at (i / 6, j / 6)
 HOUSE = [[4, 0], [4, 6], [2, 7], [0, 6], [0, 0]]  # goes on above the chord of two wheels
+SQUARE = [[0, 0], [8, 0], [8, 8], [0, 8]]
+LAP = 2 * np.pi * np.arange(18) / 18
+BAND = [(1.5 - 0.5 * y) * np.array([np.cos(8 * x), np.sin(8 * x)]) for x, y in grid(12, 2)[0]]
 OUTER, HOLE = 4 * circle(24), circle(8)[::-1]
 
 # name: (problem, kind, what it forbids, elements to be found in the obstruction)
@@ -151,8 +154,8 @@ OBSTRUCTED = {
         ("PIN", "INJECTIVE", {"vertices": [16, 32]}),
     ),
     "pin in the hole": (
-        moved(annulus(8), {18: [0.1, 0.1]}, pins=[18]),
-        ("PIN", "INJECTIVE", {"vertices": [18]}),
+        moved(annulus(8), {10: [0.1, 0.1]}, pins=[10]),
+        ("PIN", "INJECTIVE", {"vertices": [10]}),
     ),
     "no kernel": (
         moved(wheel(8), U),
@@ -179,11 +182,11 @@ OBSTRUCTED = {
         ("REVERSED", "INJECTIVE", {"loops": [0, 1]}),
     ),
     "figure of eight": (
-        onto(disk(3), np.stack([np.sin(2 * np.pi * np.arange(18) / 18 + 0.1), np.sin(4 * np.pi * np.arange(18) / 18 + 0.2)], axis=1)),
+        onto(disk(3), np.stack([np.sin(LAP + 0.1), np.sin(2 * LAP + 0.2)], axis=1)),
         ("TURNING_NUMBER", "INJECTIVE", {"loops": [0]}),
     ),
-    "negative pocket": (
-        onto(disk(3), [*spread([[0, 0], [8, 0], [8, 8], [5, 8]], 14), [3, 9], [3, 10], [5, 10], [4, 7]]),
+    "twisted pocket": (
+        onto(disk(3), spread([[0, 0], [8, 0], [8, 8], [5, 8], [3, 10], [5, 10], [3, 8], [0, 8]], 18)),
         ("NEGATIVE_WINDING", "INJECTIVE", {"loops": [0]}),
     ),
     "on a line": (
@@ -191,31 +194,47 @@ OBSTRUCTED = {
         ("SIGNED_AREA", "INJECTIVE", {"loops": [0]}),
     ),
     "whisker": (
-        onto(disk(3), [*spread([[0, 0], [8, 0], [8, 8], [5, 8]], 15), [5, 9], [5, 8.5], [0, 8]]),
+        onto(disk(3), spread([[0, 0], [8, 0], [8, 8], [4, 8], [4, 10], [4, 8], [0, 8]], 18)),
         ("TURNING_NUMBER", "INJECTIVE", {"loops": [0]}),
+    ),
+    "slit": (
+        onto(disk(3), spread([[0, 0], [8, 0], [8, 8], [4, 8], [4, 3], [4, 8], [0, 8]], 18)),
+        ("FOLD", "BIJECTIVE", {}),
     ),
     "handle": (
         onto(handle(), circle(4)),
         ("GENUS", "INJECTIVE", {}),
     ),
     "hole outside": (
-        onto(RING, OUTER, HOLE + [9, 0]),
+        onto(RING, OUTER, HOLE + np.array([9, 0])),
         ("NESTING", "INJECTIVE", {"loops": [1]}),
     ),
     "two outer loops": (
-        onto(RING, OUTER, HOLE[::-1] + [9, 0]),
+        onto(RING, OUTER, HOLE[::-1] + np.array([9, 0])),
         ("NESTING", "INJECTIVE", {"loops": [0, 1]}),
     ),
     "hole wound as an island": (
         onto(RING, OUTER, HOLE[::-1]),
         ("NESTING", "UNBRANCHED", {"loops": [1]}),
     ),
+    "hole across the outer loop": (
+        onto(RING, OUTER, HOLE + np.array([4, 0.1])),
+        ("NEGATIVE_WINDING", "INJECTIVE", {"loops": [0, 1]}),
+    ),
+    "loops cross": (
+        onto(RING, OUTER, HOLE + np.array([4, 0.1])),
+        ("CROSSING", "BIJECTIVE", {"loops": [0, 1]}),
+    ),
+    "loops touch": (
+        onto(RING, spread(SQUARE, 24), HOLE + np.array([1, 4])),
+        ("CROSSING", "BIJECTIVE", {"loops": [0, 1]}),
+    ),
     "wound twice": (
-        onto(disk(3), circle(18, turns=2) * (2 + np.cos(2 * np.pi * np.arange(18) / 18))[:, None]),
+        onto(disk(3), circle(18, turns=2) * (2 + np.cos(LAP + 0.1))[:, None]),
         ("TURNING_NUMBER", "UNBRANCHED", {"loops": [0]}),
     ),
     "band over itself": (
-        onto(grid(12, 2), np.concatenate([circle(13, 2, 13 / 11)[:13], [[0, 0]] * 0])) if False else None,
-        None,
+        moved(grid(12, 2), BAND),
+        ("CROSSING", "BIJECTIVE", {"loops": [0]}),
     ),
 }

@@ -24,6 +24,7 @@ from quasiharmonic.optimize import Stop
 from quasiharmonic.optimize.alternating import alternating, own_tensor
 from quasiharmonic.optimize.lbfgs import lbfgs
 from quasiharmonic.optimize.newton import newton
+from quasiharmonic.optimize.patches import patches
 from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.polishing import energy_named, polish_map
 from quasiharmonic.problem import Problem
@@ -33,10 +34,6 @@ from quasiharmonic.tensor import TANH, TensorField
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-# A stage has settled when within this many iterations no triangle was righted and the energy did not fall
-# by this fraction.
-PATIENCE, PROGRESS = 300, 1e-3
 
 
 def injective_map(
@@ -139,7 +136,7 @@ def solve(
     lower = None if polish is None else energy_named(polish)
     search = _Search(problem, linear_solver, callback, max_iterations, record)
     status = search.run(stages_of(strategy, problem))
-    uv = _positions(problem, search.best_map)
+    uv = problem.positions(search.best_map)
     certificate = certify(problem.F, uv)
     field = search.best_field
     result = MapResult(
@@ -196,14 +193,7 @@ def quasi_harmonic_map(
     """
     objective = Objective(problem, reference=reference, linear_solver=linear_solver)
     xi = np.zeros(len(problem.F), dtype=np.complex128) if mu is None else TANH.invert(mu)
-    return _positions(problem, objective.evaluate(xi).w)
-
-
-def _positions(problem: Problem, w: ComplexArray) -> FloatArray:
-    """A map of the problem's frame as the caller gets it, the fixed vertices to the last bit."""
-    uv = problem.frame.outward(w)
-    uv[problem.fixed] = problem.target
-    return uv
+    return problem.positions(objective.evaluate(xi).w)
 
 
 _Visit = Callable[[Iterate], None]
@@ -212,6 +202,7 @@ _METHODS: dict[str, Callable[[Objective, Iterate, _Visit, Descent, int], None]] 
     "l-bfgs": lambda o, start, visit, stage, n: lbfgs(o, start, visit, iterations=n),
     "newton": lambda o, start, visit, stage, n: newton(o, start, visit, iterations=n),
     "alternating": lambda o, start, visit, stage, n: alternating(o, start, visit, iterations=n),
+    "patches": lambda o, start, visit, stage, n: patches(o, start, visit, iterations=n),
 }
 
 
@@ -245,8 +236,8 @@ class _Search:
         self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
         self._rounded = False
-        self._mark = self.best
-        self._marked = 0
+        self._mark, self._marked = self.best, 0
+        self._patience, self._progress = 0, 0.0
 
     def run(self, stages: Sequence[Descent]) -> Status:
         """Run stages until one finds an injective map; why the search ended."""
@@ -281,6 +272,7 @@ class _Search:
         """Run one stage."""
         before, done, began = None, max(len(self.history), 1), time.perf_counter()
         self._mark, self._marked = (len(self.problem.F) + 1, np.inf), len(self.history)
+        self._patience, self._progress = stage.patience
         try:
             objective = Objective(
                 self.problem, stage.functional, stage.parameterization, stage.reference, self.linear_solver
@@ -328,12 +320,12 @@ class _Search:
         flipped = here.flipped
         if flipped == 0:
             # Decided on the coordinates that are handed back, not on the solver's own.
-            flipped = flipped_triangles(self.problem.F, _positions(self.problem, here.w)).size
+            flipped = flipped_triangles(self.problem.F, self.problem.positions(here.w)).size
             self._rounded |= flipped > 0
         step = Step(len(self.history), flipped, here.energy)
         self.history.append(step)
         if self.record and step.iteration % self.record == 0:
-            self.path.append(Snapshot(step.iteration, _positions(self.problem, here.w)))
+            self.path.append(Snapshot(step.iteration, self.problem.positions(here.w)))
         if (flipped, step.energy) < self.best:
             self.best = flipped, step.energy
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.mesh.kind
@@ -344,8 +336,8 @@ class _Search:
         if flipped == 0:
             raise Stop(Status.INJECTIVE)
         flips, energy = self._mark
-        if flipped < flips or step.energy < (1 - PROGRESS) * energy:
+        if flipped < flips or step.energy < (1 - self._progress) * energy:
             self._mark = min(flipped, flips), min(step.energy, energy)
             self._marked = len(self.history)
-        elif len(self.history) - self._marked > PATIENCE:
+        elif len(self.history) - self._marked > self._patience:
             raise Stop(Status.SETTLED)

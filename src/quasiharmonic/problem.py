@@ -125,6 +125,12 @@ class Problem:
         """The coordinates in which the problem is solved."""
         return Frame(self.target)
 
+    def positions(self, w: ComplexArray) -> FloatArray:
+        """A map of the frame (n,) complex128 as the caller gets it, (n, 2), the fixed vertices to the last bit."""
+        uv = self.frame.outward(w)
+        uv[self.fixed] = self.target
+        return uv
+
     @property
     def pins(self) -> IntArray:
         """Fixed vertices that are not on the boundary, ascending."""

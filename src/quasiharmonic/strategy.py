@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Literal, get_args, get_type_hints
 
@@ -17,8 +17,6 @@ from quasiharmonic.problem import Problem
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
 # The longer way that si-log's ξ has to go to the same tensor wants longer steps.
 SI_LOG_STEPS = ((0, 0.5),)
-# Until it settles or the caller's iterations are spent.
-_NO_END = 10**9
 
 
 @dataclass(frozen=True)
@@ -27,8 +25,9 @@ class Descent:
 
     Attributes
     ----------
-    optimizer : {"vector-adam", "l-bfgs", "newton", "alternating"}
-        The last two descend V₃ whatever the functional (§9.2, §F.2).
+    optimizer : {"vector-adam", "l-bfgs", "newton", "alternating", "patches"}
+        Newton and alternation descend V₃ whatever the functional (§9.2, §F.2); patches moves vertices around
+        the last inverted triangles.
     parameterization : {"tanh", "si-log"}
         How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
     functional : {"dirichlet", "neumann", "sobolev", "poisson"}
@@ -49,7 +48,7 @@ class Descent:
         When a word is none of those above.
     """
 
-    optimizer: Literal["vector-adam", "l-bfgs", "newton", "alternating"] = "vector-adam"
+    optimizer: Literal["vector-adam", "l-bfgs", "newton", "alternating", "patches"] = "vector-adam"
     parameterization: Literal["tanh", "si-log"] = "tanh"
     functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
     reference: Reference = "equilateral"
@@ -83,6 +82,14 @@ class Descent:
         return ", ".join(words)
 
     @property
+    def patience(self) -> tuple[int, float]:
+        """The stage has settled when within so many iterations none was righted and the energy fell by less.
+
+        As a fraction of itself. Newton's steps are dear, and where they lead anywhere they do so at once.
+        """
+        return (40, 0.1) if self.optimizer == "newton" else (300, 1e-3)
+
+    @property
     def steps(self) -> Sequence[tuple[int, float]]:
         """VectorAdam's step lengths."""
         return self.schedule or (TANH_STEPS if self.parameterization == "tanh" else SI_LOG_STEPS)
@@ -92,27 +99,36 @@ def speed(problem: Problem) -> list[Descent]:
     """The stages that find a map soonest, the first of which usually suffices.
 
     Boundaries alone want tanh, pins want si-log: the spike that a pinned point draws needs distortion that
-    grows slowly towards it, and tanh never gets there. Newton rights the last few triangles where short Adam
-    steps would take hundreds.
+    grows slowly towards it, and tanh never gets there. Newton brings the last few triangles near to being
+    righted where short Adam steps would take hundreds, and rights most of them; local repair does the rest.
     """
-    tanh = [Descent(iterations=100), Descent("newton", iterations=60, resume=True)]
-    si_log = [
-        Descent(parameterization="si-log", iterations=600),
-        Descent("newton", parameterization="si-log", iterations=60, resume=True),
-    ]
-    last = [Descent(iterations=_NO_END, schedule=((0, 0.05), (200, 0.01)), resume=True)]
-    return (si_log + tanh if problem.pins.size else tanh + si_log) + last
+    tanh = [Descent(iterations=100), *_finish("tanh", 1000)]
+    if problem.pins.size:
+        return [Descent(parameterization="si-log", iterations=400), *_finish("si-log", 60), *tanh, _LAST]
+    # From ξ = 0: where the target overlaps itself, tanh's first steps lead into a valley without an end.
+    afresh = replace(_finish("si-log", 300)[0], resume=False)
+    return [*tanh, afresh, Descent("patches", resume=True), _LAST]
 
 
 def quality(problem: Problem) -> list[Descent]:
     """The stages that keep angles: si-log on the rest mesh's own triangles, then whatever finds a map (§10.1)."""
     return [
         Descent(parameterization="si-log", reference="corrected", iterations=1000),
-        Descent("newton", parameterization="si-log", reference="corrected", iterations=60, resume=True),
+        *(replace(stage, reference="corrected") for stage in _finish("si-log", 60)),
         *speed(problem),
     ]
 
 
+def _finish(parameterization: Literal["tanh", "si-log"], steps: int) -> list[Descent]:
+    """Newton and local repair from the best so far."""
+    return [
+        Descent("newton", parameterization, iterations=steps, resume=True),
+        Descent("patches", parameterization, resume=True),
+    ]
+
+
+# When all else has failed: short steps from the best so far, until they settle or the caller's iterations are spent.
+_LAST = Descent(iterations=10**9, schedule=((0, 0.05), (200, 0.01)), resume=True)
 STRATEGIES = {"speed": speed, "quality": quality}
 
 

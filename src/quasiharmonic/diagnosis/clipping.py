@@ -142,7 +142,7 @@ class Walls:
 
     def __init__(self, ends: IntArray, lattice: Lattice) -> None:
         self._ends, self._lattice = ends, lattice
-        corners = lattice.near[ends]
+        corners = lattice.near[ends.T].transpose(2, 0, 1)  # coordinate, end, wall
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
 
     def seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
@@ -165,13 +165,18 @@ class Walls:
             A polygon of positive area all of which sees every eye.
         """
         near = self._lattice.corners(area)
-        waiting = [(area, near, [self._before(eye, near) for eye in eyes])]
+        met = self._met(np.concatenate([near, self._lattice.near[list(eyes)]]))
+        # Which walls may hide an area from the first eyes; none for those that are known to see it all.
+        waiting: list[tuple[Convex, FloatArray, list[IntArray]]] = [(area, near, [])]
         while waiting:
             area, near, blocking = waiting.pop()
             parts = None
             blocking = list(blocking)
             for k, eye in enumerate(eyes):
-                parts, blocking[k] = self._split(area, near, eye, blocking[k])
+                if k == len(blocking):
+                    blocking.append(self._facing(eye, met))
+                if len(blocking[k]):
+                    parts, blocking[k] = self._split(area, near, eye, blocking[k])
                 if parts is not None:
                     break
             if parts is None:
@@ -179,19 +184,20 @@ class Walls:
             waiting += [(part, self._lattice.corners(part), blocking) for part in parts]
         return None
 
-    def _before(self, eye: int, near: FloatArray) -> IntArray:
-        """Walls that may stand between an eye and an area, as (m, 2) seen from right to left."""
-        here = self._lattice.near[eye]
-        low, high = np.minimum(near.min(axis=0), here), np.maximum(near.max(axis=0), here)
-        met = ((self._low <= high + _MARGIN) & (self._high >= low - _MARGIN)).all(axis=1)
-        ends = self._ends[met & (self._ends != eye).all(axis=1)]
-        p, q = self._lattice.near[ends.T] - here
+    def _met(self, points: FloatArray) -> IntArray:
+        """Walls that reach into the box around some points, (m, 2) int64."""
+        (x0, y0), (x1, y1) = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+        inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
+        return self._ends[inside]
+
+    def _facing(self, eye: int, walls: IntArray) -> IntArray:
+        """Walls as an eye sees them from right to left, without those that end in it; (m, 2) int64."""
+        ends = walls[(walls[:, 0] != eye) & (walls[:, 1] != eye)]
+        p, q = self._lattice.near[ends.T] - self._lattice.near[eye]
         turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
         return np.where(turned[:, None], ends[:, ::-1], ends)
 
-    def _split(
-        self, area: Convex, near: FloatArray, eye: int, walls: IntArray
-    ) -> tuple[list[Convex] | None, IntArray]:
+    def _split(self, area: Convex, near: FloatArray, eye: int, walls: IntArray) -> tuple[list[Convex] | None, IntArray]:
         """Cut an area at the shadow of one of the walls.
 
         Returns
@@ -205,9 +211,7 @@ class Walls:
         p, q = self._lattice.near[walls.T]
         right, left = _cross(p - here, near - here), _cross(q - here, near - here)
         front = _cross(q - p, near[None] - p[:, None])
-        in_the_way = (
-            (right.max(axis=1) > -_MARGIN) & (left.min(axis=1) < _MARGIN) & (front.min(axis=1) < _MARGIN)
-        )
+        in_the_way = (right.max(axis=1) > -_MARGIN) & (left.min(axis=1) < _MARGIN) & (front.min(axis=1) < _MARGIN)
         # The walls that hide most corners first: one that hides them all leaves nothing to look at.
         hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
         walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..predicates import SegmentRelation, box_pairs, orientation, segment_relation
+from quasiharmonic.predicates import SegmentRelation, box_pairs, orientation, segment_relation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -167,8 +167,8 @@ class BoundaryCurves:
     def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
         self.positions = positions
         self.loops = [_from_lowest(positions, loop) for loop in loops]
-        self.ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
-        self.loop_of = np.repeat(np.arange(len(loops)), [len(loop) for loop in loops])
+        self.ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
+        self.loop_of = np.repeat(np.arange(len(loops)), [len(loop) for loop in self.loops])
 
     @cached_property
     def degenerate(self) -> IntArray:
@@ -247,8 +247,7 @@ class BoundaryCurves:
     def _when(self, edge: int, other: int) -> Fraction:
         """Where along an edge another crosses it, from 0 at its tail to 1 at its head."""
         (px, py), (qx, qy), (rx, ry), (sx, sy) = (
-            tuple(map(Fraction, self.positions[vertex].tolist()))
-            for vertex in (*self.ends[edge], *self.ends[other])
+            tuple(map(Fraction, self.positions[vertex].tolist())) for vertex in (*self.ends[edge], *self.ends[other])
         )
         tail = (sx - rx) * (py - ry) - (sy - ry) * (px - rx)
         head = (sx - rx) * (qy - ry) - (sy - ry) * (qx - rx)

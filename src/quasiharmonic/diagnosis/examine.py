@@ -7,13 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.topology import named
-from ..predicates import SegmentRelation
-from ..problem import Problem
-from .curves import BoundaryCurves
-from .local import Fixture, collapsed_edges, half_planes, inverted_patches, inverted_triangles, stars
-from .obstruction import Diagnosis, Forbids, Kind, Obstruction, named_edges, named_vertices
-from .sight import Sight, bad_chords, misplaced_pins
+from quasiharmonic.diagnosis.curves import BoundaryCurves
+from quasiharmonic.diagnosis.elements import collapsed_edges, half_planes, inverted_patches, inverted_triangles
+from quasiharmonic.diagnosis.fixture import Fixture, stars
+from quasiharmonic.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_edges, named_vertices
+from quasiharmonic.diagnosis.shortcuts import Shortcuts
+from quasiharmonic.diagnosis.sight import Sight, bad_chords, misplaced_pins
+from quasiharmonic.mesh.topology import named
+from quasiharmonic.predicates import SegmentRelation
+from quasiharmonic.problem import Problem
 
 IntArray = NDArray[np.int64]
 
@@ -50,12 +52,14 @@ def diagnose(problem: Problem) -> Diagnosis:
 
     - edges between fixed vertices strictly inside the target, clear of the boundary and each other;
     - pins strictly inside;
-    - for each free vertex a point that sees all fixed vertices it is joined to, the half-planes
-      above included. In particular two fixed vertices with a common neighbour are at link distance
-      two at most [2]_.
+    - for each free vertex a point that sees all fixed vertices it is joined to, from the left of
+      the edges above;
+    - for any two boundary vertices no fewer edges from one to the other than the link distance of
+      their positions, the number of segments that it takes inside the target [2]_.
 
-    Not checked are link distances for fixed vertices further apart in the mesh, and whether a curve
-    that crosses itself bounds an immersed surface at all (for a disk, Blank's theorem [1]_ decides).
+    Link distances are compared for targets with one loop and vertices up to eight edges apart, as
+    long as that takes no more than about the time of the rest. Not checked is whether a curve that
+    crosses itself bounds an immersed surface at all (for a disk, Blank's theorem [1]_ decides).
 
     References
     ----------
@@ -66,21 +70,22 @@ def diagnose(problem: Problem) -> Diagnosis:
     """
     fixture = Fixture.of(problem)
     curves = BoundaryCurves(fixture.positions, problem.loops)
+    euler = problem.n - len(problem.edges.interior) - len(problem.edges.boundary) + len(problem.F)
     area = _twice_area(fixture, curves)
-    if area < 0 and _mirrored(curves):
+    if area < 0 and _fits_mirrored(curves, euler):
         message = "The target is wound against the mesh: every loop runs the wrong way around."
         loops = np.arange(len(problem.loops))
         reversed_ = Obstruction(Kind.REVERSED, Forbids.INJECTIVE, message, loops=loops)
         return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",))
 
     proper = _proper(curves)
-    found = list(_global(problem, fixture, curves, area))
+    found = list(_global(problem, curves, euler, area))
     found += misplaced_pins(problem, fixture, curves, proper)
     found += collapsed_edges(problem, fixture)
     found += inverted_triangles(problem, fixture)
     found += inverted_patches(problem, fixture)
     # Nothing has a place in a target on a line parallel to an axis, and nothing more need be said.
-    flat = np.ptp(problem.target, axis=0).min() == 0
+    flat = any(low == high for low, high in zip(fixture.lattice.low, fixture.lattice.high, strict=True))
     around = [] if flat else stars(problem, fixture, curves.folds)
     chords = fixture.chords
     if proper:
@@ -95,7 +100,14 @@ def diagnose(problem: Problem) -> Diagnosis:
             obstruction = sight.hidden(star)
         if obstruction is not None:
             found.append(obstruction)
-    return Diagnosis(tuple(found), tuple(_unchecked(curves, proper)))
+    unchecked = list(_unchecked(curves, proper))
+    if proper and len(problem.loops) == 1:
+        shortcuts = Shortcuts(problem, fixture)
+        found += shortcuts.find()
+        unchecked.append(f"link distances of boundary vertices that are {shortcuts.unchecked} or more edges apart")
+    elif proper:
+        unchecked.append("link distances of fixed vertices that are three or more edges apart, around holes")
+    return Diagnosis(tuple(found), tuple(unchecked))
 
 
 def _twice_area(fixture: Fixture, curves: BoundaryCurves) -> int:
@@ -104,13 +116,12 @@ def _twice_area(fixture: Fixture, curves: BoundaryCurves) -> int:
     return sum(px * qy - py * qx for (px, py), (qx, qy) in zip(tails, heads, strict=True))
 
 
-def _mirrored(curves: BoundaryCurves) -> bool:
+def _fits_mirrored(curves: BoundaryCurves, euler: int) -> bool:
     """Whether the reflected target passes the conditions on whole curves."""
     mirrored = BoundaryCurves(curves.positions * [-1.0, 1.0], curves.loops)
-    if mirrored.turning is None or curves.turning is None:
+    if mirrored.turning is None or sum(mirrored.turning) < euler:
         return False
-    ranges = mirrored.winding_range
-    return sum(mirrored.turning) > sum(curves.turning) and (ranges is None or bool((ranges[:, 0] >= 0).all()))
+    return mirrored.winding_range is None or bool((mirrored.winding_range[:, 0] >= 0).all())
 
 
 def _proper(curves: BoundaryCurves) -> bool:
@@ -121,13 +132,21 @@ def _proper(curves: BoundaryCurves) -> bool:
     return curves.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
 
 
-def _global(problem: Problem, fixture: Fixture, curves: BoundaryCurves, area: int) -> Iterator[Obstruction]:
-    """Obstructions by the loops as a whole."""
+def _global(problem: Problem, curves: BoundaryCurves, euler: int, area: int) -> Iterator[Obstruction]:
+    """Obstructions by the loops as a whole.
+
+    Parameters
+    ----------
+    problem : Problem
+    curves : BoundaryCurves
+    euler : int
+        Euler characteristic of the surface.
+    area : int
+        Any number of the sign of the area that the loops wind around.
+    """
     every = np.arange(len(problem.loops))
     turning, ranges = curves.turning, curves.winding_range
     proper = _proper(curves)
-    edges = len(problem.edges.interior) + len(problem.edges.boundary)
-    euler = problem.n - edges + len(problem.F)
     genus = (2 - len(problem.loops) - euler) // 2
 
     if area <= 0:
@@ -201,7 +220,6 @@ def _meetings(curves: BoundaryCurves) -> Iterator[Obstruction]:
 def _unchecked(curves: BoundaryCurves, proper: bool) -> Iterator[str]:
     """Conditions that were left out, and why."""
     if proper:
-        yield "link distances of fixed vertices that are three or more edges apart"
         return
     yield "edges between fixed vertices and what vertices see, which matters where the target is simple"
     if curves.turning is None:

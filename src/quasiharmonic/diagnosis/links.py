@@ -41,23 +41,23 @@ class Polygon:
 
     Attributes
     ----------
+    triangles : list of (int, int, int)
+        As corners, counterclockwise.
     work : int
         Triangles and sides gone through so far, a measure of the time spent.
     """
 
     def __init__(self, corners: list[tuple[int, int]], near: FloatArray) -> None:
         self._points: list[Point] = [(x, y, 1) for x, y in corners]
-        self._triangles = clip_ears(corners, near)
+        self.triangles = clip_ears(corners, near)
         self._corner = {point: k for k, point in enumerate(self._points)}
-        self._of_side = {
-            side: t for t, (a, b, c) in enumerate(self._triangles) for side in ((a, b), (b, c), (c, a))
-        }
+        self._of_side = {side: t for t, (a, b, c) in enumerate(self.triangles) for side in ((a, b), (b, c), (c, a))}
         # The triangles form a tree, in which an ear hangs on what it was cut from.
-        self._parent = [self._of_side.get((a, c), -1) for a, _, c in self._triangles]
-        self._depth = [0] * len(self._triangles)
-        for t in range(len(self._triangles) - 2, -1, -1):
+        self._parent = [self._of_side.get((a, c), -1) for a, _, c in self.triangles]
+        self._depth = [0] * len(self.triangles)
+        for t in range(len(self.triangles) - 2, -1, -1):
             self._depth[t] = self._depth[self._parent[t]] + 1
-        self._at = {corner: t for t, triangle in enumerate(self._triangles) for corner in triangle}
+        self._at = {corner: t for t, triangle in enumerate(self.triangles) for corner in triangle}
         self.work = len(corners)
 
     def link_distance(self, start: int, goal: int, limit: int) -> int:
@@ -93,25 +93,25 @@ class Polygon:
         """The shortest path from a point in a triangle to a corner: start, bends, goal [2]_."""
         left, right = self._portals(start, t, goal)
         path, k = [start], 0
-        # What is seen from the last bend through all doors so far lies between the ways to l and r.
-        l = r = start
-        at_l = at_r = 0
+        # What is seen from the last bend through all doors so far lies between these two corners.
+        at_left = at_right = 0
+        near_left = near_right = start
         while (k := k + 1) < len(left):
             self.work += 1
-            if _turn(path[-1], r, right[k]) >= 0:
-                if _turn(path[-1], l, right[k]) > 0:
-                    path.append(l)
-                    r, k = l, at_l
-                    at_r = k
+            if _turn(path[-1], near_right, right[k]) >= 0:
+                if _turn(path[-1], near_left, right[k]) > 0:
+                    path.append(near_left)
+                    near_right, k = near_left, at_left
+                    at_right = k
                     continue
-                r, at_r = right[k], k
-            if _turn(path[-1], l, left[k]) <= 0:
-                if _turn(path[-1], r, left[k]) < 0:
-                    path.append(r)
-                    l, k = r, at_r
-                    at_l = k
+                near_right, at_right = right[k], k
+            if _turn(path[-1], near_left, left[k]) <= 0:
+                if _turn(path[-1], near_right, left[k]) < 0:
+                    path.append(near_right)
+                    near_left, k = near_right, at_right
+                    at_left = k
                     continue
-                l, at_l = left[k], k
+                near_left, at_left = left[k], k
         path.append(self._points[goal])
         # A bend that the path touches without turning is none.
         return [p for k, p in enumerate(path) if k in (0, len(path) - 1) or _turn(path[k - 1], p, path[k + 1])]
@@ -126,15 +126,15 @@ class Polygon:
                 down.append(self._parent[down[-1]])
         sleeve = up + down[-2::-1]
         # Triangles around the two ends need not be crossed.
-        around = [self._corner.get(start, -1) in self._triangles[t] for t in sleeve]
+        around = [self._corner.get(start, -1) in self.triangles[t] for t in sleeve]
         first = max((k for k, inside in enumerate(around) if inside), default=0)
-        last = next(k for k in range(first, len(sleeve)) if goal in self._triangles[sleeve[k]])
+        last = next(k for k in range(first, len(sleeve)) if goal in self.triangles[sleeve[k]])
         left, right = [start], [start]
         for here, following in pairwise(sleeve[first : last + 1]):
             if self._parent[here] == following:
-                a, _, c = self._triangles[here]
+                a, _, c = self.triangles[here]
             else:
-                c, _, a = self._triangles[following]
+                c, _, a = self.triangles[following]
             left.append(self._points[a])
             right.append(self._points[c])
         return [*left, self._points[goal]], [*right, self._points[goal]]
@@ -195,36 +195,50 @@ def clip_ears(corners: list[tuple[int, int]], near: FloatArray) -> list[tuple[in
     points = [(x, y, 1) for x, y in corners]
     n = len(points)
     before, after = [(k - 1) % n for k in range(n)], [(k + 1) % n for k in range(n)]
-    # Only corners that are not convex can lie in an ear. One that does keeps it waiting.
-    blunt = np.array([_turn(points[before[k]], points[k], points[after[k]]) <= 0 for k in range(n)])
-    candidates = deque(np.flatnonzero(~blunt).tolist())
+    blunt = [_turn(points[before[k]], points[k], points[after[k]]) <= 0 for k in range(n)]
+    # Only corners that are not convex can lie in an ear, and one that does keeps it waiting.
+    rest = np.flatnonzero(blunt)
+    count = rest.size
     held_up: dict[int, list[int]] = {}
-    cut = [False] * n
+    # A corner whose neighbours changed queues anew: ears are cut in rounds, which keeps the tree low.
+    turn_of = [0] * n
+    queue = deque((k, 0) for k in range(n) if not blunt[k])
     triangles: list[tuple[int, int, int]] = []
+
+    def again(corner: int) -> None:
+        turn_of[corner] += 1
+        queue.append((corner, turn_of[corner]))
+
     while len(triangles) < n - 2:
-        b = candidates.popleft()
-        a, c = before[b], after[b]
-        if cut[b] or blunt[b]:
+        b, turn = queue.popleft()
+        if turn != turn_of[b] or blunt[b]:
             continue
+        a, c = before[b], after[b]
         low, high = near[[a, b, c]].min(axis=0), near[[a, b, c]].max(axis=0)
-        inside = blunt & ((low <= near) & (near <= high)).all(axis=1)
+        x, y = near[rest].T
+        inside = (low[0] <= x) & (x <= high[0]) & (low[1] <= y) & (y <= high[1])
         sides = _cross(points[a], points[b]), _cross(points[b], points[c]), _cross(points[c], points[a])
         blocking = (
             k
-            for k in np.flatnonzero(inside).tolist()
-            if k not in (a, c) and all(_side(side, points[k]) >= 0 for side in sides)
+            for k in rest[inside].tolist()
+            if blunt[k] and k not in (a, c) and all(_side(side, points[k]) >= 0 for side in sides)
         )
         if (blocker := next(blocking, None)) is not None:
             held_up.setdefault(blocker, []).append(b)
             continue
         triangles.append((a, b, c))
-        cut[b], after[a], before[c] = True, c, a
-        candidates.extend(held_up.pop(b, []))
+        turn_of[b] = -1
+        after[a], before[c] = c, a
         for k in (a, c):
             if blunt[k] and _turn(points[before[k]], points[k], points[after[k]]) > 0:
                 blunt[k] = False
-                candidates.extend(held_up.pop(k, []))
-            candidates.append(k)
+                count -= 1
+                for freed in held_up.pop(k, []):
+                    if turn_of[freed] >= 0:
+                        again(freed)
+            again(k)
+        if 2 * count < rest.size:
+            rest = rest[[blunt[k] for k in rest.tolist()]]
     return triangles
 
 
@@ -240,7 +254,10 @@ def _side(line: Point, p: Point) -> int:
 
 
 def _turn(p: Point, q: Point, r: Point) -> int:
-    """1 where the way from p over q to r turns left, -1 where it turns right."""
+    """1 where the way from p over q to r turns left, -1 where it turns right, 0 where it goes straight."""
+    if p[2] == q[2] == r[2] == 1:
+        value = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+        return (value > 0) - (value < 0)
     return _side(_cross(p, q), r)
 
 
@@ -249,7 +266,7 @@ def _common_end(ways: list[list[Point]]) -> int:
     if len(ways) == 1:
         return len(ways[0]) - 1
     count = 0
-    for p, q in zip(reversed(ways[0]), reversed(ways[1])):
+    for p, q in zip(reversed(ways[0]), reversed(ways[1]), strict=False):
         if p != q:
             break
         count += 1

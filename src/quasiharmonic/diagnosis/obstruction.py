@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..mesh.topology import named
+from quasiharmonic.mesh.topology import named
 
 IntArray = NDArray[np.int64]
 
@@ -40,6 +41,7 @@ class Kind(Enum):
     NESTING = "Move the loops so that one lies outside all others and these outside each other."
     CHORD = "Split the edge, so that it may bend, or move its ends."
     PIN = "Move the pin."
+    LINK_DISTANCE = "Split the edges on the shortest paths between the two vertices, or move them."
     HIDDEN = "Split the edges between the vertex and the fixed vertices it cannot all see."
 
 
@@ -176,6 +178,37 @@ class Diagnosis:
             "split": self.split.tolist(),
             "unchecked": list(self.unchecked),
         }
+
+
+def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list[int]:
+    """Of conditions that cannot all hold, some that cannot either, but could if any one were left out.
+
+    Parameters
+    ----------
+    count : int
+        Number of conditions.
+    possible : callable
+        Whether those of given indices can hold together; False for all of them.
+
+    Returns
+    -------
+    list of int
+        Indices, ascending. Found with about ``log2(count)`` calls for each.
+    """
+    chosen: list[int] = []
+    end = count
+    while possible(chosen):
+        # The first condition that is too much, on top of the chosen ones and those before it.
+        low, high = 1, end
+        while low < high:
+            middle = (low + high) // 2
+            if possible([*range(middle), *chosen]):
+                low = middle + 1
+            else:
+                high = middle
+        end = high - 1
+        chosen.insert(0, end)
+    return chosen
 
 
 def named_edges(pairs: IntArray, most: int = 5) -> str:

@@ -12,15 +12,25 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..predicates import orientation
-from ..problem import Problem
-from .clipping import Convex, Walls, line, reverse
-from .curves import BoundaryCurves, contacts, winding
-from .local import Fixture, Star, clip_to
-from .obstruction import Forbids, Kind, Obstruction, named_edges, named_vertices
+from quasiharmonic.diagnosis.clipping import Convex, Walls, line, reverse
+from quasiharmonic.diagnosis.curves import BoundaryCurves, contacts, winding
+from quasiharmonic.diagnosis.fixture import Fixture, Star
+from quasiharmonic.diagnosis.obstruction import (
+    Forbids,
+    Kind,
+    Obstruction,
+    named_edges,
+    named_vertices,
+    smallest_conflict,
+)
+from quasiharmonic.predicates import orientation
+from quasiharmonic.problem import Problem
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+# So many vertices are looked at before all others, however many have to be seen.
+_APART = 8
 
 
 def misplaced_pins(problem: Problem, fixture: Fixture, curves: BoundaryCurves, proper: bool) -> Iterator[Obstruction]:
@@ -102,9 +112,7 @@ class Corners:
 
     def reflex(self, vertices: IntArray, where: NDArray[np.float64]) -> BoolArray:
         """Whether the angle inside is larger than π; (k,) bool."""
-        turns: BoolArray = (
-            orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
-        )
+        turns: BoolArray = orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
         return turns
 
     def opens_to(self, vertices: IntArray, points: NDArray[np.float64], where: NDArray[np.float64]) -> BoolArray:
@@ -140,19 +148,14 @@ class Sight:
 
     def hidden(self, star: Star) -> Obstruction | None:
         """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it."""
-        if self._place(star.neighbours, star.opposite):
+        neighbours, opposite = self._apart_first(star.neighbours), star.opposite
+        if self._place(neighbours, opposite):
             return None
-        # What is said is a smallest reason: without any one of these, there would be a place.
-        edges = star.opposite
-        if not self._place(star.neighbours, edges[:0]):
-            edges = edges[:0]
-        for k in range(len(edges) - 1, -1, -1):
-            fewer = np.delete(edges, k, axis=0)
-            edges = edges if self._place(star.neighbours, fewer) else fewer
-        seen = star.neighbours
-        for k in range(len(seen) - 1, -1, -1):
-            less = np.delete(seen, k)
-            seen = seen if self._place(less, edges) else less
+        edges = opposite[smallest_conflict(len(opposite), lambda some: self._place(neighbours, opposite[some]))]
+        # Without anything to be seen, half-planes alone leave room: otherwise they were the reason.
+        seen = neighbours[
+            smallest_conflict(len(neighbours), lambda some: not some or self._place(neighbours[some], edges))
+        ]
         vertex = np.array([star.vertex])
         beside = f", from the left of {named_edges(edges)}" if len(edges) else ""
         ends = np.unique(np.concatenate([seen, edges.ravel()]))
@@ -166,13 +169,23 @@ class Sight:
             split=np.stack([np.full(len(ends), star.vertex), ends], axis=1),
         )
 
+    def _apart_first(self, vertices: IntArray) -> IntArray:
+        """Fixed vertices in an order in which each of the first few is far from those before it.
+
+        What they cannot all see is then found out before many small pieces of it are looked at.
+        """
+        near = self._fixture.lattice.near[self._fixture.row[vertices]]
+        distance = np.full(len(vertices), np.inf)
+        first = [0]
+        while len(first) < min(_APART, len(vertices)):
+            distance = np.minimum(distance, np.hypot(*(near - near[first[-1]]).T))
+            first.append(int(np.argmax(distance)))
+        return np.concatenate([vertices[first], np.delete(vertices, first)])
+
     def _place(self, neighbours: IntArray, edges: IntArray) -> bool:
         """Whether some point inside sees the neighbours and lies to the left of the edges."""
         eyes = self._fixture.row[neighbours].tolist()
-        for area in self._areas(neighbours, edges):
-            if self._walls.seeing(area, eyes) is not None:
-                return True
-        return False
+        return any(self._walls.seeing(area, eyes) is not None for area in self._areas(neighbours, edges))
 
     def _areas(self, neighbours: IntArray, edges: IntArray) -> Iterator[Convex]:
         """Where to look: near the neighbours first, then everywhere.
@@ -184,10 +197,10 @@ class Sight:
         known = neighbours[corner.known[neighbours]]
         reflex = corner.reflex(known, where)
         xs, ys = zip(*self._fixture.points(neighbours), strict=True)
-        reach = max(max(xs) - min(xs), max(ys) - min(ys))
+        reach = max(max(xs) - min(xs), max(ys) - min(ys), 1)
         near = Convex.box((min(xs) - reach, min(ys) - reach), (max(xs) + reach, max(ys) + reach))
         for box in (near, self._fixture.extent()):
-            area = clip_to(box, edges, self._fixture)
+            area = self._fixture.left_of(box, edges)
             if area is None:
                 continue
             if not known.size:

@@ -1,0 +1,129 @@
+"""Edges are split where asked, conformingly, and everything can be traced back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshes import boundary_of, signed_areas, surfaces
+from quasiharmonic.mesh.topology import edges
+from quasiharmonic.refinement import refine
+
+TWO = ([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize(("name", "V", "F"), surfaces())
+@pytest.mark.parametrize("share", [0.03, 0.4, 1.0])
+def test_random_edges(name, V, F, share):
+    rng = np.random.default_rng(7)
+    interior = edges(F, len(V)).interior
+    chosen = interior[rng.random(len(interior)) < share]
+    turned = np.where(rng.random((len(chosen), 1)) < 0.5, chosen, chosen[:, ::-1])
+    refined = refine(V, F, np.concatenate([turned, chosen[:3]]))
+
+    n, s = len(V), len(chosen)
+    np.testing.assert_array_equal(refined.V[:n], V)
+    np.testing.assert_allclose(refined.V[n:], (V[chosen[:, 0]] + V[chosen[:, 1]]) / 2)
+    np.testing.assert_array_equal(refined.parents, chosen)
+    np.testing.assert_array_equal(refined.weights, 0.5)
+    # Two more triangles for each split edge, and a surface with the same boundary.
+    assert len(refined.F) == len(F) + 2 * s
+    found = edges(refined.F, len(refined.V))
+    assert not found.nonmanifold.size
+    assert not found.inconsistent.size
+    np.testing.assert_array_equal(found.boundary, edges(F, n).boundary)
+    assert len(found.interior) == len(interior) + 3 * s
+    np.testing.assert_array_equal(np.unique(refined.F), np.arange(n + s))
+    # Triangles keep their index, and untouched ones all else.
+    np.testing.assert_array_equal(refined.parent[: len(F)], np.arange(len(F)))
+    split = {tuple(e) for e in chosen.tolist()}
+    sides = np.sort(np.stack([F, np.roll(F, -1, axis=1)], axis=2), axis=2)
+    untouched = np.array([not any(tuple(e) in split for e in sides_of.tolist()) for sides_of in sides])
+    np.testing.assert_array_equal(refined.F[: len(F)][untouched], F[untouched])
+    assert not np.isin(refined.parent[len(F) :], np.flatnonzero(untouched)).any()
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7, 1.0])
+def test_parts_fill_their_parents(share):
+    _, V, F = surfaces()[0]
+    every = np.concatenate([edges(F, len(V)).interior, edges(F, len(V)).boundary])
+    chosen = every[np.random.default_rng(3).random(len(every)) < share]
+    refined = refine(V, F, chosen, boundary=True)
+    parts = signed_areas(refined.F, refined.V)
+    whole = signed_areas(F, V)
+    assert (parts > 0.2 * whole[refined.parent]).all()
+    np.testing.assert_allclose(np.bincount(refined.parent, parts), whole)
+
+
+def test_values_follow():
+    _, V, F = surfaces()[1]
+    refined = refine(V, F, edges(F, len(V)).interior[::5])
+    np.testing.assert_allclose(refined.extend(V), refined.V)
+    np.testing.assert_allclose(refined.extend(V[:, 0]), refined.V[:, 0])
+    with pytest.raises(ValueError, match="one a vertex"):
+        refined.extend(refined.V)
+
+
+def test_boundary_only_on_request():
+    with pytest.raises(ValueError, match=r"\(0, 1\), \(1, 2\): on the boundary"):
+        refine(*TWO, [[0, 2], [2, 1], [0, 1]])
+    refined = refine(*TWO, [[1, 0]], boundary=True)
+    assert refined.parents.tolist() == [[0, 1]]
+    assert 4 in boundary_of(refined.F)
+
+
+def test_the_shorter_diagonal_is_taken():
+    V = [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0], [2.0, 0.5]]
+    F = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
+    refined = refine(V, F, [[0, 4], [1, 4]])
+    # Both diagonals of the trapezoid 0, 1, 6, 5 have the same length: one of them, not both.
+    assert len(refined.F) == 4 + 4
+    refined = refine(V, F, [[1, 4], [2, 4]])
+    assert not edges(refined.F, 7).nonmanifold.size
+    stretched = np.array(V) * [1.0, 5.0]
+    stretched[1] -= [0.0, 2.0]
+    refined = refine(stretched, F, [[0, 4], [1, 4]])
+    inner = {tuple(e) for e in edges(refined.F, 7).interior.tolist()}
+    lengths = {pair: np.linalg.norm(refined.V[pair[0]] - refined.V[pair[1]]) for pair in ((0, 6), (1, 5))}
+    assert min(lengths, key=lengths.get) in inner
+    assert max(lengths, key=lengths.get) not in inner
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e300, 1.7e308])
+def test_extreme_coordinates(scale):
+    V = scale * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [0, 0.2]])
+    F = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
+    refined = refine(V, F, [[0, 4], [1, 4], [2, 4]])
+    assert np.isfinite(refined.V).all()
+    assert len(refined.F) == 4 + 6
+
+
+def test_nothing_to_split():
+    refined = refine(*TWO, [])
+    assert refined.F.tolist() == TWO[1]
+    assert refined.V.tolist() == TWO[0]
+    assert refined.parents.shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        ([[1, 3]], r"\(1, 3\): not an edge"),
+        ([[0, 7]], r"\(0, 7\): not an edge"),
+        ([[-1, 2]], r"\(-1, 2\): not an edge"),
+        ([[2, 2]], r"\(2, 2\): not an edge"),
+        ([[0.0, 2.0]], "edges must hold integers"),
+        ([0, 2], "edges must hold integers"),
+        ([[0, 2, 3]], "edges must hold integers"),
+    ],
+)
+def test_wrong_edges_are_named(pairs, message):
+    with pytest.raises(ValueError, match=message):
+        refine(*TWO, pairs)
+
+
+def test_wrong_triangles_are_refused():
+    with pytest.raises(ValueError, match="outside 0 … 3"):
+        refine(TWO[0], [[0, 1, 4]], [])
+    with pytest.raises(ValueError, match="F must hold integers"):
+        refine(TWO[0], [[0.5, 1, 2]], [])
