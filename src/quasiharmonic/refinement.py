@@ -90,7 +90,7 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     >>> V = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
     >>> refined = refine(V, [[0, 1, 2], [0, 2, 3]], [[0, 2]])
     >>> refined.F.tolist(), refined.parent.tolist()
-    ([[4, 0, 1], [4, 2, 3], [4, 1, 2], [4, 3, 0]], [0, 1, 0, 1])
+    ([[4, 1, 2], [4, 3, 0], [4, 0, 1], [4, 2, 3]], [0, 1, 0, 1])
     """
     V = np.array(V, dtype=np.float64)
     F = _indices("F", F, 3)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.diagnosis.curves import BoundaryCurves, winding
 from quasiharmonic.diagnosis.fixture import Fixture, Star
 from quasiharmonic.diagnosis.obstruction import (
     Forbids,
@@ -94,6 +95,39 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
             triangles=open_[patch == k],
             split=split,
         )
+
+
+def misplaced_pins(problem: Problem, fixture: Fixture, curves: BoundaryCurves, proper: bool) -> Iterator[Obstruction]:
+    """Pins that the map cannot reach.
+
+    As many interior vertices can be pinned to a position as the boundary winds around it; where it
+    winds at most once, pins must lie inside, each at a position of its own.
+
+    Parameters
+    ----------
+    problem : Problem
+    fixture : Fixture
+    curves : BoundaryCurves
+    proper : bool
+        Whether the curves are simple and properly nested.
+    """
+    pins = problem.pins
+    if not pins.size:
+        return
+    where, same, times = np.unique(fixture.positions[pins], axis=0, return_inverse=True, return_counts=True)
+    covered, on = winding(where, curves.tails, curves.heads)
+    bad = np.where(on, proper, covered < times)
+    for k in np.flatnonzero(bad).tolist():
+        here = pins[same.ravel() == k]
+        if on[k]:
+            place = "lies on the target's boundary"
+        elif covered[k] <= 0:
+            place = "lies outside the target"
+        else:
+            once = "once" if covered[k] == 1 else f"{covered[k]} times"
+            place = f"share a position that the target covers only {once}"
+        message = f"The pinned interior {named_vertices(here)} {place}."
+        yield Obstruction(Kind.PIN, Forbids.INJECTIVE, message, vertices=here)
 
 
 def half_planes(star: Star, fixture: Fixture) -> Obstruction | None:

@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.diagnosis.curves import BoundaryCurves
-from quasiharmonic.diagnosis.elements import collapsed_edges, half_planes, inverted_patches, inverted_triangles
+from quasiharmonic.diagnosis.elements import (
+    collapsed_edges,
+    half_planes,
+    inverted_patches,
+    inverted_triangles,
+    misplaced_pins,
+)
 from quasiharmonic.diagnosis.fixture import Fixture, stars
 from quasiharmonic.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_edges, named_vertices
 from quasiharmonic.diagnosis.shortcuts import Shortcuts
-from quasiharmonic.diagnosis.sight import Sight, bad_chords, misplaced_pins
+from quasiharmonic.diagnosis.sight import Sight, bad_chords
 from quasiharmonic.mesh.topology import named
 from quasiharmonic.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
@@ -206,7 +212,7 @@ def _meetings(curves: BoundaryCurves) -> Iterator[Obstruction]:
         crossing = bool((relation[here] == SegmentRelation.CROSSING).any())
         who = f"{_named_loops(np.array([a])).capitalize()} of the target"
         whom = "itself" if a == b else f"loop {b}"
-        count = f"{'' if meet.complete else 'at least '}{here.sum()} pairs of edges"
+        count = f"{'' if meet.complete else 'at least '}{here.sum()} {'pair' if here.sum() == 1 else 'pairs'} of edges"
         involved = curves.ends[pairs[here]].reshape(-1, 2)
         message = (
             f"{who} {'crosses' if crossing else 'touches'} {whom} ({count}), among them "

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.diagnosis.clipping import Convex, Walls, line, reverse
-from quasiharmonic.diagnosis.curves import BoundaryCurves, contacts, winding
+from quasiharmonic.diagnosis.curves import BoundaryCurves, contacts
 from quasiharmonic.diagnosis.fixture import Fixture, Star
 from quasiharmonic.diagnosis.obstruction import (
     Forbids,
@@ -33,41 +33,13 @@ BoolArray = NDArray[np.bool_]
 _APART = 8
 
 
-def misplaced_pins(problem: Problem, fixture: Fixture, curves: BoundaryCurves, proper: bool) -> Iterator[Obstruction]:
-    """Pins that the map cannot reach.
-
-    As many interior vertices can be pinned to a position as the boundary winds around it; where it
-    winds at most once, pins must lie inside, each at a position of its own.
-    """
-    on_boundary = np.zeros(problem.n, dtype=bool)
-    on_boundary[curves.ends] = True
-    pins = problem.fixed[~on_boundary[problem.fixed]]
-    if not pins.size:
-        return
-    where, same, times = np.unique(fixture.positions[pins], axis=0, return_inverse=True, return_counts=True)
-    covered, on = winding(where, curves.tails, curves.heads)
-    bad = np.where(on, proper, covered < times)
-    for k in np.flatnonzero(bad).tolist():
-        here = pins[same.ravel() == k]
-        if on[k]:
-            place = "lies on the target's boundary"
-        elif covered[k] <= 0:
-            place = "lies outside the target"
-        else:
-            once = "once" if covered[k] == 1 else f"{covered[k]} times"
-            place = f"share a position that the target covers only {once}"
-        message = f"The pinned interior {named_vertices(here)} {place}."
-        yield Obstruction(Kind.PIN, Forbids.INJECTIVE, message, vertices=here)
-
-
 def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves) -> Iterator[Obstruction]:
     """Interior edges with both ends fixed that do not lie strictly inside, free of all else that is fixed."""
     chords, where = fixture.chords, fixture.positions
     if not len(chords):
         return
     corner = Corners(problem, curves)
-    pins = problem.fixed[~corner.known[problem.fixed]]
-    segments = np.concatenate([curves.ends, np.stack([pins, pins], axis=1), chords])
+    segments = np.concatenate([curves.ends, np.stack([problem.pins, problem.pins], axis=1), chords])
     first = len(segments) - len(chords)
     met: dict[int, list[IntArray]] = {}
     for i, j in contacts(where, segments).pairs.tolist():
@@ -179,6 +151,7 @@ class Sight:
         first = [0]
         while len(first) < min(_APART, len(vertices)):
             distance = np.minimum(distance, np.hypot(*(near - near[first[-1]]).T))
+            distance[first] = -1.0
             first.append(int(np.argmax(distance)))
         return np.concatenate([vertices[first], np.delete(vertices, first)])
 
