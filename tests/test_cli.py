@@ -248,6 +248,25 @@ class TestReportFails:
         assert (tmp_path / "p.png").exists()
 
 
+class TestDiagnose:
+    def test_nothing_found(self, star, capsys):
+        assert run("diagnose", star) == 0
+        assert str(star) in capsys.readouterr().out
+
+    def test_names_what_forbids_a_map(self, tmp_path, capsys):
+        V, F, fixed, target = star_problem(n=80)
+        problem = write_problem(tmp_path, V, F, fixed, target * [1, -1])
+        assert run("diagnose", problem, "--json", "-") == 1
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["obstructions"]
+        assert run("map", problem, "-o", tmp_path / "o.obj", "--json", tmp_path / "r.json") == 1
+        said = capsys.readouterr().out
+        assert "No injective map exists" in said
+        report = json.loads((tmp_path / "r.json").read_text())
+        assert report["status"] == "impossible"
+        assert report["diagnosis"]["obstructions"]
+
+
 class TestPolish:
     def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):
         first, polished = tmp_path / "first.obj", tmp_path / "polished.obj"

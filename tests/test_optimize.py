@@ -147,7 +147,10 @@ class TestStrategy:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ({"optimizer": "sgd"}, "optimizer must be one of vector-adam, l-bfgs, newton, alternating, patches, not 'sgd'"),
+            (
+                {"optimizer": "sgd"},
+                "optimizer must be one of vector-adam, l-bfgs, newton, alternating, patches, not 'sgd'",
+            ),
             ({"parameterization": "log"}, "parameterization must be one of tanh, si-log"),
             ({"functional": "v3"}, "functional must be one of dirichlet"),
             ({"reference": "square"}, "reference must be one of"),

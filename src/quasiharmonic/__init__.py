@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .certificate import Certificate, certify, flipped_triangles, is_injective
+    from .diagnosis import Diagnosis, diagnose
     from .energies import Energy
     from .inject import injective_map, quasi_harmonic_map, solve
     from .measures import Distortion, distortion
     from .polishing import polish
     from .problem import Problem
+    from .refinement import Refined, refine
     from .result import MapResult, Stage, Status, Step
     from .strategy import Descent
 
@@ -23,40 +25,48 @@ __version__ = "0.1.0"
 _HOME = {
     "Certificate": "certificate",
     "Descent": "strategy",
+    "Diagnosis": "diagnosis",
     "Distortion": "measures",
     "Energy": "energies",
     "MapResult": "result",
     "Problem": "problem",
+    "Refined": "refinement",
     "Stage": "result",
     "Status": "result",
     "Step": "result",
     "certify": "certificate",
+    "diagnose": "diagnosis",
     "distortion": "measures",
     "flipped_triangles": "certificate",
     "injective_map": "inject",
     "is_injective": "certificate",
     "polish": "polishing",
     "quasi_harmonic_map": "inject",
+    "refine": "refinement",
     "solve": "inject",
 }
 
 __all__ = [
     "Certificate",
     "Descent",
+    "Diagnosis",
     "Distortion",
     "Energy",
     "MapResult",
     "Problem",
+    "Refined",
     "Stage",
     "Status",
     "Step",
     "certify",
+    "diagnose",
     "distortion",
     "flipped_triangles",
     "injective_map",
     "is_injective",
     "polish",
     "quasi_harmonic_map",
+    "refine",
     "solve",
 ]
 

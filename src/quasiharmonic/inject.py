@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +32,9 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.strategy import Descent, stages_of
 from quasiharmonic.tensor import TANH, TensorField
+
+if TYPE_CHECKING:
+    from quasiharmonic.diagnosis import Diagnosis
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -146,6 +150,7 @@ def solve(
         stages=search.stages,
         history=search.history,
         path=search.path,
+        diagnosis=search.diagnosis,
         linear_solver=search.linear_solver,
         mu=None if field is None else field.mu,
         reference=search.best_reference,
@@ -229,6 +234,7 @@ class _Search:
         self.path: list[Snapshot] = []
         self.history: list[Step] = []
         self.stages: list[Stage] = []
+        self.diagnosis: Diagnosis | None = None
         # Should nothing at all be computed, every free vertex lies at the middle of the target.
         self.best_map = np.zeros(problem.n, dtype=np.complex128)
         self.best_field: TensorField | None = None
@@ -241,27 +247,35 @@ class _Search:
 
     def run(self, stages: Sequence[Descent]) -> Status:
         """Run stages until one finds an injective map; why the search ended."""
-        if not self.problem.encloses_area:
-            stages = [replace(stages[0], iterations=1)]
         status = Status.OUT_OF_ITERATIONS
         try:
-            for stage in stages:
+            if not self.problem.encloses_area:
+                self._descend(replace(stages[0], iterations=1))
+                return self._diagnosed(Status.IMPOSSIBLE)
+            for number, stage in enumerate(stages):
                 status = self._descend(stage)
                 while status is Status.UNSOLVABLE and self._spare and self._left > 0:
                     self.linear_solver = self._spare[0]
                     status = self._descend(replace(stage, resume=True))
                 if status is Status.INJECTIVE:
                     return status
-                if self._left <= 0:
+                # What is tried from the third stage on is dear, and pointless where there is a reason.
+                if self._left <= 0 or (number == 1 and self._diagnosed(status) is Status.IMPOSSIBLE):
                     break
             else:
                 # Every stage has done what it could.
                 status = Status.SETTLED if status is Status.OUT_OF_ITERATIONS else status
+            return self._diagnosed(Status.ROUNDED if self._rounded else status)
         except KeyboardInterrupt:
             return Status.INTERRUPTED
-        if not self.problem.encloses_area:
-            return Status.IMPOSSIBLE
-        return Status.ROUNDED if self._rounded else status
+
+    def _diagnosed(self, status: Status) -> Status:
+        """The status once it is known whether anything forbids a map."""
+        from quasiharmonic.diagnosis import diagnose
+
+        if self.diagnosis is None:
+            self.diagnosis = diagnose(self.problem)
+        return Status.IMPOSSIBLE if self.diagnosis.forbids_injective else status
 
     @property
     def _left(self) -> int:

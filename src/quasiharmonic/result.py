@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 from math import isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.certificate import Certificate
+
+if TYPE_CHECKING:
+    from quasiharmonic.diagnosis import Diagnosis
 
 
 class Status(Enum):
@@ -19,11 +22,11 @@ class Status(Enum):
     INJECTIVE = "Every triangle is strictly positive, decided exactly."
     SETTLED = (
         "Some triangles stay inverted and the energy has settled at a positive value: "
-        "no map was found, and perhaps this mesh and this target admit none."
+        "no map was found, and perhaps this mesh and this target admit none. No known obstruction forbids one."
     )
     IMPOSSIBLE = (
-        "No injective map exists: the area that the target's boundary encloses, counterclockwise for this mesh, is "
-        "not positive. Where the target is wound the wrong way, reflect it or reverse the triangles."
+        "No injective map exists for this mesh and this target: the diagnosis names what forbids it, and what would "
+        "help. This is the best map found."
     )
     OUT_OF_ITERATIONS = (
         "Some triangles were still inverted after the last iteration. "
@@ -140,6 +143,8 @@ class MapResult:
         What ran, how long, what it brought.
     history : list of Step
         Flips and energy at every iteration.
+    diagnosis : Diagnosis or None
+        What forbids a map, examined where none was found.
     linear_solver : str
         The backend that solved the linear systems.
     seconds : float
@@ -158,6 +163,7 @@ class MapResult:
     certificate: Certificate
     stages: list[Stage] = field(default_factory=list)
     history: list[Step] = field(default_factory=list)
+    diagnosis: Diagnosis | None = None
     linear_solver: str = ""
     seconds: float = 0.0
     mu: NDArray[np.complex128] | None = None
@@ -185,4 +191,5 @@ class MapResult:
             "linear_solver": self.linear_solver,
             "stages": [stage.to_dict() for stage in self.stages],
             "certificate": self.certificate.to_dict(),
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
         }

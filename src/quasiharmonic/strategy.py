@@ -17,6 +17,8 @@ from quasiharmonic.problem import Problem
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
 # The longer way that si-log's ξ has to go to the same tensor wants longer steps.
 SI_LOG_STEPS = ((0, 0.5),)
+# Tries at local repair: most succeed in the first few, and a failing one costs as much as many Newton steps.
+_PATCHES = 24
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def speed(problem: Problem) -> list[Descent]:
         return [Descent(parameterization="si-log", iterations=400), *_finish("si-log", 60), *tanh, _LAST]
     # From ξ = 0: where the target overlaps itself, tanh's first steps lead into a valley without an end.
     afresh = replace(_finish("si-log", 300)[0], resume=False)
-    return [*tanh, afresh, Descent("patches", resume=True), _LAST]
+    return [*tanh, afresh, Descent("patches", iterations=_PATCHES, resume=True), _LAST]
 
 
 def quality(problem: Problem) -> list[Descent]:
@@ -123,7 +125,7 @@ def _finish(parameterization: Literal["tanh", "si-log"], steps: int) -> list[Des
     """Newton and local repair from the best so far."""
     return [
         Descent("newton", parameterization, iterations=steps, resume=True),
-        Descent("patches", parameterization, resume=True),
+        Descent("patches", parameterization, iterations=_PATCHES, resume=True),
     ]
 
 

@@ -13,10 +13,10 @@ import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 
-from . import check, demo, map, polish
+from . import check, demo, diagnose, map, polish
 from .report import ReportError
 
-COMMANDS = (map, polish, check, demo)
+COMMANDS = (map, polish, check, diagnose, demo)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

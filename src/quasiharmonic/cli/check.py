@@ -42,10 +42,7 @@ def run(options: argparse.Namespace) -> int:
 
     from . import report
 
-    if options.json not in (None, "-"):
-        io.check_writable(options.json)
-        if Path(options.json).resolve() == options.input.resolve():
-            raise ValueError(f"--json {options.json} would replace the input file")
+    report.check_json(options.json, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
     uv = io.map_of(mesh)
     if options.precision == "float32":

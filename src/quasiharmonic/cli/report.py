@@ -36,6 +36,8 @@ def of_map(result: MapResult, certificate: Certificate, output: Path) -> str:
     lines = [f"wrote {output}: {certificate.summary()}"]
     if not certificate.injective:
         lines.append(result.status.value)
+        if result.diagnosis is not None and result.diagnosis.obstructions:
+            lines.append(result.diagnosis.summary())
     plural = "" if result.iterations == 1 else "s"
     lines.append(f"{result.iterations} iteration{plural}, {result.seconds:.3g} s, {result.linear_solver}")
     return "\n".join(lines)
@@ -69,17 +71,27 @@ def check_outputs(map_path: Path, plot: Path | None, json_path: str | None, inpu
     if plot is not None and plot.suffix.lower() != ".png":
         raise ValueError(f"--plot {plot}: pictures are written as .png")
     taken = {map_path.resolve(): "the map (-o)"}
-    kept = {path.resolve() for path in inputs if path is not None}
-    others = (("--plot", plot), ("--json", None if json_path in (None, "-") else Path(str(json_path))))
-    for option, path in others:
+    for option, path in (("--plot", plot), ("--json", None if json_path in (None, "-") else Path(str(json_path)))):
         if path is None:
             continue
-        io.check_writable(path)
-        if path.resolve() in kept:
-            raise ValueError(f"{option} {path} would replace an input file")
+        _check_replaces_nothing(option, path, inputs)
         if path.resolve() in taken:
             raise ValueError(f"{option} {path} is also the file of {taken[path.resolve()]}")
         taken[path.resolve()] = option
+
+
+def check_json(json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for a command that writes a report alone."""
+    if json_path not in (None, "-"):
+        _check_replaces_nothing("--json", Path(str(json_path)), inputs)
+
+
+def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
+    from quasiharmonic import io
+
+    io.check_writable(path)
+    if path.resolve() in {source.resolve() for source in inputs if source is not None}:
+        raise ValueError(f"{option} {path} would replace an input file")
 
 
 @contextmanager

@@ -30,7 +30,7 @@ IntArray = NDArray[np.int64]
 # Rings of triangles around an inverted one, tried in turn.
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16
 # More flips than this are no matter for local repair, and larger patches are no patches.
-_MOST_FLIPS, _MOST_TRIANGLES = 100, 5000
+_MOST_FLIPS, _MOST_TRIANGLES = 50, 1000
 # Weight of areas against angles; rounds of lowering ε and descents within each.
 _LAMBDA, _ROUNDS, _STEPS = 1e-2, 10, 300
 
