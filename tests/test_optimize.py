@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import lift, random_xi
+from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Descent, Problem, solve
 from quasiharmonic.functionals import beltrami_energy
-from quasiharmonic.objective import Objective
+from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize.alternating import alternating, own_tensor
 from quasiharmonic.optimize.lbfgs import lbfgs
 from quasiharmonic.optimize.newton import _gather, _Model, newton
+from quasiharmonic.optimize.patches import patches
 from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.strategy import STRATEGIES, stages_of
+from quasiharmonic.surfaces import grid
 from quasiharmonic.tensor import PARAMETERIZATIONS, TANH
 from test_inject import star_problem, turned_ring
 
@@ -141,6 +143,49 @@ def test_vector_adam_ignores_the_frames():
     turned = np.where((np.arange(len(F)) % 2)[:, None], np.roll(F, -1, axis=1), F)
     a, b = (solve(Problem(V, G, fixed, target)) for G in (F, turned))
     np.testing.assert_allclose(a.uv, b.uv, atol=1e-9)
+
+
+class TestPatches:
+    def displaced(self, *vertices):
+        """An injective map with some free vertices thrown across their neighbours."""
+        V, F = grid(12, 12)
+        problem = Problem(V, F, boundary_of(F), bend(V[boundary_of(F)]))
+        objective = Objective(problem)
+        w = problem.frame.inward(bend(V))
+        for vertex in vertices:
+            w[vertex] += 0.25
+        dw = objective.mesh.derivatives(w)
+        return objective, Iterate(objective, TANH.field(TANH.invert(own_tensor(dw))), w, dw)
+
+    def test_only_the_patch_changes(self):
+        vertex = 5 * 13 + 6
+        objective, start = self.displaced(vertex)
+        assert start.flipped > 0
+        seen = path(patches, objective, start, iterations=5)
+        assert seen[-1].flipped == 0
+        moved = np.flatnonzero(seen[-1].w != start.w)
+        assert vertex in moved
+        near = np.abs(objective.problem.V[moved] - objective.problem.V[vertex]).max(axis=1)
+        assert near.max() < 4 / 12
+        assert not np.isin(moved, objective.problem.fixed).any()
+
+    def test_two_places_one_after_the_other(self):
+        objective, start = self.displaced(2 * 13 + 3, 9 * 13 + 8)
+        flips = [i.flipped for i in path(patches, objective, start, iterations=20)]
+        assert flips[-1] == 0
+        assert np.all(np.diff(flips) < 0)
+        assert len(flips) > 2
+
+    def test_gives_a_quasi_harmonic_map(self):
+        """Where it ends without a flip its tensors are those of the map, and V₃ is zero."""
+        objective, start = self.displaced(5 * 13 + 6)
+        end = path(patches, objective, start, iterations=5)[-1]
+        assert end.energy < 1e-20
+        np.testing.assert_allclose(objective.evaluate(end.xi).w, end.w, atol=1e-9)
+
+    def test_leaves_alone_what_is_injective(self):
+        objective, start = self.displaced()
+        assert path(patches, objective, start, iterations=5) == [start]
 
 
 class TestStrategy:

@@ -42,7 +42,7 @@ TWO_TRIANGLES = np.array([[0, 1, 2], [3, 4, 5]])
         ({"V": np.zeros((0, 2)), "F": []}, "the mesh has no triangles"),
         ({"F": F[:, :2]}, r"F must have shape \(f, 3\)"),
         ({"F": F.astype(float)}, "F must hold integer"),
-        ({"F": changed(F, (5, 0), len(V))}, rf"F refers to vertex {len(V)}, but there are only vertices 0 … {len(V) - 1}"),
+        ({"F": changed(F, (5, 0), len(V))}, rf"F refers to vertex {len(V)}, but there are only vertices 0 … "),
         ({"F": changed(F, (5, 0), -1)}, "F refers to vertex -1"),
         ({"F": F.astype(np.uint64) + np.uint64(2**63)}, "F refers to vertex 9223372036854775"),
         ({"F": [[0, 1, 2], [1, 2]]}, "F is not an array: its rows differ in length"),
