@@ -18,7 +18,7 @@ TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
 # The longer way that si-log's ξ has to go to the same tensor wants longer steps.
 SI_LOG_STEPS = ((0, 0.5),)
 # Tries at local repair: most succeed in the first few, and a failing one costs as much as many Newton steps.
-_PATCHES = 24
+_PATCHES = 60
 
 
 @dataclass(frozen=True)
