@@ -1,0 +1,47 @@
+"""Figure 5: the paths of tanh and si-log on a curved surface that goes onto a G."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from common import COLORS, first_map, frames, mips, onto, panels, run, save, show
+from quasiharmonic import surfaces, targets
+
+SHOTS = 5
+
+
+def main(output: Path, size: int = 40) -> dict[str, Any]:
+    V, F = surfaces.cat(size)
+    problem = onto(V, F, targets.letter("G")[0])
+    figure, axes = panels(3, SHOTS, (2.5, 3.0))
+    for ax in axes[2]:
+        ax.remove()
+    curves = [figure.add_axes((0.07 + 0.5 * k, 0.065, 0.41, 0.23)) for k in range(2)]
+    numbers: dict[str, Any] = {"triangles": len(F)}
+    for row, name in zip(axes, COLORS, strict=False):
+        result = first_map(problem, name, record=1)
+        for ax, at in zip(row, frames([step.flipped**0.5 for step in result.history], SHOTS), strict=True):
+            snapshot = result.path[at]
+            show(ax, problem, snapshot.uv, f"{name}, iteration {snapshot.iteration}", size=9)
+        steps = [step.iteration for step in result.history]
+        curves[0].plot(steps, [step.flipped for step in result.history], color=COLORS[name], lw=2, label=name)
+        curves[1].plot(steps, [step.energy for step in result.history], color=COLORS[name], lw=2, label=name)
+        numbers[name] = {
+            "flips at the start": result.history[0].flipped,
+            "flips": len(result.certificate.flipped),
+            "iterations": result.iterations,
+            "MIPS": round(mips(problem, result.uv), 2),
+        }
+    curves[0].set(ylabel="inverted triangles", yscale="symlog", ylim=(0, None))
+    curves[1].set(ylabel="V₃ / area", yscale="log")
+    for ax in curves:
+        ax.set_xlabel("iteration")
+        ax.grid(alpha=0.3)
+        ax.legend()
+    save(figure, output, "figure_05")
+    return numbers
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,45 @@
+"""Figure 7: the curves |ξ| ↦ |μ| of the two parameterisations, and what they are for.
+
+The paper draws ``r = tanh`` and ``r = si-log``. So do we, and beside them how far ξ must go for a given
+angle distortion σ₁/σ₂ = (1 + |μ|)/(1 − |μ|): a distance that grows with the logarithm of the distortion for
+tanh and exponentially with it for si-log. For σ₁/σ₂ = 19, that is |μ| = 0.9, tanh needs |ξ| = 1.5, si-log 8,100.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import COLORS, panels, run, save
+from quasiharmonic.tensor import PARAMETERIZATIONS
+
+
+def main(output: Path) -> dict[str, Any]:
+    figure, [axes] = panels(1, 2, (5, 4))
+    for k, ax in enumerate(axes):
+        ax.set_position((0.08 + 0.5 * k, 0.15, 0.39, 0.75))
+    numbers = {}
+    for name, parameterization in PARAMETERIZATIONS.items():
+        rho = np.linspace(0, 5, 400)
+        axes[0].plot(rho, rho * parameterization.radial(rho)[0], color=COLORS[name], lw=2, label=name)
+        distortion = np.geomspace(1, 1000, 400)[1:]
+        far = parameterization.inverse((distortion - 1) / (distortion + 1))
+        shown = far < 1e12
+        axes[1].plot(distortion[shown], far[shown], color=COLORS[name], lw=2, label=name)
+        numbers[name] = {
+            "|μ| at |ξ| = 1": float(parameterization.radial(np.ones(1))[0][0]),
+            "|ξ| at |μ| = 0.9": float(parameterization.inverse(np.array([0.9]))[0]),
+        }
+    axes[0].set(xlabel="|ξ|", ylabel="|μ| = r(|ξ|)", ylim=(0, 1))
+    axes[1].set(xlabel="σ₁/σ₂", ylabel="|ξ| that it takes", xscale="log", yscale="log", xlim=(1, 1000))
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        ax.legend()
+    save(figure, output, "figure_07")
+    return numbers
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,72 @@
+"""Figure 18: boundaries that allow no map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import first_map, panels, ring, run, save, show
+from quasiharmonic import Problem, surfaces
+from quasiharmonic.diagnosis import diagnose
+from quasiharmonic.mesh.topology import boundary_loops
+
+
+def problems(size: int) -> dict[str, Problem]:
+    """A disk onto curves that bound nothing, and rings too coarse for the turn that is asked of them."""
+    V, F = surfaces.disk(size)
+    (loop,) = boundary_loops(F, len(V))
+    t = 2 * np.pi * np.arange(len(loop)) / len(loop)
+    eight = np.stack([np.cos(t), 0.5 * np.sin(2 * t) + 0.25 * np.sin(t)], axis=1)
+    # Four loops outwards, wound the wrong way, at the corners of a disk.
+    looped = np.stack([1.2 * np.cos(t) - 0.5 * np.cos(3 * t), 0.6 * np.sin(t) + 0.45 * np.sin(3 * t)], axis=1)
+    return {
+        "lopsided eight": Problem(V, F, loop, eight),
+        "four loops": Problem(V, F, loop, looped),
+        "coarse ring by π": ring(8, (-0.5, -0.5, 0.5, 0.5), np.pi),
+    }
+
+
+def winding_area(problem: Problem) -> float:
+    """``∫ |winding number|`` of the target's boundary over the plane, by sampling: no map covers less area."""
+    place = dict(zip(problem.fixed.tolist(), problem.target @ (1, 1j), strict=True))
+    low, high = problem.target.min(axis=0), problem.target.max(axis=0)
+    x, y = (low[k] + (np.arange(400) + 0.5) / 400 * (high - low)[k] for k in range(2))
+    points = (x[:, None] + 1j * y).ravel()
+    turns = np.zeros(points.size)
+    for loop in problem.loops:
+        b = np.array([place[i] for i in loop.tolist()])
+        for start, end in zip(b, np.roll(b, -1), strict=True):
+            turns += np.angle((end - points) / (start - points))
+    return float(np.abs(np.round(turns / (2 * np.pi))).mean() * np.prod(high - low))
+
+
+def main(output: Path, size: int = 16) -> dict[str, Any]:
+    numbers: dict[str, Any] = {}
+    cases = problems(size)
+    figure, axes = panels(2, len(cases), (3.6, 3.9))
+    for above, below, (name, problem) in zip(*axes, cases.items(), strict=True):
+        result = first_map(problem, "tanh", 3000, record=1)
+        deepest = min(result.history, key=lambda step: step.energy)
+        uv = result.path[deepest.iteration].uv
+        area = problem.mesh("rest").derivatives(uv @ (1, 1j)).area
+        signed, unsigned = float(area.sum()), float(np.abs(area).sum())
+        show(above, problem, result.path[0].uv, f"{name}: first guess")
+        show(below, problem, uv, f"{result.status.name.lower()} after {result.iterations} iterations")
+        numbers[name] = {
+            "flips at first": result.history[0].flipped,
+            "flips": len(result.certificate.flipped),
+            "iterations": result.iterations,
+            "status": result.status.name,
+            "unsigned area": round(unsigned, 4),
+            "A-Dirichlet energy": round(signed + deepest.energy * abs(signed), 4),
+            "least unsigned area of any map": round(winding_area(problem), 4),
+            "known obstructions": sorted({o.kind.name for o in diagnose(problem).obstructions}),
+        }
+    save(figure, output, "figure_18")
+    return numbers
+
+
+if __name__ == "__main__":
+    run(main)
