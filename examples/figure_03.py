@@ -1,4 +1,13 @@
-"""Figure 3: harmonic maps onto nonconvex outlines fold over the concave corners; si-log unfolds them."""
+"""Figure 3: harmonic maps onto nonconvex outlines fold over the concave corners; si-log unfolds them.
+
+The paper shows shapes of Du et al. and Weber and Zorin: cotangent weights invert triangles at concave corners,
+si-log does not. Here are outlines of the same kind, an arrow, a cross, and a sheet two of whose corners are bent
+across each other (four crossings, one turn in all), from a square of 24 × 24 cells.
+
+Harmonic maps invert 344, 170 and 91 of 1,152 triangles, si-log none after 194, 40 and 63 iterations: as in the
+paper. The sheet's map is injective triangle by triangle and, its target overlapping itself, not bijective. si-log
+is not the less distorted on every shape: on the arrow tanh finds a map of MIPS 9.9 in 4 iterations, si-log 13.8.
+"""
 
 from __future__ import annotations
 

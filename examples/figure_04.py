@@ -1,4 +1,23 @@
-"""Figure 4: the inner rectangle turned by π, until something breaks."""
+"""Figure 4: the inner rectangle turned by π, until something breaks.
+
+The paper shows one ring, which its method passes, with triangles that become very thin. Here are fourteen, ever
+narrower, finer, off-centre and stretched, each from several functionals: their own descent first, then Newton's method
+on V₃ for the triangles that are left.
+
+What breaks first is existence, and it is proven: where a corner of the hole has but two layers of triangles to the
+outside, the diagnosis names vertices that no point of the target lets see all their fixed neighbours, and no map
+exists. One layer more and there is one. Where nothing forbids a map,
+
+- V₃ never fails: tanh takes 64 to 290 iterations, si-log 220 to 482, down to a strip of 1/40 of the width;
+- V₂ never fails with si-log (246 to 491) and does on five of eleven rings with tanh;
+- V₁ fails with si-log on the narrowest strip alone (2 of 7,800 triangles), with tanh on four;
+- V₄ fails on seven with either, for the reason that Figure 6 has; where it succeeds it is by Newton's method.
+
+Refinement is no difficulty: 6 and 12 layers take 108 and 112 iterations.
+
+By default every combination runs on the first ring and those with a chance on the others; ``--full`` runs
+all on all, ``--size 14`` adds the narrowest ring.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +92,9 @@ def main(output: Path, size: int = 13, full: bool = False) -> dict[str, Any]:
     figure, axes = panels(3, len(DRAWN), (3.2, 3.4))
     for (above, below, _), (name, (problem, uv)) in zip(zip(*axes, strict=True), maps.items(), strict=False):
         show(above, problem, uv, name)
-        show(below, problem, uv, "the hole's corner")
+        show(below, problem, uv, "")
+        below.triplot(*uv.T, problem.F, color="white", lw=0.4)
+        below.set_title("a corner of the hole, × 17", size=10)
         corner = problem.target[np.argmax(problem.target @ (1, 1) * (np.abs(problem.target).max(axis=1) < 1))]
         below.set(xlim=corner[0] + np.array((-0.09, 0.03)), ylim=corner[1] + np.array((-0.09, 0.03)))
     for ax in axes[2]:
@@ -85,13 +106,14 @@ def main(output: Path, size: int = 13, full: bool = False) -> dict[str, Any]:
 
 def table(figure: Figure, numbers: dict[str, Any]) -> None:
     """Iterations to the first injective map, or what was left."""
-    ax = figure.add_axes((0.2, 0.01, 0.79, 0.3))
+    ax = figure.add_axes((0.27, 0.01, 0.72, 0.3))
     ax.set_axis_off()
     cells = [[row.get(column, "") for column in COLUMNS] for row in numbers.values()]
     rows = [f"{name} ({row['triangles']:,})" for name, row in numbers.items()]
     drawn = ax.table(cells, rowLabels=rows, colLabels=COLUMNS, loc="upper center", cellLoc="center")
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(9)
+    drawn.scale(1, 1.15)
     colors = {"": "white", "exists": "0.85", "inverted": "#f6b8bf"}
     for (i, j), cell in drawn.get_celld().items():
         cell.set_edgecolor("0.8")

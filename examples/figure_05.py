@@ -1,4 +1,13 @@
-"""Figure 5: the paths of tanh and si-log on a curved surface that goes onto a G."""
+"""Figure 5: the paths of tanh and si-log on a curved surface that goes onto a G.
+
+The paper maps Lucy and counts gradients: tanh is injective in fewer than 60, si-log in 190 and with a MIPS energy an
+order of magnitude below others'. Its quasi-Newton, projected Newton and soft-barrier rivals need thousands; they
+are other programs and not run here.
+
+Here it is the head of a cat, 9,600 triangles of which Tutte's embedding inverts 2,644. tanh takes 20 iterations and
+ends at MIPS 13.8, si-log 118 and 6.5: the same trade. Both undo most inversions in the first ten iterations, and the
+last few triangles take most of the time. V₃ need not fall at every step: VectorAdam's is not a line search.
+"""
 
 from __future__ import annotations
 

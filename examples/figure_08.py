@@ -1,4 +1,13 @@
-"""Figure 8: the first injective maps of tanh and si-log, coloured by their angle distortion."""
+"""Figure 8: the first injective maps of tanh and si-log, coloured by their angle distortion.
+
+The paper shows one pair and says that si-log's distortion is the smaller. Here are two pairs. Onto the letter S,
+si-log's first map has a MIPS energy of 5.5 against tanh's 10.3, and 99 % of its triangles lie below σ₁/σ₂ = 16
+against 61; on the ring turned by a quarter it is 1.46 against 1.69 and 3.8 against 4.7. The price is iterations: 66
+against 5, and 22 against 3.
+
+Said plainly: the largest single ratio is si-log's, 620 against 230 and 115 against 5. The search stops at the first
+map without inverted triangles, and the triangle that was righted last is nearly flat.
+"""
 
 from __future__ import annotations
 

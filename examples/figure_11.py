@@ -1,4 +1,12 @@
-"""Figure 11: the middle of a rectangle moved to its left, the boundary held; coloured by σ₁/σ₂."""
+"""Figure 11: the middle of a rectangle moved to its left, the boundary held; coloured by σ₁/σ₂.
+
+The paper compares si-log, which keeps the largest σ₁/σ₂ small, with a map of least MIPS energy (tanh + MIPS), which
+concentrates it in a spike at the point. So it is here: si-log takes 3 iterations and its largest ratio is 2.9; the map
+of least MIPS has less than half its energy (0.25 against 0.57) and a largest ratio of 35.
+
+The paper descends MIPS along with V₃ from tanh; here the si-log map is polished, as tanh alone does not get
+there: one of 6,400 triangles stays inverted, and at other places of the point up to eight.
+"""
 
 from __future__ import annotations
 

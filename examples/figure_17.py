@@ -1,4 +1,13 @@
-"""Figure 17: two points of a square change places, at ever finer grids; and two small disks in their stead."""
+"""Figure 17: two points of a square change places, at ever finer grids; and two small disks in their stead.
+
+The paper's si-log succeeds up to 140 × 140 cells and fails at 160 × 160. With larger steps and less momentum, and
+without being told which parameterisation to take, we get through at every size: 90, 132, 151 and 192 iterations at 20,
+40, 80 and 160 squared, and with ``--finest`` 237 at 320 squared. It does grow, about as the logarithm of the size,
+since a point held in the plane is no boundary to a Laplacian.
+
+Disks of radius 0.055 in place of the points, as §10.3 suggests, make the iterations independent of the size: 316, 194,
+224, 209 and 215. On the coarsest grid such a disk is five vertices and the gap between the two is tight.
+"""
 
 from __future__ import annotations
 

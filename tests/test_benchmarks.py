@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, certify
+from quasiharmonic import Problem, certify, solve
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -146,3 +146,13 @@ def test_a_generator_that_fails_is_a_failure_with_a_summary(monkeypatch):
 def test_without_a_known_solution_no_map_is_no_failure():
     assert not campaign.failed({"outcome": "not injective", "feasible": False})
     assert campaign.failed({"outcome": "not injective", "feasible": True})
+
+
+@pytest.mark.parametrize("name", ["jam:2:0.736", "noise:4:0.972"])
+def test_local_repair_solves_what_newton_leaves(name):
+    """Problems whose last triangle has next to no room: solved by the patches of the default strategy."""
+    case = problems.make(*problems.parse(name))
+    result = solve(Problem(case.V, case.F, case.fixed, case.target))
+    assert result.injective
+    assert result.stages[-1].name.startswith("patches")
+    assert result.stages[-1].flipped[0] > 0

@@ -88,6 +88,14 @@ class TestMap:
         assert facts["flipped"]
         assert run("check", out) == 1
 
+    @pytest.mark.parametrize("scale", [1e-300, 1e160])
+    def test_pictures_of_any_scale(self, tmp_path, scale):
+        V, F, fixed, target = star_problem(n=120)
+        problem = write_problem(tmp_path, V * scale, F, fixed, target / scale)
+        arguments = "--plot", tmp_path / "p.png", "--reference", "rest"
+        assert run("map", problem, "-o", tmp_path / "o.obj", *arguments) == 0
+        assert (tmp_path / "p.png").exists()
+
     @pytest.mark.parametrize("strategy", ["speed", "quality"])
     @pytest.mark.parametrize("reference", ["equilateral", "rest", "corrected"])
     def test_options_reach_the_solver(self, star, tmp_path, strategy, reference):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numpy as np
@@ -102,8 +103,7 @@ class TestTheory:
         V, F = disk(8)
         fixed = boundary_of(F)
         target = V[fixed] / np.abs(V[fixed]).sum(axis=1, keepdims=True)
-        turned = np.vstack([target, target])[: len(target)]
-        result = injective_map(lift(V), F, fixed, turned * [3.0, 0.5])
+        result = injective_map(lift(V), F, fixed, target * [3.0, 0.5])
         assert result.injective
         assert result.iterations == 0
 
@@ -236,6 +236,25 @@ class TestNoMap:
         with pytest.raises(ValueError, match="max_iterations must be a whole number"):
             injective_map(*star_problem(n=60), max_iterations=wrong)
 
+    def test_a_strategy_of_ones_own_that_ends_early_has_not_settled(self):
+        result = injective_map(*turned_ring(180), strategy=[Descent(iterations=3)])
+        assert result.status is Status.OUT_OF_ITERATIONS
+
+    def test_a_stage_resumes_where_the_energy_was_lowest(self):
+        """Not at ξ = 0, and not at the last iterate."""
+        stages = [Descent(iterations=100), Descent("newton", iterations=1, resume=True)]
+        result = injective_map(*turned_ring(180), strategy=stages)
+        first = result.history[:101]
+        lowest = min(first, key=lambda step: step.energy)
+        assert lowest.energy < 0.2 * first[0].energy
+        assert result.history[101].energy == pytest.approx(lowest.energy, rel=1e-6)
+
+    def test_what_makes_it_worse_is_discarded(self):
+        stages = [Descent(iterations=60), Descent("alternating", iterations=2)]
+        result = injective_map(*turned_ring(180), strategy=stages)
+        assert [stage.kept for stage in result.stages] == [True, False]
+        assert np.sum(signed_areas(turned_ring(180)[1], result.uv) <= 0) == result.stages[1].flipped[1]
+
     def test_out_of_iterations(self):
         result = injective_map(*turned_ring(180), max_iterations=3)
         assert result.status is Status.OUT_OF_ITERATIONS
@@ -333,6 +352,37 @@ def test_the_tensors_give_the_map_back(strategy):
     result = solve(problem, strategy=strategy)
     again = quasi_harmonic_map(problem, result.mu, reference=result.reference)
     np.testing.assert_allclose(again, result.uv, atol=1e-9)
+
+
+def test_moved_problems_in_threads_give_what_they_give_alone():
+    base = Problem(*turned_ring(90))
+    targets = [base.target * [1, s] for s in (1, 0.9, 0.8)]
+    alone = [solve(base.moved(target)).uv for target in targets]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(lambda target: solve(base.moved(target)).uv, targets))
+    for a, b in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_solve_within_a_callback_disturbs_nothing():
+    problem = Problem(*star_problem())
+    plain = solve(problem).uv
+    nested = solve(problem, callback=lambda step: solve(problem.moved(2 * problem.target), max_iterations=1)).uv
+    np.testing.assert_array_equal(plain, nested)
+
+
+@pytest.mark.parametrize(
+    ("mu", "words"),
+    [(1.0, "not below 1 in modulus at triangles 0, 1"), (np.nan, "not below 1"), ("x", "one a triangle")],
+)
+def test_quasi_harmonic_map_checks_its_tensors(mu, words):
+    problem = Problem(*star_problem(n=60))
+    with pytest.raises(ValueError, match=words):
+        quasi_harmonic_map(problem, np.full(len(problem.F), mu))
+    with pytest.raises(ValueError, match="one a triangle"):
+        quasi_harmonic_map(problem, np.zeros(3))
+    with pytest.raises(ValueError, match="reference must be one of"):
+        quasi_harmonic_map(problem, reference="square")
 
 
 def test_public_names_are_lazy_and_complete():

@@ -10,8 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from numbers import Integral
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +19,7 @@ from quasiharmonic.certificate import certify, flipped_triangles
 from quasiharmonic.energies import Energy
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.mesh.topology import named
 from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize import Stop
 from quasiharmonic.optimize.alternating import alternating, own_tensor
@@ -30,7 +30,7 @@ from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.polishing import energy_named, polish_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
-from quasiharmonic.strategy import Descent, stages_of
+from quasiharmonic.strategy import Descent, stages_of, whole_number
 from quasiharmonic.tensor import TANH, TensorField
 
 if TYPE_CHECKING:
@@ -135,11 +135,12 @@ def solve(
 ) -> MapResult:
     """Solve a problem at hand; parameters and result as `injective_map` has them."""
     began = time.perf_counter() if _began is None else _began
-    if not isinstance(max_iterations, Integral) or max_iterations < 1:
-        raise ValueError(f"max_iterations must be a whole number of at least 1, not {max_iterations!r}")
+    whole_number("max_iterations", max_iterations, least=1)
+    whole_number("record", record, least=0)
     lower = None if polish is None else energy_named(polish)
-    search = _Search(problem, linear_solver, callback, max_iterations, record)
-    status = search.run(stages_of(strategy, problem))
+    with problem.exclusive() as own:
+        search = _Search(own, linear_solver, callback, max_iterations, record)
+        status = search.run(stages_of(strategy, own))
     uv = problem.positions(search.best_map)
     certificate = certify(problem.F, uv)
     field = search.best_field
@@ -155,7 +156,7 @@ def solve(
         mu=None if field is None else field.mu,
         reference=search.best_reference,
     )
-    if lower is not None and result.injective:
+    if lower is not None and status is Status.INJECTIVE:
         polished = polish_map(problem, uv, energy=lower, linear_solver=search.linear_solver, callback=callback)
         result = replace(
             polished,
@@ -193,12 +194,22 @@ def quasi_harmonic_map(
 
     Raises
     ------
+    ValueError
+        When μ has another shape or is not below 1 in modulus; the message names the triangles.
     quasiharmonic.linsolve.NotPositiveDefinite
         When rounding leaves no positive definite Laplacian.
     """
-    objective = Objective(problem, reference=reference, linear_solver=linear_solver)
-    xi = np.zeros(len(problem.F), dtype=np.complex128) if mu is None else TANH.invert(mu)
-    return problem.positions(objective.evaluate(xi).w)
+    if reference not in get_args(Reference):
+        raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
+    coefficients = np.zeros(len(problem.F)) if mu is None else np.asarray(mu)
+    if coefficients.shape != (len(problem.F),) or coefficients.dtype.kind not in "iufc":
+        raise ValueError(f"mu must hold {len(problem.F)} numbers, one a triangle, not an array of {coefficients.shape}")
+    bad = np.flatnonzero(~(np.abs(coefficients) < 1))
+    if bad.size:
+        raise ValueError(f"mu is not below 1 in modulus at {named('triangle', 'triangles', bad)}")
+    with problem.exclusive() as own:
+        objective = Objective(own, reference=reference, linear_solver=linear_solver)
+        return own.positions(objective.evaluate(TANH.invert(coefficients.astype(np.complex128))).w)
 
 
 _Visit = Callable[[Iterate], None]
@@ -222,8 +233,6 @@ class _Search:
         budget: int,
         record: int,
     ) -> None:
-        if record < 0:
-            raise ValueError(f"record must not be negative, but is {record}")
         self.problem = problem
         # Where rounding defeats one backend's factorisation, another's order of elimination may do.
         self.linear_solver = linear_solver
@@ -262,9 +271,6 @@ class _Search:
                 # What is tried from the third stage on is dear, and pointless where there is a reason.
                 if self._left <= 0 or (number == 1 and self._diagnosed(status) is Status.IMPOSSIBLE):
                     break
-            else:
-                # Every stage has done what it could.
-                status = Status.SETTLED if status is Status.OUT_OF_ITERATIONS else status
             return self._diagnosed(Status.ROUNDED if self._rounded else status)
         except KeyboardInterrupt:
             return Status.INTERRUPTED
@@ -285,6 +291,7 @@ class _Search:
     def _descend(self, stage: Descent) -> Status:
         """Run one stage."""
         before, done, began = None, max(len(self.history), 1), time.perf_counter()
+        status = Status.INTERRUPTED
         self._mark, self._marked = (len(self.problem.F) + 1, np.inf), len(self.history)
         self._patience, self._progress = stage.patience
         try:
@@ -298,8 +305,11 @@ class _Search:
             # The first map of all is what the first stage begins with.
             before = self.best if self.history else (start.flipped, start.energy)
             self._visit(start)
-            _METHODS[stage.optimizer](objective, start, self._visit, stage, min(stage.iterations, self._left))
-            status = Status.OUT_OF_ITERATIONS
+            begun, allowed = len(self.history), min(stage.iterations, self._left)
+            _METHODS[stage.optimizer](objective, start, self._visit, stage, allowed)
+            # A method that returns before its iterations are spent has nothing left to do.
+            spent = len(self.history) - begun >= allowed
+            status = Status.OUT_OF_ITERATIONS if spent or stage.optimizer == "newton" else Status.SETTLED
         except Stop as stop:
             status = stop.status
         except NotPositiveDefinite:
@@ -312,7 +322,7 @@ class _Search:
                     seconds=time.perf_counter() - began,
                     flipped=((before or self.best)[0], self.best[0]),
                     energy=((before or self.best)[1], self.best[1]),
-                    kept=self.best != before,
+                    kept=self.best != before or status is Status.INJECTIVE,
                 )
             )
         return status

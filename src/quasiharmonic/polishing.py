@@ -226,6 +226,8 @@ def energy_named(energy: str | Energy) -> Energy:
         if energy not in ENERGIES:
             raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}")
         return ENERGIES[energy]
+    if not isinstance(energy, Energy):
+        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}")
     if not energy.barrier:
         raise ValueError(
             f"{type(energy).__name__} is no barrier: it would let the first triangles collapse and stop there; "

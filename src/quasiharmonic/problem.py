@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
+from threading import Lock
 from typing import Any, get_args
 
 import numpy as np
@@ -78,12 +81,33 @@ class Problem:
         self.target = _target(target, len(self.fixed))
         for array in (self.V, self.F, self.fixed, self.target):
             array.flags.writeable = False
+        self._lock = Lock()
         self._laplacians: dict[str, Laplacian] = {}
         self._meshes: dict[Reference, ReferenceMesh] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         # Factorisations live in a library's memory and stay behind when a problem is pickled.
-        return {**self.__dict__, "_laplacians": {}}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_laplacians", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _laplacians={}, _lock=Lock())
+
+    @contextmanager
+    def exclusive(self) -> Iterator[Problem]:
+        """Give this problem, or a twin with factorisations of its own while another solve is using this one's.
+
+        Problems that `moved` made share them, and two threads, or a solve within another's callback, must not
+        overwrite each other's.
+        """
+        if not self._lock.acquire(blocking=False):
+            twin = object.__new__(Problem)
+            twin.__setstate__(self.__getstate__())
+            yield twin
+            return
+        try:
+            yield self
+        finally:
+            self._lock.release()
 
     def moved(self, target: ArrayLike) -> Problem:
         """The same problem with its fixed vertices elsewhere.

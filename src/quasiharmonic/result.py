@@ -150,8 +150,8 @@ class MapResult:
     seconds : float
         Wall time from the call to the verdict.
     mu : (f,) complex128 or None
-        Beltrami coefficients of the tensors whose quasi-harmonic map this is (`quasi_harmonic_map` gives it
-        back), where a tensor field made it.
+        Beltrami coefficients of the tensors of this map: where it is injective, `quasi_harmonic_map` of them
+        gives it back. None after a polish.
     reference : str
         The triangles in whose frames they are expressed.
     path : list of Snapshot

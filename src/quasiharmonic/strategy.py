@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import Literal, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 
@@ -63,13 +63,12 @@ class Descent:
             words, given = get_args(hint), getattr(self, name)
             if words and all(isinstance(word, str) for word in words) and given not in words:
                 raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
-        if not isinstance(self.iterations, Integral) or self.iterations < 1:
-            raise ValueError(f"iterations must be a whole number of at least 1, not {self.iterations!r}")
+        whole_number("iterations", self.iterations, least=1)
         try:
             times, lengths = np.array([*zip(*self.steps, strict=True)], dtype=np.float64)
         except (TypeError, ValueError):
             times, lengths = np.zeros(2), np.zeros(2)
-        if np.any(np.diff(times) <= 0) or not np.all((lengths > 0) & np.isfinite(lengths)):
+        if not np.all(np.diff(times) > 0) or not np.all((times >= 0) & (lengths > 0) & np.isfinite(times + lengths)):
             raise ValueError(
                 "schedule must be pairs (iteration, step length), iterations ascending and lengths positive, "
                 f"not {self.schedule!r}"
@@ -95,6 +94,12 @@ class Descent:
     def steps(self) -> Sequence[tuple[int, float]]:
         """VectorAdam's step lengths."""
         return self.schedule or (TANH_STEPS if self.parameterization == "tanh" else SI_LOG_STEPS)
+
+
+def whole_number(name: str, value: Any, *, least: int) -> None:
+    """Raise a ValueError for what is not an integer of at least ``least``."""
+    if not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")
 
 
 def speed(problem: Problem) -> list[Descent]:

@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from quasiharmonic.certificate import Certificate
     from quasiharmonic.cli.arguments import Commands
     from quasiharmonic.io import MeshData
@@ -118,9 +121,14 @@ def draw(path: Path, problem: Problem, result: MapResult, certificate: Certifica
     from quasiharmonic.linsolve import NotPositiveDefinite
     from quasiharmonic.plot import save_map_figure
 
+    def framed(uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        # Of unit size, so that a picture of coordinates of 1e300 does not overflow.
+        return problem.frame.inward(uv).view(np.float64).reshape(-1, 2)
+
     try:
-        tutte = quasi_harmonic_map(problem, linear_solver=result.linear_solver)
+        tutte = framed(quasi_harmonic_map(problem, linear_solver=result.linear_solver))
     except NotPositiveDefinite:
         tutte = None
+    rest = np.ldexp(problem.V, -int(np.frexp(np.abs(problem.V).max())[1]))
     inverted = np.concatenate([certificate.flipped, certificate.degenerate])
-    save_map_figure(path, problem.V, problem.F, result.uv, tutte, flipped=inverted, fixed=problem.fixed)
+    save_map_figure(path, rest, problem.F, framed(result.uv), tutte, flipped=inverted, fixed=problem.fixed)

@@ -22,6 +22,7 @@ from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize.alternating import own_tensor
+from quasiharmonic.tensor import TANH
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -75,8 +76,8 @@ def patches(
                 w, left = moved, now
                 dw = objective.mesh.derivatives(w)
                 # The map's own tensors: where it is injective, it is the quasi-harmonic map of these (eq. 39).
-                xi = objective.parameterization.invert(own_tensor(dw))
-                visit(Iterate(objective, objective.parameterization.field(xi), w, dw))
+                # In the tanh parameterisation, which reaches them all.
+                visit(Iterate(objective, TANH.field(TANH.invert(own_tensor(dw))), w, dw))
 
 
 def _grown(F: IntArray, n: int, triangle: int, rings: int) -> IntArray:
@@ -140,8 +141,8 @@ def _untangled(F: IntArray, w: ComplexArray, held: NDArray[np.bool_]) -> Complex
     epsilon = np.sqrt(1e-18 + 0.04 * least**2)
     for _ in range(_ROUNDS):
         x = w[free].view(np.float64)
-        before = energy(x, epsilon)[0]
         with np.errstate(all="ignore"):
+            before = energy(x, epsilon)[0]
             found = minimize(
                 energy, x, args=(epsilon,), jac=True, method="L-BFGS-B", options={"maxiter": _STEPS, "maxcor": 20}
             )
