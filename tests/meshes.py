@@ -32,7 +32,16 @@ def surfaces():
         ("bowl", lift(disk), disk_faces),
         ("annulus", ring, ring_faces),
         ("curved annulus", lift(ring), ring_faces),
+        ("random annulus", *random_annulus()),
     ]
+
+
+def random_annulus(n=220, seed=1, radius=0.35):
+    """An irregular disk with a hole, without vertices that nothing uses."""
+    V, F = random_delaunay(n, seed=seed)
+    F = F[np.hypot(*V[F].mean(axis=1).T) > radius]
+    used, F = np.unique(F, return_inverse=True)
+    return V[used], F.reshape(-1, 3)
 
 
 def boundary_of(F):

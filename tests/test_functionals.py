@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, random_xi, signed_areas, surfaces
+from quasiharmonic import Descent, solve
 from quasiharmonic.functionals import FUNCTIONALS, neumann_target
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.objective import Objective
@@ -149,6 +150,25 @@ class TestTheorems:
             H = factor * op.laplacian(a.T).toarray() + 1j * op.D.toarray()
             lowest = np.linalg.eigvalsh(H).min()
             assert (lowest > -1e-12) if holds else (lowest < -1e-3)
+
+    @pytest.mark.parametrize("functional", ["neumann", "sobolev", "dirichlet"])
+    def test_a_vanishing_functional_means_an_injective_map(self, name, V, F, functional):
+        """Theorem 6.4 the other way, by descent: as V → 0 the last triangle is righted, from any of them.
+
+        Newton finishes (its functional is V₃), and V is what the tensors found give.
+        """
+        problem = posed(V, F)
+        stages = [
+            Descent("l-bfgs", functional=functional, iterations=60),
+            Descent("newton", iterations=60, resume=True),
+        ]
+        result = solve(problem, strategy=stages)
+        assert result.injective
+        start = Objective(problem, functional).evaluate(np.zeros(len(F), dtype=complex))
+        mu = inverse_field(problem.mesh("equilateral"), problem.frame.inward(result.uv))
+        end = Objective(problem, functional).evaluate(TANH.invert(mu))
+        assert end.value < 1e-10 * max(start.value, 1)
+        assert end.flipped == 0
 
     def test_sufficiency(self, name, V, F):
         """Theorem 6.4 the other way: where the Neumann data do not fit, V₃ exceeds twice the inverted area."""

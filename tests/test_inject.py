@@ -80,6 +80,43 @@ class TestFinds:
         np.testing.assert_array_equal(result.uv[pins], V[pins[::-1]])
         assert inverted(F, result.uv) == 0
 
+    def test_one_point_moved(self):
+        """Figure 11."""
+        V, F = grid(16, 16)
+        middle = int(np.argmin(((V - 0.5) ** 2).sum(axis=1)))
+        fixed = np.append(boundary_of(F), middle)
+        result = injective_map(V, F, fixed, np.vstack([V[fixed[:-1]], [[0.2, 0.5]]]))
+        assert result.injective
+        assert result.uv[middle].tolist() == [0.2, 0.5]
+
+    def test_two_regions_swapped(self):
+        """Small regional handles in place of points (§10.3)."""
+        V, F = grid(24, 24)
+        near = [np.flatnonzero(np.abs(V - p).max(axis=1) < 0.06) for p in ((1 / 3, 0.5), (2 / 3, 0.5))]
+        rim = boundary_of(F)
+        fixed = np.concatenate([rim, *near])
+        target = np.vstack([V[rim], V[near[0]] + [1 / 3, 0], V[near[1]] - [1 / 3, 0]])
+        result = injective_map(V, F, fixed, target)
+        assert len(fixed) > len(rim) + 8
+        assert result.injective
+
+    @pytest.mark.parametrize("functional", ["neumann", "sobolev", "dirichlet"])
+    def test_every_functional_turns_the_ring(self, functional):
+        """Figure 6 by an eighth of a turn, nothing but the functional's own descent."""
+        stages = [Descent(functional=functional, iterations=400)]
+        assert injective_map(*turned_ring(45), strategy=stages).injective
+
+    def test_ends_near_the_least_area_where_there_is_no_map(self):
+        """Figure 18: a pin outside the target must be reached and left again; no more area than that is covered."""
+        V, F = disk(10)
+        rim = boundary_of(F)
+        result = injective_map(V, F, np.append(rim, 0), np.vstack([V[rim], [[1.5, 0.0]]]))
+        assert result.status is Status.IMPOSSIBLE
+        unsigned = np.abs(signed_areas(F, result.uv)).sum() / 2
+        assert np.all(np.isfinite(result.uv))
+        # The disk's area, and the spike to the pin twice: a fan of one triangle's width where it leaves the rim.
+        assert unsigned < 1.15 * np.pi
+
     def test_locally_injective_where_the_target_crosses_itself(self):
         """A spiral strip that overlaps itself: every triangle positive, not bijective."""
         V, F = grid(60, 3)
