@@ -115,7 +115,13 @@ def show(ax: Axes, problem: Problem, uv: FloatArray, title: str, *, size: float 
 def show_ratios(ax: Axes, problem: Problem, uv: FloatArray, title: str, highest: float) -> PolyCollection:
     """Draw a map coloured by σ₁/σ₂ from 1 to ``highest``; hand back what a colour bar needs."""
     drawn = PolyCollection(
-        uv[problem.F], array=ratios(problem, uv)[0], cmap="viridis", norm=LogNorm(1, highest), edgecolors="face", lw=0.4
+        uv[problem.F],
+        array=ratios(problem, uv)[0],
+        cmap="viridis",
+        norm=LogNorm(1, highest),
+        edgecolors="face",
+        lw=0.4,
+        snap=False,
     )
     ax.add_collection(drawn)
     ax.autoscale_view()
@@ -154,8 +160,3 @@ def run(main: Callable[..., dict[str, Any]]) -> None:
             parser.add_argument(f"--{name}", type=int, default=parameter.default, help=f"({parameter.default})")
     options = vars(parser.parse_args())
     print(json.dumps(main(**options), indent=2, ensure_ascii=False))
-
-
-def spread(values: Sequence[float]) -> dict[str, float]:
-    """Mean and largest of some numbers, for a report."""
-    return {"mean": round(float(np.mean(values)), 3), "max": round(float(np.max(values)), 3)}

@@ -3,15 +3,15 @@
 The paper shows V₃, V₄ and V₁, all of them injective at last: V₃ opens a hole in the middle, V₁ moves the singularity
 to a corner first, V₄ turns the whole domain and takes the fewest iterations.
 
-Here V₃ takes 220 iterations, V₂ 246, V₁ 509, and all three go the same way: nothing much for about 90 iterations, then a
-hole opens in the middle and within ten iterations fills the inner square. V₁'s detour by a corner does not
-occur; from a start without random disturbance on a mesh that is its own image under half a turn the middle stays the middle.
+Here V₃ takes 220 iterations, V₂ 246, V₁ 509, and all three go the same way: nothing much for about 90 iterations,
+then a hole opens in the middle and within ten iterations fills the inner square. V₁'s detour by a corner does not
+occur: the mesh is its own image under half a turn and the start is undisturbed, so the middle stays the middle.
 
-V₄ does not get there at all: 74 triangles stay inverted with VectorAdam, and as many or more with tanh, L-BFGS, other
-steps and rings of up to 17,000 triangles. In linear elements V₄ is not bounded below by zero, and its zeros, the
-injective maps, are saddle points: close around the tensor of V₃'s map it is negative in every one of twenty random
-directions. A slow descent, as this one is, leaves the smooth fields before it arrives. A fast one may not: turned by
-π/2, with tanh and a fine mesh, V₄ finds a map in 3 iterations.
+V₄ does not get there: 74 triangles stay inverted. It fails too with tanh, with L-BFGS, with other steps and on rings of
+up to 17,000 triangles. In linear elements V₄ is not bounded below by zero, and its zeros, the injective maps, are
+saddle points: close around the tensor of V₃'s map it is negative in every one of twenty random directions. A
+slow descent, as this one is, leaves the smooth fields before it arrives. A fast one may not: turned by π/2, with tanh
+and a fine mesh, V₄ finds a map in 3 iterations.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ concentrates it in a spike at the point. So it is here: si-log takes 3 iteration
 of least MIPS has less than half its energy (0.25 against 0.57) and a largest ratio of 35.
 
 The paper descends MIPS along with V₃ from tanh; here the si-log map is polished, as tanh alone does not get
-there: one of 6,400 triangles stays inverted, and at other places of the point up to eight.
+there: one of 6,400 triangles stays inverted, on finer grids up to eight.
 """
 
 from __future__ import annotations

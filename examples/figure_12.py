@@ -2,7 +2,7 @@
 
 The paper's si-log distributes distortion evenly and TLC concentrates it at the concave corner. TLC is another
 program; tanh's first map is of that kind and stands in for it. The dotted line is the ratio of the plain shear
-``y + 2|x|``, 5.83, which a map of least distortion could hardly avoid.
+``(x, y + 2|x|)``, 5.83 everywhere.
 
 si-log: half of all triangles between 5.31 and 5.45, 99 % below 6.7. tanh: half between 5.16 and 5.46, but a tail at the
 corner, 99 % below 44. A map of least MIPS (3.37; si-log 3.64, tanh 4.74) leaves a disk in the middle nearly
