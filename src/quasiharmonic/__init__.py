@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .polishing import polish
     from .problem import Problem
     from .refinement import Refined, refine
-    from .result import MapResult, Stage, Status, Step
+    from .result import MapResult, Snapshot, Stage, Status, Step
     from .strategy import Descent
 
 __version__ = "0.1.0"
@@ -31,6 +31,7 @@ _HOME = {
     "MapResult": "result",
     "Problem": "problem",
     "Refined": "refinement",
+    "Snapshot": "result",
     "Stage": "result",
     "Status": "result",
     "Step": "result",
@@ -55,6 +56,7 @@ __all__ = [
     "MapResult",
     "Problem",
     "Refined",
+    "Snapshot",
     "Stage",
     "Status",
     "Step",
