@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.laplacian import Laplacian
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh, rest_frames
-from quasiharmonic.mesh.topology import Edges, components, edges, named, trace_loops
+from quasiharmonic.mesh.topology import Edges, components, edges, named, named_edges, trace_loops
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -275,10 +275,10 @@ def _surface(F: IntArray, n: int) -> Edges:
     if found.nonmanifold.size or found.inconsistent.size:
         _repeated(F)
     if found.nonmanifold.size:
-        raise ValueError(f"{_named_edges(found.nonmanifold)} in more than two triangles: not a surface")
+        raise ValueError(f"{named_edges(found.nonmanifold)} in more than two triangles: not a surface")
     if found.inconsistent.size:
         raise ValueError(
-            f"mixed winding: {_named_edges(found.inconsistent)} traversed in the same direction by both triangles; "
+            f"mixed winding: {named_edges(found.inconsistent)} traversed in the same direction by both triangles; "
             "orient all triangles alike"
         )
     if not found.boundary.size:
@@ -334,9 +334,3 @@ def _target(target: ArrayLike, k: int) -> FloatArray:
         raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
     _finite("target", "row", array)
     return array
-
-
-def _named_edges(pairs: IntArray, most: int = 5) -> str:
-    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
-    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
-    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"

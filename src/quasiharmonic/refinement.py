@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.mesh.topology import edge_keys
 from quasiharmonic.mesh.topology import edges as sort_edges
 
 FloatArray = NDArray[np.float64]
@@ -107,7 +108,7 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     V = np.concatenate([V, V[wanted[:, 0]] / 2 + V[wanted[:, 1]] / 2])
     keys = _keys(wanted, n)
     # Midpoint of the side opposite to each corner, or -1.
-    sides = _keys(np.stack([F[:, (1, 2, 0)], F[:, (2, 0, 1)]], axis=2).reshape(-1, 2), n)
+    sides = edge_keys(F[:, (1, 2, 0)].ravel(), F[:, (2, 0, 1)].ravel(), n)
     at = np.minimum(np.searchsorted(keys, sides), max(len(keys) - 1, 0))
     middle = np.where(keys[at] == sides, n + at, -1).reshape(-1, 3) if len(keys) else np.full(F.shape, -1)
     F, parent = _subdivide(V, F, middle)
@@ -175,7 +176,5 @@ def _refuse(wanted: IntArray, known: IntArray, n: int, why: str) -> None:
         raise ValueError(f"cannot split {listed}{rest}: {why}")
 
 
-def _keys(edges: IntArray, n: int) -> IntArray:
-    """One integer for each undirected edge."""
-    keys: IntArray = edges.min(axis=1) * n + edges.max(axis=1)
-    return keys
+def _keys(pairs: IntArray, n: int) -> IntArray:
+    return edge_keys(pairs[:, 0], pairs[:, 1], n)

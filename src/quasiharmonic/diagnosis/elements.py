@@ -17,11 +17,10 @@ from quasiharmonic.diagnosis.obstruction import (
     Forbids,
     Kind,
     Obstruction,
-    named_edges,
     named_vertices,
     smallest_conflict,
 )
-from quasiharmonic.mesh.topology import named
+from quasiharmonic.mesh.topology import edge_keys, named, named_edges
 from quasiharmonic.predicates import orientation
 from quasiharmonic.problem import Problem
 
@@ -42,14 +41,14 @@ def inverted_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obstructi
     whole = np.flatnonzero(fixture.fixed[problem.F].all(axis=1))
     corners = problem.F[whole]
     sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
-    boundary = _keys(problem.edges.boundary, problem.n)
+    boundary = edge_keys(problem.edges.boundary[:, 0], problem.edges.boundary[:, 1], problem.n)
     for t, abc, s in zip(whole[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
         sides = np.stack([abc, np.roll(abc, -1)], axis=1)
         message = (
             f"All vertices of {named('triangle', 'triangles', t[None])} are fixed, "
             f"and the target {'inverts' if s < 0 else 'flattens'} it."
         )
-        split = sides[~np.isin(_keys(sides, problem.n), boundary)]
+        split = sides[~np.isin(edge_keys(sides[:, 0], sides[:, 1], problem.n), boundary)]
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
 
 
@@ -82,11 +81,11 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
     twice_area: dict[int, int] = {}
     for k, (px, py), (qx, qy) in zip(of.tolist(), fixture.points(edge[:, 0]), fixture.points(edge[:, 1]), strict=True):
         twice_area[k] = twice_area.get(k, 0) + px * qy - py * qx
-    boundary = _keys(problem.edges.boundary, problem.n)
+    boundary = edge_keys(problem.edges.boundary[:, 0], problem.edges.boundary[:, 1], problem.n)
     for k in sorted(k for k, area in twice_area.items() if area <= 0):
         around = edge[of == k]
         message = f"The fixed {named_edges(around)} around a part of the mesh leave it no positive area."
-        split = around[~np.isin(_keys(around, problem.n), boundary)]
+        split = around[~np.isin(edge_keys(around[:, 0], around[:, 1], problem.n), boundary)]
         yield Obstruction(
             Kind.INVERTED_PATCH,
             Forbids.INJECTIVE,
@@ -153,9 +152,3 @@ def half_planes(star: Star, fixture: Fixture) -> Obstruction | None:
         edges=needed,
         split=np.stack([np.full(len(ends), star.vertex), ends], axis=1),
     )
-
-
-def _keys(edges: IntArray, n: int) -> IntArray:
-    """One integer for each undirected edge."""
-    keys: IntArray = np.minimum(edges[:, 0], edges[:, 1]) * n + np.maximum(edges[:, 0], edges[:, 1])
-    return keys

@@ -16,10 +16,10 @@ from quasiharmonic.diagnosis.elements import (
     misplaced_pins,
 )
 from quasiharmonic.diagnosis.fixture import Fixture, stars
-from quasiharmonic.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_edges, named_vertices
+from quasiharmonic.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_vertices
 from quasiharmonic.diagnosis.shortcuts import Shortcuts
 from quasiharmonic.diagnosis.sight import Sight, bad_chords
-from quasiharmonic.mesh.topology import named
+from quasiharmonic.mesh.topology import named, named_edges
 from quasiharmonic.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
 

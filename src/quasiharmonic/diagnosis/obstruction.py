@@ -211,13 +211,6 @@ def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list
     return chosen
 
 
-def named_edges(pairs: IntArray, most: int = 5) -> str:
-    """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
-    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
-    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
-    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"
-
-
 def named_vertices(vertices: IntArray) -> str:
     """Name the first few of some vertices."""
     return named("vertex", "vertices", vertices)

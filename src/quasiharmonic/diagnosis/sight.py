@@ -19,10 +19,10 @@ from quasiharmonic.diagnosis.obstruction import (
     Forbids,
     Kind,
     Obstruction,
-    named_edges,
     named_vertices,
     smallest_conflict,
 )
+from quasiharmonic.mesh.topology import named_edges
 from quasiharmonic.predicates import orientation
 from quasiharmonic.problem import Problem
 

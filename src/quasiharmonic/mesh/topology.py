@@ -56,7 +56,7 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     tail = F.ravel()
     head = F[:, (1, 2, 0)].ravel()
     backward = tail > head
-    key = (np.minimum(tail, head) * n + np.maximum(tail, head)) * 2 + backward
+    key = edge_keys(tail, head, n) * 2 + backward
     key.sort()
     edge = key >> 1
     first = np.flatnonzero(np.concatenate(([True], edge[1:] != edge[:-1]))) if edge.size else edge
@@ -74,6 +74,12 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     flip = direction[single] == 1
     boundary[flip] = boundary[flip, ::-1]
     return Edges(unpack(pair[opposed]), boundary, unpack(pair[~opposed]), unpack(first[count > 2]))
+
+
+def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> IntArray:
+    """One integer for each undirected edge between vertices below ``n``, whichever way it is given."""
+    keys: IntArray = np.minimum(tail, head) * n + np.maximum(tail, head)
+    return keys
 
 
 def boundary_edges(F: NDArray[np.integer], n: int) -> IntArray:
@@ -155,3 +161,10 @@ def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> s
     listed = ", ".join(str(int(i)) for i in indices[:most])
     rest = f", … ({len(indices)} in all)" if len(indices) > most else ""
     return f"{one if len(indices) == 1 else many} {listed}{rest}"
+
+
+def named_edges(pairs: IntArray, most: int = 5) -> str:
+    """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
+    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
+    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
+    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"
