@@ -6,6 +6,7 @@ import numpy as np
 
 from meshes import boundary_of
 from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.predicates import SegmentRelation, segment_relation
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
 
@@ -33,6 +34,26 @@ def spiral(n, turns, width=0.6):
     outward = np.stack([np.cos(t), np.sin(t)], axis=1)
     middle = 1 + t[:, None] / (2 * np.pi)
     return np.concatenate([(middle + width / 2) * outward, ((middle - width / 2) * outward)[::-1]])
+
+
+def random_polygon(rng, n, size):
+    """A simple polygon, counterclockwise, on a grid of so many points a side; often with straight angles."""
+    while True:
+        p = rng.permutation(np.stack(np.divmod(rng.permutation(size**2)[:n], size), axis=1)).astype(float)
+        for _ in range(20 * n):
+            q = np.roll(p, -1, axis=0)
+            i, j = np.triu_indices(n, 2)
+            relation = segment_relation(p[i], q[i], p[j], q[j])
+            # The first edge and the last have an end in common.
+            crossed = np.flatnonzero((relation != SegmentRelation.DISJOINT) & ((i > 0) | (j < n - 1)))
+            if not crossed.size:
+                break
+            k = rng.choice(crossed)
+            p[i[k] + 1 : j[k] + 1] = p[i[k] + 1 : j[k] + 1][::-1].copy()
+        folded = segment_relation(p, q, q, np.roll(q, -1, axis=0)) == SegmentRelation.OVERLAPPING
+        area = np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+        if not crossed.size and not folded.any() and area:
+            return p if area > 0 else p[::-1]
 
 
 def wheel(n):

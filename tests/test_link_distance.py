@@ -12,8 +12,7 @@ from quasiharmonic.predicates import orientation
 
 
 def polygon(corners):
-    lattice = Lattice(np.asarray(corners, dtype=float))
-    return Polygon(lattice.points, lattice.near)
+    return Polygon(Lattice(np.asarray(corners, dtype=float)).points)
 
 
 def table(corners, limit=30):

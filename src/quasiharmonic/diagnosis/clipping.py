@@ -22,7 +22,7 @@ Line = tuple[int, int, int]
 
 # Coordinates below are at most 1 and rounded once, so that a product of two differences is wrong by
 # less than this; what the filter cannot decide by this margin is decided in integers.
-_MARGIN = 2.0**-48
+MARGIN = 2.0**-48
 
 
 def line(p: Point, q: Point) -> Line:
@@ -186,7 +186,7 @@ class Walls:
 
     def _met(self, points: FloatArray) -> IntArray:
         """Walls that reach into the box around some points, (m, 2) int64."""
-        (x0, y0), (x1, y1) = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+        (x0, y0), (x1, y1) = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
         inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
         return self._ends[inside]
 
@@ -209,9 +209,9 @@ class Walls:
         """
         here = self._lattice.near[eye]
         p, q = self._lattice.near[walls.T]
-        right, left = _cross(p - here, near - here), _cross(q - here, near - here)
-        front = _cross(q - p, near[None] - p[:, None])
-        in_the_way = (right.max(axis=1) > -_MARGIN) & (left.min(axis=1) < _MARGIN) & (front.min(axis=1) < _MARGIN)
+        right, left = cross((p - here)[:, None], near - here), cross((q - here)[:, None], near - here)
+        front = cross((q - p)[:, None], near - p[:, None])
+        in_the_way = (right.max(axis=1) > -MARGIN) & (left.min(axis=1) < MARGIN) & (front.min(axis=1) < MARGIN)
         # The walls that hide most corners first: one that hides them all leaves nothing to look at.
         hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
         walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]
@@ -240,7 +240,7 @@ def _past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
     return [part for part in parts if part is not None]
 
 
-def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Cross products of vectors ``u`` (m, 2) with ``v``, (r, 2) or (m, r, 2); (m, r) float64."""
-    product: FloatArray = u[:, :1] * v[..., 1] - u[:, 1:] * v[..., 0]
+def cross(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Cross products along the last axis, of which the others are broadcast."""
+    product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     return product

@@ -10,75 +10,21 @@ around every point, such a map is injective.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.predicates import SegmentRelation, box_pairs, orientation, segment_relation
+from quasiharmonic.boundary_curves import Contacts, contacts, winding
+from quasiharmonic.predicates import SegmentRelation, orientation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-SignArray = NDArray[np.int8]
 
 # More meeting pairs than this are not collected: a target that is this entangled needs no full list.
-_MOST_CONTACTS = 10_000
-# Pairs of a point and an edge that `winding` compares at a time.
-_WINDING_CHUNK = 1 << 20
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """Pairs of segments that meet where they should not.
-
-    Attributes
-    ----------
-    pairs : (c, 2) int64
-        Indices of segments, the smaller first.
-    relation : (c,) int8
-        Values of `SegmentRelation`, none of them DISJOINT.
-    complete : bool
-        False when there are more pairs than were collected.
-    """
-
-    pairs: IntArray
-    relation: SignArray
-    complete: bool
-
-
-def contacts(positions: FloatArray, ends: IntArray) -> Contacts:
-    """Find all segments that have more in common than an end.
-
-    Parameters
-    ----------
-    positions : (n, 2) float64
-        Points; finite where ``ends`` uses them.
-    ends : (m, 2) int64
-        Segments as pairs of points. The same point twice is a point.
-
-    Returns
-    -------
-    Contacts
-        Pairs without a common end that meet, and pairs with one that overlap.
-    """
-    corners = positions[ends]
-    found: list[tuple[IntArray, SignArray]] = []
-    total, complete = 0, True
-    for i, j in box_pairs(corners.min(axis=1), corners.max(axis=1)):
-        relation = segment_relation(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
-        joined = (ends[i][:, :, None] == ends[j][:, None, :]).any(axis=(1, 2))
-        bad = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
-        found.append((np.stack([i, j], axis=1)[bad], relation[bad]))
-        total += int(bad.sum())
-        if total > _MOST_CONTACTS:
-            complete = False
-            break
-    pairs = np.concatenate([np.empty((0, 2), dtype=np.int64), *(p for p, _ in found)])
-    relations = np.concatenate([np.empty(0, dtype=np.int8), *(r for _, r in found)])
-    return Contacts(pairs, relations, complete)
+MOST_CONTACTS = 10_000
 
 
 def turning_number(loop: FloatArray) -> int:
@@ -102,46 +48,6 @@ def turning_number(loop: FloatArray) -> int:
     passes = np.where(turn > 0, ~up & up_after, False).astype(np.int64)
     passes -= np.where(turn <= 0, up & ~up_after, False)
     return int(passes.sum())
-
-
-def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Winding number of closed curves around points.
-
-    Parameters
-    ----------
-    points : (k, 2) float64
-    tails, heads : (m, 2) float64
-        Ends of the directed edges that make up the curves.
-
-    Returns
-    -------
-    winding : (k,) int64
-        Counted counterclockwise: crossings of a ray to the right [1]_. Meaningless where ``on``.
-    on : (k,) bool
-        Whether the point lies on the curves.
-
-    References
-    ----------
-    .. [1] K. Hormann, A. Agathos, The point in polygon problem for arbitrary polygons.
-       Computational Geometry 20 (2001).
-    """
-    result = np.zeros(len(points), dtype=np.int64)
-    on = np.zeros(len(points), dtype=bool)
-    low, high = np.minimum(tails, heads), np.maximum(tails, heads)
-    step = max(_WINDING_CHUNK // max(len(tails), 1), 1)
-    for start in range(0, len(points), step):
-        y = points[start : start + step, 1, None]
-        which, edge = np.nonzero((low[:, 1] <= y) & (y <= high[:, 1]))
-        here = points[start + which]
-        tail, head = tails[edge], heads[edge]
-        side = orientation(tail, head, here)
-        rising = (tail[:, 1] <= here[:, 1]) & (here[:, 1] < head[:, 1]) & (side > 0)
-        falling = (head[:, 1] <= here[:, 1]) & (here[:, 1] < tail[:, 1]) & (side < 0)
-        np.add.at(result, start + which[rising], 1)
-        np.subtract.at(result, start + which[falling], 1)
-        met = (side == 0) & (low[edge, 0] <= here[:, 0]) & (here[:, 0] <= high[edge, 0])
-        on[start + which[met]] = True
-    return result, on
 
 
 class BoundaryCurves:
@@ -202,7 +108,7 @@ class BoundaryCurves:
     @cached_property
     def contacts(self) -> Contacts:
         """Where the curves meet themselves or each other, as pairs of edges."""
-        return contacts(self.positions, self.ends)
+        return contacts(self.positions, self.ends, MOST_CONTACTS)
 
     @property
     def simple(self) -> bool:
@@ -260,6 +166,40 @@ class BoundaryCurves:
         others, _ = winding(here[None], self.tails[~own], self.heads[~own])
         # Below its lowest corner a loop does not wind; the corner's inner side is left of a left turn.
         return int(others[0]) + int(orientation(before, here, after) > 0)
+
+
+class Corners:
+    """The angles of the target at its boundary vertices.
+
+    Attributes
+    ----------
+    known : (n,) bool
+        Boundary vertices.
+    """
+
+    def __init__(self, curves: BoundaryCurves) -> None:
+        n = len(curves.positions)
+        self.known = np.zeros(n, dtype=bool)
+        self.before, self.after = np.full((2, n), -1)
+        tails, heads = curves.ends.T
+        self.known[tails] = True
+        self.before[heads], self.after[tails] = tails, heads
+
+    def reflex(self, vertices: IntArray, where: FloatArray) -> BoolArray:
+        """Whether the angle inside is larger than π; (k,) bool."""
+        turns: BoolArray = orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
+        return turns
+
+    def opens_to(self, vertices: IntArray, points: FloatArray, where: FloatArray) -> BoolArray:
+        """Whether the way to a point starts strictly inside the angle; (k,) bool, False at pins."""
+        result = np.zeros(len(vertices), dtype=bool)
+        known = np.flatnonzero(self.known[vertices])
+        v, x = vertices[known], points[known]
+        left_of_last = orientation(where[self.before[v]], where[v], x) > 0
+        left_of_next = orientation(where[v], where[self.after[v]], x) > 0
+        reflex = self.reflex(v, where)
+        result[known] = np.where(reflex, left_of_last | left_of_next, left_of_last & left_of_next)
+        return result
 
 
 def _from_lowest(positions: FloatArray, loop: IntArray) -> IntArray:

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.diagnosis.curves import BoundaryCurves, winding
+from quasiharmonic.boundary_curves import winding
+from quasiharmonic.diagnosis.curves import BoundaryCurves
 from quasiharmonic.diagnosis.fixture import Fixture, Star
 from quasiharmonic.diagnosis.obstruction import (
     Forbids,

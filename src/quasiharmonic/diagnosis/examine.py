@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.diagnosis.curves import BoundaryCurves
+from quasiharmonic.diagnosis.curves import BoundaryCurves, Corners
 from quasiharmonic.diagnosis.elements import (
     collapsed_edges,
     half_planes,
@@ -19,11 +19,15 @@ from quasiharmonic.diagnosis.fixture import Fixture, stars
 from quasiharmonic.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_vertices
 from quasiharmonic.diagnosis.shortcuts import Shortcuts
 from quasiharmonic.diagnosis.sight import Sight, bad_chords
+from quasiharmonic.diagnosis.witness import unplaced
 from quasiharmonic.mesh.topology import named, named_edges
 from quasiharmonic.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
 
 IntArray = NDArray[np.int64]
+
+# What is spent on vertices that see too little, in about microseconds, before those left are passed over.
+_MOST_EFFORT = 3_000_000
 
 
 def diagnose(problem: Problem) -> Diagnosis:
@@ -63,9 +67,10 @@ def diagnose(problem: Problem) -> Diagnosis:
     - for any two boundary vertices no fewer edges from one to the other than the link distance of
       their positions, the number of segments that it takes inside the target [2]_.
 
-    Link distances are compared for targets with one loop and vertices up to eight edges apart, as
-    long as that takes no more than about the time of the rest. Not checked is whether a curve that
-    crosses itself bounds an immersed surface at all (for a disk, Blank's theorem [1]_ decides).
+    Link distances are compared for targets with one loop and vertices up to eight edges apart. Both
+    these and sight are given up where they would take more than some seconds, which ``unchecked`` then
+    says. Not checked is whether a curve that crosses itself bounds an immersed surface at all (for a
+    disk, Blank's theorem [1]_ decides).
 
     References
     ----------
@@ -85,35 +90,53 @@ def diagnose(problem: Problem) -> Diagnosis:
         return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",))
 
     proper = _proper(curves)
+    unchecked = list(_unchecked(curves, proper))
     found = list(_global(problem, curves, euler, area))
     found += misplaced_pins(problem, fixture, curves, proper)
     found += collapsed_edges(problem, fixture)
     found += inverted_triangles(problem, fixture)
     found += inverted_patches(problem, fixture)
-    # Nothing has a place in a target on a line parallel to an axis, and nothing more need be said.
-    flat = any(low == high for low, high in zip(fixture.lattice.low, fixture.lattice.high, strict=True))
-    around = [] if flat else stars(problem, fixture, curves.folds)
-    chords = fixture.chords
+    chords, corners = fixture.chords, None
     if proper:
-        bad = list(bad_chords(problem, fixture, curves))
+        corners = Corners(curves)
+        bad = list(bad_chords(problem, fixture, curves, corners))
         found += bad
         wrong = {tuple(o.split[0].tolist()) for o in bad}
         chords = np.array([c for c in chords.tolist() if tuple(c) not in wrong], dtype=np.int64).reshape(-1, 2)
-        sight = Sight(problem, fixture, curves, chords)
-    for star in around:
-        obstruction = half_planes(star, fixture)
-        if obstruction is None and proper:
-            obstruction = sight.hidden(star)
-        if obstruction is not None:
-            found.append(obstruction)
-    unchecked = list(_unchecked(curves, proper))
-    if proper and len(problem.loops) == 1:
-        shortcuts = Shortcuts(problem, fixture)
+    # Nothing has a place in a target on a line parallel to an axis, and nothing more need be said.
+    if all(low < high for low, high in zip(fixture.lattice.low, fixture.lattice.high, strict=True)):
+        hidden, passed_over = _unplaced(problem, fixture, curves, corners, np.concatenate([curves.ends, chords]))
+        found += hidden
+        unchecked += passed_over
+    if corners is not None and len(problem.loops) == 1:
+        shortcuts = Shortcuts(problem, fixture, corners)
         found += shortcuts.find()
         unchecked.append(f"link distances of boundary vertices that are {shortcuts.unchecked} or more edges apart")
     elif proper:
         unchecked.append("link distances of fixed vertices that are three or more edges apart, around holes")
     return Diagnosis(tuple(found), tuple(unchecked))
+
+
+def _unplaced(
+    problem: Problem, fixture: Fixture, curves: BoundaryCurves, corners: Corners | None, walls: IntArray
+) -> tuple[list[Obstruction], list[str]]:
+    """Free vertices for which there is no place, and what was left unchecked about them."""
+    around = stars(problem, fixture, curves.folds)
+    around = around.take(unplaced(around, fixture, corners, walls))
+    sight = None if corners is None else Sight(problem, fixture, corners, walls)
+    found = []
+    passed_over = []
+    for star in map(around.__getitem__, range(len(around))):
+        obstruction = half_planes(star, fixture)
+        if obstruction is None and sight is not None:
+            if sight.effort < _MOST_EFFORT:
+                obstruction = sight.hidden(star)
+            else:
+                passed_over.append(star.vertex)
+        if obstruction is not None:
+            found.append(obstruction)
+    which = named_vertices(np.array(passed_over))
+    return found, [f"whether a place sees the fixed neighbours of {which}"] * bool(passed_over)
 
 
 def _twice_area(fixture: Fixture, curves: BoundaryCurves) -> int:

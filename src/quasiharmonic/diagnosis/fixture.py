@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +88,46 @@ class Star:
     opposite: IntArray
 
 
-def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Iterator[Star]:
+@dataclass(frozen=True)
+class Stars:
+    """The stars of several free vertices.
+
+    Attributes
+    ----------
+    vertices : (s,) int64
+        Ascending.
+    of_neighbour : (k,) int64
+        Index of the star of each neighbour, ascending.
+    neighbours : (k,) int64
+    of_opposite : (h,) int64
+        Index of the star of each edge, ascending.
+    opposite : (h, 2) int64
+    """
+
+    vertices: IntArray
+    of_neighbour: IntArray
+    neighbours: IntArray
+    of_opposite: IntArray
+    opposite: IntArray
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def __getitem__(self, k: int) -> Star:
+        near = slice(*np.searchsorted(self.of_neighbour, (k, k + 1)))
+        beyond = slice(*np.searchsorted(self.of_opposite, (k, k + 1)))
+        return Star(int(self.vertices[k]), self.neighbours[near], self.opposite[beyond])
+
+    def take(self, chosen: IntArray) -> Stars:
+        """Some of the stars, named in ascending order."""
+        at = np.full(len(self), -1)
+        at[chosen] = np.arange(len(chosen))
+        near, beyond = at[self.of_neighbour], at[self.of_opposite]
+        a, b = near >= 0, beyond >= 0
+        return Stars(self.vertices[chosen], near[a], self.neighbours[a], beyond[b], self.opposite[b])
+
+
+def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
     """Free vertices whose fixed surroundings could leave them no place.
 
     Left out are those that always find one: with a single fixed neighbour, or with those of one or
@@ -106,23 +144,20 @@ def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Iterator[Star]
     interior = problem.edges.interior
     joined = interior[fixed[interior[:, 0]] != fixed[interior[:, 1]]]
     joined = np.where(fixed[joined[:, :1]], joined[:, ::-1], joined)  # free, fixed
-    free = np.argmin(fixed[problem.F], axis=1)
     two = np.flatnonzero(fixed[problem.F].sum(axis=1) == 2)
-    corner = problem.F[two[:, None], (free[two, None] + [0, 1, 2]) % 3]  # free, then the fixed edge
+    free = np.argmin(fixed[problem.F[two]], axis=1)
+    corner = problem.F[two[:, None], (free[:, None] + [0, 1, 2]) % 3]  # free, then the fixed edge
 
     neighbours = np.bincount(joined[:, 0], minlength=problem.n)
     opposite = np.bincount(corner[:, 0], minlength=problem.n)
-    outer = np.zeros(problem.n, dtype=np.int64)
     following = np.full(problem.n, -1)
     following[problem.edges.boundary[:, 0]] = problem.edges.boundary[:, 1]
-    np.add.at(outer, corner[following[corner[:, 1]] == corner[:, 2], 0], 1)
+    outer = np.bincount(corner[following[corner[:, 1]] == corner[:, 2], 0], minlength=problem.n)
     placed = (neighbours <= 3) & (outer == neighbours - 1) & (outer == opposite)
     placed[corner[np.isin(corner[:, 1], folds), 0]] = False
-    wanted = np.flatnonzero((neighbours >= 2) & ~placed)
 
+    every = np.arange(problem.n)
     joined = joined[np.argsort(joined[:, 0], kind="stable")]
     corner = corner[np.argsort(corner[:, 0], kind="stable")]
-    first_joined, first_corner = np.cumsum(neighbours) - neighbours, np.cumsum(opposite) - opposite
-    for v in wanted.tolist():
-        a, b = first_joined[v], first_corner[v]
-        yield Star(v, joined[a : a + neighbours[v], 1], corner[b : b + opposite[v], 1:])
+    around = Stars(every, joined[:, 0], joined[:, 1], corner[:, 0], corner[:, 1:])
+    return around.take(np.flatnonzero((neighbours >= 2) & ~placed))

@@ -24,9 +24,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.diagnosis.clipping import MARGIN
+from quasiharmonic.diagnosis.triangulation import triangulate
+
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 Point = tuple[int, int, int]
 """Homogeneous coordinates, the last positive."""
+
+# The line through a point and itself, of which every point lies on neither side.
+_NOWHERE: Point = (0, 0, 0)
+# Corners that are compared with a line in about the time of one step through a triangle.
+_AT_ONCE = 100
 
 
 class Polygon:
@@ -36,29 +45,43 @@ class Polygon:
     ----------
     corners : list of (int, int)
         Counterclockwise, no two equal.
-    near : (k, 2) float64
-        The same, rounded so that order is kept in each coordinate.
 
     Attributes
     ----------
     triangles : list of (int, int, int)
-        As corners, counterclockwise.
+        As corners, counterclockwise. They form a tree, and the side from the last to the first
+        corner of each but the root leads to its parent.
     work : int
-        Triangles and sides gone through so far, a measure of the time spent.
+        Triangles and crossings gone through so far, a measure of the time spent.
     """
 
-    def __init__(self, corners: list[tuple[int, int]], near: FloatArray) -> None:
+    def __init__(self, corners: list[tuple[int, int]]) -> None:
         self._points: list[Point] = [(x, y, 1) for x, y in corners]
-        self.triangles = clip_ears(corners, near)
         self._corner = {point: k for k, point in enumerate(self._points)}
+        self.triangles = triangulate(corners)
         self._of_side = {side: t for t, (a, b, c) in enumerate(self.triangles) for side in ((a, b), (b, c), (c, a))}
-        # The triangles form a tree, in which an ear hangs on what it was cut from.
-        self._parent = [self._of_side.get((a, c), -1) for a, _, c in self.triangles]
-        self._depth = [0] * len(self.triangles)
-        for t in range(len(self.triangles) - 2, -1, -1):
-            self._depth[t] = self._depth[self._parent[t]] + 1
+        self._parent, self._depth = [-1] * len(self.triangles), [0] * len(self.triangles)
+        self._plant()
         self._at = {corner: t for t, triangle in enumerate(self.triangles) for corner in triangle}
+        xs, ys = zip(*corners, strict=True)
+        self._centre = (min(xs) + max(xs)) // 2, (min(ys) + max(ys)) // 2
+        self._unit = max(max(xs) - min(xs), max(ys) - min(ys))
+        (x, y), unit = self._centre, self._unit
+        self._near = np.array([((px - x) / unit, (py - y) / unit) for px, py in corners])
         self.work = len(corners)
+
+    def _plant(self) -> None:
+        """Make the triangles a tree."""
+        reached = deque([0])
+        while reached:
+            t = reached.popleft()
+            a, b, c = self.triangles[t]
+            for p, q in ((a, b), (b, c), (c, a)):
+                child = self._of_side.get((q, p), -1)
+                if child >= 0 and child != self._parent[t]:
+                    self._parent[child], self._depth[child] = t, self._depth[t] + 1
+                    self.triangles[child] = _with_last(self.triangles[child], q)
+                    reached.append(child)
 
     def link_distance(self, start: int, goal: int, limit: int) -> int:
         """Number of segments that it takes from one corner to another.
@@ -95,23 +118,23 @@ class Polygon:
         path, k = [start], 0
         # What is seen from the last bend through all doors so far lies between these two corners.
         at_left = at_right = 0
-        near_left = near_right = start
+        to_left = to_right = _NOWHERE
         while (k := k + 1) < len(left):
             self.work += 1
-            if _turn(path[-1], near_right, right[k]) >= 0:
-                if _turn(path[-1], near_left, right[k]) > 0:
-                    path.append(near_left)
-                    near_right, k = near_left, at_left
-                    at_right = k
+            if _side(to_right, right[k]) >= 0:
+                if _side(to_left, right[k]) > 0:
+                    path.append(left[at_left])
+                    k = at_right = at_left
+                    to_left = to_right = _NOWHERE
                     continue
-                near_right, at_right = right[k], k
-            if _turn(path[-1], near_left, left[k]) <= 0:
-                if _turn(path[-1], near_right, left[k]) < 0:
-                    path.append(near_right)
-                    near_left, k = near_right, at_right
-                    at_left = k
+                at_right, to_right = k, _cross(path[-1], right[k])
+            if _side(to_left, left[k]) <= 0:
+                if _side(to_right, left[k]) < 0:
+                    path.append(right[at_right])
+                    k = at_left = at_right
+                    to_left = to_right = _NOWHERE
                     continue
-                near_left, at_left = left[k], k
+                at_left, to_left = k, _cross(path[-1], left[k])
         path.append(self._points[goal])
         # A bend that the path touches without turning is none.
         return [p for k, p in enumerate(path) if k in (0, len(path) - 1) or _turn(path[k - 1], p, path[k + 1])]
@@ -126,8 +149,8 @@ class Polygon:
                 down.append(self._parent[down[-1]])
         sleeve = up + down[-2::-1]
         # Triangles around the two ends need not be crossed.
-        around = [self._corner.get(start, -1) in self.triangles[t] for t in sleeve]
-        first = max((k for k, inside in enumerate(around) if inside), default=0)
+        corner = self._corner.get(start, -1)
+        first = max((k for k, t in enumerate(sleeve) if corner in self.triangles[t]), default=0)
         last = next(k for k in range(first, len(sleeve)) if goal in self.triangles[sleeve[k]])
         left, right = [start], [start]
         for here, following in pairwise(sleeve[first : last + 1]):
@@ -142,9 +165,7 @@ class Polygon:
     def _hit(self, before: Point, bend: Point) -> tuple[Point, int]:
         """Where the way from a point through a corner leaves the polygon, and a triangle there."""
         along = _cross(before, bend)
-        sides = [_side(along, p) for p in self._points]
-        self.work += len(sides)
-        n = len(sides)
+        sides = self._sides(along)
         # The distance from the bend, up to a positive factor.
         x, y, w = before
         dx, dy = bend[0] * w - x, bend[1] * w - y
@@ -154,92 +175,39 @@ class Polygon:
             return Fraction(dx * p[0] + dy * p[1], p[2]) - origin
 
         exits: list[tuple[Fraction, Point, int]] = []
-        start = next(k for k in range(n) if sides[k])
-        k = start
-        while k < start + n:
-            # From one corner beside the line to the next: across a side, or along corners on the line.
-            after = k + 1
-            while not sides[after % n]:
-                after += 1
-            if sides[k % n] != sides[after % n]:
-                if after == k + 1:
-                    i, j = k % n, after % n
-                    p = _cross(along, _cross(self._points[i], self._points[j]))
-                    p = p if p[2] > 0 else (-p[0], -p[1], -p[2])
-                    exits.append((distance(p), p, self._of_side[i, j]))
-                else:
-                    on = (self._points[m % n] for m in range(k + 1, after))
-                    far = max(on, key=distance)
-                    exits.append((distance(far), far, self._at[self._corner[far]]))
-            k = after
+        beside = np.flatnonzero(sides)
+        crossed = np.flatnonzero(sides[beside] != np.roll(sides[beside], -1))
+        self.work += crossed.size + len(sides) // _AT_ONCE
+        n = len(sides)
+        # From one corner beside the line to the next: across a side, or along corners on the line.
+        for start, end in zip(beside[crossed].tolist(), np.roll(beside, -1)[crossed].tolist(), strict=True):
+            if end == (start + 1) % n:
+                p = _cross(along, _cross(self._points[start], self._points[end]))
+                p = p if p[2] > 0 else (-p[0], -p[1], -p[2])
+                exits.append((distance(p), p, self._of_side[start, end]))
+            else:
+                on = (self._points[m % n] for m in range(start + 1, end if end > start else end + n))
+                far = max(on, key=distance)
+                exits.append((distance(far), far, self._at[self._corner[far]]))
         _, point, t = min((e for e in exits if e[0] > 0), key=lambda e: e[0])
         return point, t
 
+    def _sides(self, line: Point) -> IntArray:
+        """On which side of a line each corner lies: 1 for its left, -1 for its right, 0 on it."""
+        a, b, c = line
+        (x, y), unit, size = self._centre, self._unit, max(abs(a), abs(b))
+        # Quotients of integers are rounded once, whatever their size.
+        value = self._near @ (a / size, b / size) + (a * x + b * y + c) / (size * unit)
+        sides = np.where(value > 0, 1, -1)
+        for k in np.flatnonzero(np.abs(value) < MARGIN).tolist():
+            sides[k] = _side(line, self._points[k])
+        return sides
 
-def clip_ears(corners: list[tuple[int, int]], near: FloatArray) -> list[tuple[int, int, int]]:
-    """Triangulate a simple polygon by cutting off one convex corner after another.
 
-    Parameters
-    ----------
-    corners : list of (int, int)
-        Counterclockwise, no two equal. Straight angles are allowed.
-    near : (k, 2) float64
-        The same, rounded so that order is kept in each coordinate.
-
-    Returns
-    -------
-    list of (int, int, int)
-        Counterclockwise triangles of positive area. The side from the first to the last corner of
-        each but the last is one of a later triangle, or rather its reverse.
-    """
-    points = [(x, y, 1) for x, y in corners]
-    n = len(points)
-    before, after = [(k - 1) % n for k in range(n)], [(k + 1) % n for k in range(n)]
-    blunt = [_turn(points[before[k]], points[k], points[after[k]]) <= 0 for k in range(n)]
-    # Only corners that are not convex can lie in an ear, and one that does keeps it waiting.
-    rest = np.flatnonzero(blunt)
-    count = rest.size
-    held_up: dict[int, list[int]] = {}
-    # A corner whose neighbours changed queues anew: ears are cut in rounds, which keeps the tree low.
-    turn_of = [0] * n
-    queue = deque((k, 0) for k in range(n) if not blunt[k])
-    triangles: list[tuple[int, int, int]] = []
-
-    def again(corner: int) -> None:
-        turn_of[corner] += 1
-        queue.append((corner, turn_of[corner]))
-
-    while len(triangles) < n - 2:
-        b, turn = queue.popleft()
-        if turn != turn_of[b] or blunt[b]:
-            continue
-        a, c = before[b], after[b]
-        low, high = near[[a, b, c]].min(axis=0), near[[a, b, c]].max(axis=0)
-        x, y = near[rest].T
-        inside = (low[0] <= x) & (x <= high[0]) & (low[1] <= y) & (y <= high[1])
-        sides = _cross(points[a], points[b]), _cross(points[b], points[c]), _cross(points[c], points[a])
-        blocking = (
-            k
-            for k in rest[inside].tolist()
-            if blunt[k] and k not in (a, c) and all(_side(side, points[k]) >= 0 for side in sides)
-        )
-        if (blocker := next(blocking, None)) is not None:
-            held_up.setdefault(blocker, []).append(b)
-            continue
-        triangles.append((a, b, c))
-        turn_of[b] = -1
-        after[a], before[c] = c, a
-        for k in (a, c):
-            if blunt[k] and _turn(points[before[k]], points[k], points[after[k]]) > 0:
-                blunt[k] = False
-                count -= 1
-                for freed in held_up.pop(k, []):
-                    if turn_of[freed] >= 0:
-                        again(freed)
-            again(k)
-        if 2 * count < rest.size:
-            rest = rest[[blunt[k] for k in rest.tolist()]]
-    return triangles
+def _with_last(triangle: tuple[int, int, int], corner: int) -> tuple[int, int, int]:
+    """The same triangle with a corner as the last."""
+    a, b, c = triangle
+    return (b, c, a) if corner == a else (c, a, b) if corner == b else triangle
 
 
 def _cross(p: Point, q: Point) -> Point:

@@ -165,7 +165,8 @@ class Diagnosis:
                 lines.append(f"- … and {len(same) - most} more of this kind")
             lines.append(f"  {kind.value}")
         if len(self.split):
-            lines.append(f"Splitting {len(self.split)} {'edge' if len(self.split) == 1 else 'edges'} may help.")
+            edges = f"{len(self.split)} {'edge' if len(self.split) == 1 else 'edges'}"
+            lines.append(f"Splitting {edges} may help: refine_problem, or qhm refine on the command line.")
         lines += [f"Not checked: {text}" for text in self.unchecked]
         return "\n".join(lines)
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from quasiharmonic.diagnosis.clearance import clear
+from quasiharmonic.diagnosis.curves import Corners
 from quasiharmonic.diagnosis.fixture import Fixture
 from quasiharmonic.diagnosis.links import Polygon
 from quasiharmonic.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices
@@ -25,13 +27,13 @@ BoolArray = NDArray[np.bool_]
 LONGEST = 8
 # Steps in the triangulated target, some microseconds each, after which the search ends: so many at
 # least, and more by so many for each boundary vertex.
-_WORK, _WORK_PER_VERTEX = 50_000, 20
+_WORK, _WORK_PER_VERTEX = 50_000, 10
 # More pairs than this are not collected.
 _MOST_PAIRS = 10_000_000
-# Places from which the target is overlooked, to spare most pairs an exact path.
-_HUBS = 8
-# Beyond this size, hubs cost more than they spare.
-_MOST_FOR_HUBS = 2000
+# How far beside the middle between two corners both are looked for, in halves of their distance.
+_BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
+# Pairs of a line of sight and an edge near it that are looked at for each length.
+_MOST_NEAR = 1_000_000
 
 
 class Shortcuts:
@@ -42,6 +44,7 @@ class Shortcuts:
     problem : Problem
         With a single boundary loop, simple and counterclockwise in the target.
     fixture : Fixture
+    corners : Corners
 
     Attributes
     ----------
@@ -49,7 +52,7 @@ class Shortcuts:
         Pairs so many edges apart or more were not, or not all, looked at. Known after `find`.
     """
 
-    def __init__(self, problem: Problem, fixture: Fixture) -> None:
+    def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
         self._loop = problem.loops[0]
         free = ~fixture.fixed
         interior = problem.edges.interior
@@ -64,16 +67,16 @@ class Shortcuts:
         self._ends = csr_array(
             (np.ones(len(mixed)), (place[mixed[:, 0]], mixed[:, 1])), shape=(len(self._loop), problem.n)
         )
-        rows = fixture.row[self._loop]
-        self._near = fixture.lattice.near[rows]
-        self._polygon = Polygon([fixture.lattice.points[k] for k in rows.tolist()], self._near)
+        self._fixture = fixture
+        self._corners = corners
+        self._sides = np.stack([self._loop, np.roll(self._loop, -1)], axis=1)
+        self._polygon = Polygon(fixture.points(self._loop))
         self.unchecked = LONGEST + 1
 
     def find(self) -> Iterator[Obstruction]:
         """Pairs of vertices that are fewer edges apart than segments, nearest ones first."""
         n = len(self._loop)
         budget = _WORK + _WORK_PER_VERTEX * n
-        from_hubs = _hub_distances(self._near, np.array(self._polygon.triangles))
         reached, known = self._ends, np.empty(0, dtype=np.int64)
         at_ends = np.bincount(self._ends.indices, minlength=self._ends.shape[1])
         for k in range(2, LONGEST + 1):
@@ -89,14 +92,54 @@ class Shortcuts:
             i, j = np.divmod(keys, n)
             # Along the boundary it takes no more segments than edges, two where there is but one, and
             # what a vertex sees of its neighbours has been looked at without this.
-            around = np.minimum((i - j) % n, (j - i) % n)
-            open_ = (around > k) & (_over_hubs(from_hubs, i, j) > k) & (k > 2)
-            for a, b in zip(i[open_].tolist(), j[open_].tolist(), strict=True):
+            far = (np.minimum((i - j) % n, (j - i) % n) > k) & (k > 2)
+            i, j = i[far], j[far]
+            hidden = ~self._within(i, j, k)
+            for a, b in zip(i[hidden].tolist(), j[hidden].tolist(), strict=True):
                 if self._polygon.work > budget:
                     self.unchecked = k
                     return
                 if self._polygon.link_distance(a, b, k) > k:
                     yield self._obstruction(a, b, k)
+
+    def _within(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
+        """Whether corners are known to be no more than k > 2 segments apart.
+
+        Known is whether one sees the other, or a third one that is less than k sides from it, and
+        whether both see one of a few points between them.
+        """
+        n, tails, heads = len(self._loop), self._loop[i], self._loop[j]
+        where = self._fixture.positions
+        p, q = where[tails], where[heads]
+        result = self._clear(tails, heads, p, q)
+        seen = np.sort(np.concatenate([(i * n + j)[result], (j * n + i)[result]]))
+        for here, there in ((i, j), (j, i)) if seen.size else ():
+            at = np.searchsorted(seen, here * n + there)
+            for nearest in (seen[np.minimum(at, seen.size - 1)], seen[np.maximum(at - 1, 0)]):
+                result |= (nearest // n == here) & (np.abs(nearest % n - there) < k)
+        # Round a bend the two see one another from a place beside it, towards the inside of the bend.
+        inward = np.where((j - i) % n < (i - j) % n, 1.0, -1.0)
+        dx, dy = (q / 2 - p / 2).T
+        left = np.stack([-dy * inward, dx * inward], axis=1)
+        for height in _BESIDE:
+            open_ = np.flatnonzero(~result)
+            with np.errstate(over="ignore"):
+                place = p[open_] / 2 + q[open_] / 2 + height * left[open_]
+            once = self._clear(tails[open_], None, p[open_], place)
+            open_, place = open_[once], place[once]
+            result[open_] = self._clear(heads[open_], None, q[open_], place)
+        return result
+
+    def _clear(self, tails: IntArray, heads: IntArray | None, p: FloatArray, q: FloatArray) -> BoolArray:
+        """Whether segments that start at corners, and end at others or inside, are known to run inside."""
+        where = self._fixture.positions
+        inside: BoolArray = np.all(np.isfinite(q), axis=1)
+        inside[inside] = self._corners.opens_to(tails[inside], q[inside], where)
+        if heads is not None:
+            inside[inside] = self._corners.opens_to(heads[inside], p[inside], where)
+        ends = np.stack([tails, np.full(len(tails), -1) if heads is None else heads], axis=1)
+        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, _MOST_NEAR)
+        return inside
 
     def _obstruction(self, a: int, b: int, k: int) -> Obstruction:
         ends = self._loop[[a, b]]
@@ -134,68 +177,3 @@ def _row(matrix: csr_array, k: int) -> IntArray:
     """Column indices of the entries in a row."""
     columns: IntArray = matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)
     return columns
-
-
-def _hub_distances(corners: FloatArray, triangles: IntArray) -> FloatArray:
-    """How few segments are known to lead from some places inside a polygon to its corners.
-
-    Rounding matters little here: a number that is too small hides an obstruction and invents none.
-
-    Parameters
-    ----------
-    corners : (n, 2) float64
-        Of the polygon, counterclockwise.
-    triangles : (n - 2, 3) int64
-        A triangulation.
-
-    Returns
-    -------
-    (h, n) float64
-        Whole numbers, infinite where no way is known.
-    """
-    n = len(corners)
-    if n > _MOST_FOR_HUBS:
-        return np.empty((0, n))
-    a, b, c = corners[triangles].transpose(1, 0, 2)
-    by_area = np.argsort(-_cross(b - a, c - a), kind="stable")
-    hubs, seen = np.empty((0, 2)), np.empty((0, n), dtype=bool)
-    for t in by_area.tolist():
-        if len(hubs) == _HUBS:
-            break
-        overlooked: BoolArray = np.any(seen[:, triangles[t]], axis=0)
-        if not overlooked.all():
-            hub = corners[triangles[t]].mean(axis=0)
-            hubs = np.concatenate([hubs, hub[None]])
-            seen = np.concatenate([seen, _sees(hub, corners, corners)[None]])
-    between = np.array([np.where(_sees(hub, hubs, corners), 1.0, np.inf) for hub in hubs])
-    np.fill_diagonal(between, 0)
-    for middle in range(len(hubs)):
-        between = np.minimum(between, between[:, middle, None] + between[middle])
-    return np.min(between[:, :, None] + np.where(seen, 1.0, np.inf), axis=1)
-
-
-def _over_hubs(from_hubs: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
-    """Fewest segments known to lead between corners; (k,) float64."""
-    shortest: FloatArray = np.min(from_hubs[:, i] + from_hubs[:, j], axis=0, initial=np.inf)
-    return shortest
-
-
-def _sees(place: FloatArray, points: FloatArray, corners: FloatArray) -> BoolArray:
-    """Which points (m, 2) are seen from a place inside a polygon; (m,) bool."""
-    p, q = corners, np.roll(corners, -1, axis=0)
-    way = points - place
-    p_side, q_side = (_cross(way[:, None], end - place) for end in (p, q))
-    here = _cross(q - p, place - p)
-    there = _cross(q - p, points[:, None] - p)
-    crossed = (p_side * q_side < 0) & (here * there < 0)
-    # A way through a corner is none, unless it ends there.
-    along = np.einsum("mk,nk->mn", way, p - place)
-    through = (p_side == 0) & (along > 0) & (along < np.einsum("mk,mk->m", way, way)[:, None])
-    seen: BoolArray = ~(crossed | through).any(axis=1)
-    return seen
-
-
-def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Cross products along the last axis."""
-    product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return product

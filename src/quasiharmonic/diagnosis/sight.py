@@ -12,8 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.diagnosis.clipping import Convex, Walls, line, reverse
-from quasiharmonic.diagnosis.curves import BoundaryCurves, contacts
+from quasiharmonic.boundary_curves import contacts
+from quasiharmonic.diagnosis.clipping import Convex, Walls
+from quasiharmonic.diagnosis.curves import MOST_CONTACTS, BoundaryCurves, Corners
 from quasiharmonic.diagnosis.fixture import Fixture, Star
 from quasiharmonic.diagnosis.obstruction import (
     Forbids,
@@ -22,8 +23,9 @@ from quasiharmonic.diagnosis.obstruction import (
     named_vertices,
     smallest_conflict,
 )
+from quasiharmonic.diagnosis.views import Views
+from quasiharmonic.diagnosis.wedges import Wedges
 from quasiharmonic.mesh.topology import named_edges
-from quasiharmonic.predicates import orientation
 from quasiharmonic.problem import Problem
 
 IntArray = NDArray[np.int64]
@@ -33,16 +35,15 @@ BoolArray = NDArray[np.bool_]
 _APART = 8
 
 
-def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves) -> Iterator[Obstruction]:
+def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves, corner: Corners) -> Iterator[Obstruction]:
     """Interior edges with both ends fixed that do not lie strictly inside, free of all else that is fixed."""
     chords, where = fixture.chords, fixture.positions
     if not len(chords):
         return
-    corner = Corners(problem, curves)
     segments = np.concatenate([curves.ends, np.stack([problem.pins, problem.pins], axis=1), chords])
     first = len(segments) - len(chords)
     met: dict[int, list[IntArray]] = {}
-    for i, j in contacts(where, segments).pairs.tolist():
+    for i, j in contacts(where, segments, MOST_CONTACTS).pairs.tolist():
         if j >= first:
             # Of two edges that cross one another it is enough to name one.
             met.setdefault(j - first, []).append(segments[i])
@@ -66,39 +67,6 @@ def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves) -> It
         )
 
 
-class Corners:
-    """The angles of the target at its boundary vertices.
-
-    Attributes
-    ----------
-    known : (n,) bool
-        Boundary vertices.
-    """
-
-    def __init__(self, problem: Problem, curves: BoundaryCurves) -> None:
-        self.known = np.zeros(problem.n, dtype=bool)
-        self.before, self.after = np.full((2, problem.n), -1)
-        tails, heads = curves.ends.T
-        self.known[tails] = True
-        self.before[heads], self.after[tails] = tails, heads
-
-    def reflex(self, vertices: IntArray, where: NDArray[np.float64]) -> BoolArray:
-        """Whether the angle inside is larger than π; (k,) bool."""
-        turns: BoolArray = orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
-        return turns
-
-    def opens_to(self, vertices: IntArray, points: NDArray[np.float64], where: NDArray[np.float64]) -> BoolArray:
-        """Whether the way to a point starts strictly inside the angle; (k,) bool, False at pins."""
-        result = np.zeros(len(vertices), dtype=bool)
-        known = np.flatnonzero(self.known[vertices])
-        v, x = vertices[known], points[known]
-        left_of_last = orientation(where[self.before[v]], where[v], x) > 0
-        left_of_next = orientation(where[v], where[self.after[v]], x) > 0
-        reflex = self.reflex(v, where)
-        result[known] = np.where(reflex, left_of_last | left_of_next, left_of_last & left_of_next)
-        return result
-
-
 class Sight:
     """Looks for a place from which a vertex sees all its fixed neighbours.
 
@@ -106,17 +74,24 @@ class Sight:
     ----------
     problem : Problem
     fixture : Fixture
-    curves : BoundaryCurves
-        Simple and properly nested.
-    chords : (c, 2) int64
-        Interior edges with both ends fixed that are where they can be; nothing sees through them.
+    corners : Corners
+        Of a target that is simple and properly nested.
+    walls : (m, 2) int64
+        Edges that nothing sees through: of the boundary, and interior ones with both ends fixed.
     """
 
-    def __init__(self, problem: Problem, fixture: Fixture, curves: BoundaryCurves, chords: IntArray) -> None:
+    def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray) -> None:
         self._fixture = fixture
-        self._corner = Corners(problem, curves)
-        ends = fixture.row[np.concatenate([curves.ends, chords])]
+        ends = fixture.row[walls]
+        beside = np.stack([corners.after, corners.before], axis=1)[problem.fixed]
+        beside = np.where(beside >= 0, fixture.row[beside], -1)
         self._walls = Walls(ends, fixture.lattice)
+        self._views = Views(ends, problem.target, fixture.lattice, beside)
+
+    @property
+    def effort(self) -> int:
+        """What has been spent so far, in about microseconds."""
+        return self._views.effort.spent
 
     def hidden(self, star: Star) -> Obstruction | None:
         """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it."""
@@ -157,34 +132,41 @@ class Sight:
 
     def _place(self, neighbours: IntArray, edges: IntArray) -> bool:
         """Whether some point inside sees the neighbours and lies to the left of the edges."""
-        eyes = self._fixture.row[neighbours].tolist()
-        return any(self._walls.seeing(area, eyes) is not None for area in self._areas(neighbours, edges))
+        eyes = [self._views.wedges(row) for row in self._fixture.row[neighbours].tolist()]
+        eyes, overlaps = _least_in_common(eyes)
+        if overlaps is not None and not len(overlaps):
+            return False
+        area = self._fixture.left_of(self._fixture.extent(), edges)
+        return area is not None and any(
+            self._walls.seeing(part, [wedges.eye for wedges in eyes]) is not None
+            for part in _in_view(area, eyes, overlaps)
+        )
 
-    def _areas(self, neighbours: IntArray, edges: IntArray) -> Iterator[Convex]:
-        """Where to look: near the neighbours first, then everywhere.
 
-        Points that see one boundary vertex from within its angle are inside, and those that see the
-        others too then do so from inside.
-        """
-        corner, where = self._corner, self._fixture.positions
-        known = neighbours[corner.known[neighbours]]
-        reflex = corner.reflex(known, where)
-        xs, ys = zip(*self._fixture.points(neighbours), strict=True)
-        reach = max(max(xs) - min(xs), max(ys) - min(ys), 1)
-        near = Convex.box((min(xs) - reach, min(ys) - reach), (max(xs) + reach, max(ys) + reach))
-        for box in (near, self._fixture.extent()):
-            area = self._fixture.left_of(box, edges)
-            if area is None:
-                continue
-            if not known.size:
-                yield area
-                continue
-            v = known[np.argmin(reflex)]
-            last, here, following = self._fixture.points(np.array([corner.before[v], v, corner.after[v]]))
-            left = area.cut(line(here, following))
-            if not reflex.all():
-                parts = [left and left.cut(line(last, here))]
-            else:
-                right = area.cut(reverse(line(here, following)))
-                parts = [left, right and right.cut(line(last, here))]
-            yield from (part for part in parts if part is not None)
+def _least_in_common(eyes: list[Wedges]) -> tuple[list[Wedges], IntArray | None]:
+    """Views in an order in which the first two have little in common, and their wedges that may overlap."""
+    order, least = eyes, None
+    for k in range(1, len(eyes)):
+        if least is not None and not len(least):
+            break
+        overlaps = eyes[0].overlapping(eyes[k])
+        if overlaps is not None and (least is None or len(overlaps) < len(least)):
+            order, least = [eyes[0], eyes[k], *eyes[1:k], *eyes[k + 1 :]], overlaps
+    return order, least
+
+
+def _in_view(area: Convex, eyes: list[Wedges], overlaps: IntArray | None = None) -> Iterator[Convex]:
+    """The parts of an area in wedges of all views; ``overlaps`` are those of the first two that may overlap."""
+    if not eyes:
+        yield area
+    elif overlaps is None:
+        for _, part in eyes[0].parts(area):
+            yield from _in_view(part, eyes[1:])
+    else:
+        one, two = (np.zeros(len(wedges), dtype=bool) for wedges in eyes[:2])
+        one[overlaps[:, 0]] = True
+        for k, part in eyes[0].parts(area, one):
+            two[:] = False
+            two[overlaps[overlaps[:, 0] == k, 1]] = True
+            for _, rest in eyes[1].parts(part, two):
+                yield from _in_view(rest, eyes[2:])

@@ -1,0 +1,245 @@
+"""What speeds the diagnosis up changes nothing in it: triangulation, views, places found by trial, quick sights."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from meshes import boundary_of
+from obstructed import OBSTRUCTED, U, circle, onto, random_polygon, spiral
+from quasiharmonic.boundary_curves import contacts, winding
+from quasiharmonic.diagnosis import Kind, diagnose, examine, shortcuts
+from quasiharmonic.diagnosis.clearance import clear
+from quasiharmonic.diagnosis.clipping import Lattice
+from quasiharmonic.diagnosis.triangulation import triangulate
+from quasiharmonic.diagnosis.views import Views
+from quasiharmonic.predicates import SegmentRelation, orientation, segment_relation
+from quasiharmonic.problem import Problem
+from quasiharmonic.surfaces import annulus, disk, grid
+
+
+def polygons():
+    rng = np.random.default_rng(11)
+    random = [
+        random_polygon(rng, int(n), int(m))
+        for n, m in zip(rng.integers(4, 26, 40), rng.integers(6, 9, 40), strict=True)
+    ]
+    return [np.array(U, dtype=float), circle(17), spiral(14, 1.6), *random]
+
+
+def outlines(kind, n):
+    """Simple outlines of many corners."""
+    t = 2 * np.pi * np.arange(n) / n
+    if kind == "spiral":
+        return spiral(n // 2, 8.3)
+    if kind == "star":
+        return circle(n) * (0.05 + np.random.default_rng(0).random(n))[:, None]
+    if kind == "gear":
+        return circle(n) * (0.5 + 0.4 * np.sign(np.sin(500.5 * t + 0.1)))[:, None]
+    return circle(n) * (1 + 0.3 * np.cos(5 * t) + 0.1 * np.cos(23 * t))[:, None]
+
+
+def turned_ring(n, layers, angle=np.pi):
+    """A ring of so many triangles' layers whose inner loop is turned against the outer one."""
+    V, F = grid(n, layers)
+    here = np.arange(len(V))
+    here[n :: n + 1] -= n  # the last column is the first
+    kept, F = np.unique(here[F], return_inverse=True)
+    radius, turn = 1 + V[kept, 1] / 2, -2 * np.pi * V[kept, 0]
+    z = radius * np.exp(1j * turn)
+    target = np.where(V[kept, 1] == 1, z * np.exp(1j * angle), z)
+    F = F.reshape(-1, 3)
+    fixed = boundary_of(F)
+    return Problem(z.view(float).reshape(-1, 2), F, fixed, target.view(float).reshape(-1, 2)[fixed])
+
+
+@pytest.mark.parametrize("corners", polygons())
+def test_triangles_fill_polygons(corners):
+    points = Lattice(corners).points
+    triangles = np.array(triangulate(points))
+    a, b, c = corners[triangles].transpose(1, 0, 2)
+    assert (orientation(a, b, c) > 0).all()
+    sides = {(i, j) for t in triangles.tolist() for i, j in pairwise([*t, t[0]])}
+    n = len(corners)
+    assert len(sides) == 3 * (n - 2) == 3 * len(triangles)
+    # Every side of the polygon is one of a triangle, all others are shared by two.
+    assert {(i, j) for i, j in sides if (j, i) not in sides} == {(k, (k + 1) % n) for k in range(n)}
+
+
+def seen(here, eye, corners):
+    """Whether points see a corner from inside, by brute force; None for those on a line with two corners."""
+    result = []
+    after = np.roll(corners, -1, axis=0)
+    for x in here:
+        met = segment_relation(np.tile(x, (len(corners), 1)), np.tile(corners[eye], (len(corners), 1)), corners, after)
+        met[[eye, eye - 1]] = 0
+        inside = winding(x[None], corners, after)
+        before, behind = corners[eye - 1], after[eye]
+        left, right = orientation(before, corners[eye], x), orientation(corners[eye], behind, x)
+        convex = orientation(before, corners[eye], behind) >= 0
+        opens = (left > 0 and right > 0) if convex else (left > 0 or right > 0)
+        vague = (met == SegmentRelation.TOUCHING).any() or inside[1][0] or left == 0 or right == 0
+        result.append(None if vague else bool(opens and not met.any() and inside[0][0] == 1))
+    return result
+
+
+@pytest.mark.parametrize("corners", polygons()[:12])
+def test_wedges_hold_what_is_seen_and_no_more(corners, rng):
+    n = len(corners)
+    k = np.arange(n)
+    views = Views(
+        np.stack([k, (k + 1) % n], axis=1), corners, Lattice(corners), np.stack([(k + 1) % n, (k - 1) % n], axis=1)
+    )
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    points = low + (high - low) * rng.random((40, 2))
+    for eye in range(n):
+        wedges = views.wedges(eye)
+        (p, q), tip = corners[wedges.wall.T], corners[eye]
+        held = [
+            bool(
+                (
+                    (orientation(tip, corners[wedges.right], x) > 0)
+                    & (orientation(tip, corners[wedges.left], x) < 0)
+                    & (orientation(p, q, x) > 0)
+                ).any()
+            )
+            for x in points
+        ]
+        for x, truth in zip(held, seen(points, eye, corners), strict=True):
+            assert truth is None or x == truth
+
+
+def test_directions_that_differ_by_a_rounding_are_sorted_exactly():
+    # Seen from the first corner, the others are in directions that floating point cannot tell apart.
+    corners = np.array([[0, 0], *([1 + 0.1 * k, 1e-30 * k] for k in range(9)), [0.5, 1.0]])
+    n = len(corners)
+    k = np.arange(n)
+    views = Views(
+        np.stack([k, (k + 1) % n], axis=1), corners, Lattice(corners), np.stack([(k + 1) % n, (k - 1) % n], axis=1)
+    )
+    wedges = views.wedges(0)
+    # Each wall but the two at the eye is seen, from right to left.
+    assert wedges.wall.tolist() == [[j, j + 1] for j in range(1, n - 1)]
+    assert wedges.right.tolist() == list(range(1, n - 1))
+
+
+def test_clear_segments_against_all_pairs(rng):
+    points = rng.integers(0, 12, (60, 2)).astype(float)
+    walls = np.stack([np.arange(0, 40, 2), np.arange(1, 40, 2)], axis=1)
+    ends = np.stack([rng.integers(0, 60, 300), rng.integers(0, 60, 300)], axis=1)
+    p, q = points[ends.T]
+    expected = []
+    for (a, b), x, y in zip(ends.tolist(), p, q, strict=True):
+        others = walls[~np.isin(walls, (a, b)).any(axis=1)]
+        r, s = points[others.T]
+        m = len(others)
+        expected.append(not segment_relation(np.tile(x, (m, 1)), np.tile(y, (m, 1)), r, s).any())
+    assert clear(p, q, ends, walls, points, 10**9).tolist() == expected
+    assert not clear(p, q, ends, walls, points, 10).any()
+
+
+def winding_number(x, corners):
+    """By the definition of Hormann and Agathos, one edge after another."""
+    turns = 0
+    for p, q in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if (p[1] <= x[1]) != (q[1] <= x[1]):
+            up = q[1] > p[1]
+            if orientation(p, q, x) * (1 if up else -1) > 0:
+                turns += 1 if up else -1
+    return turns
+
+
+@pytest.mark.parametrize("chunk", [1, 1 << 18])
+def test_winding_numbers(rng, monkeypatch, chunk):
+    monkeypatch.setattr("quasiharmonic.boundary_curves._PAIR_CHUNK", chunk)
+    for n in (3, 8, 30):
+        corners = rng.integers(0, 9, (n, 2)).astype(float)
+        points = np.concatenate([rng.integers(0, 9, (40, 2)), rng.integers(0, 18, (40, 2)) / 2, corners])
+        after = np.roll(corners, -1, axis=0)
+        turns, on = winding(points, corners, after)
+        m = len(points)
+        touched = [segment_relation(np.tile(x, (n, 1)), np.tile(x, (n, 1)), corners, after).any() for x in points]
+        assert on.tolist() == touched
+        for k in np.flatnonzero(~on):
+            assert turns[k] == winding_number(points[k], corners)
+        assert len(turns) == m
+
+
+def test_contacts_stop_at_the_most_that_is_asked_for(rng):
+    points = rng.random((200, 2))
+    ends = np.arange(200).reshape(-1, 2)
+    every = contacts(points, ends, 10**6)
+    assert every.complete
+    some = contacts(points, ends, 5)
+    assert not some.complete
+    assert len(some.pairs) == len(some.relation) == 5 < len(every.pairs)
+
+
+def random_problems():
+    """Simple targets on which all kinds of obstruction come up."""
+    rng = np.random.default_rng(4)
+    for n in (2, 3, 4):
+        mesh = disk(n)
+        count = len(boundary_of(mesh[1]))
+        yield onto(mesh, np.roll(spiral(count // 2, rng.uniform(0.7, 1.7)), int(rng.integers(count)), axis=0))
+        yield onto(mesh, circle(count) * (0.05 + rng.random(count))[:, None])
+        if count <= 18:
+            yield onto(mesh, random_polygon(rng, count, 7))
+    for n in (5, 8, 11):
+        V, F = annulus(n)
+        inner = np.abs(V).max(axis=1) < 1
+        target = np.where(inner[:, None], V @ [[-1, 0], [0, -1]] * rng.uniform(0.5, 1.2), V)
+        fixed = boundary_of(F)
+        yield Problem(V, F, fixed, target[fixed])
+    for _ in range(4):
+        V, F = grid(5, 5)
+        inside = np.setdiff1d(np.arange(len(V)), boundary_of(F))
+        fixed = np.concatenate([boundary_of(F), pins := rng.choice(inside, 6, replace=False)])
+        target = np.round(8 * (V + 0.2 * rng.normal(size=V.shape) * np.isin(np.arange(len(V)), pins)[:, None])) / 8
+        yield Problem(V, F, fixed, target[fixed])
+
+
+def found(problem):
+    return [
+        (o.kind, o.forbids, o.vertices.tolist(), o.edges.tolist(), o.split.tolist())
+        for o in diagnose(problem).obstructions
+    ]
+
+
+def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
+    problems = [*random_problems(), *(problem for problem, _ in OBSTRUCTED.values())]
+    quick = [found(problem) for problem in problems]
+    monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
+    monkeypatch.setattr(shortcuts.Shortcuts, "_within", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
+    assert quick == [found(problem) for problem in problems]
+    kinds = {kind for some in quick for kind, *_ in some}
+    assert {Kind.HIDDEN, Kind.HALF_PLANES, Kind.LINK_DISTANCE, Kind.CHORD} <= kinds
+
+
+def test_what_takes_too_long_is_said_to_be_unchecked(monkeypatch):
+    problem, _ = OBSTRUCTED["nothing sees all"]
+    monkeypatch.setattr(examine, "_MOST_EFFORT", 0)
+    diagnosis = diagnose(problem)
+    assert not diagnosis.obstructions
+    assert "the fixed neighbours of vertex 8" in diagnosis.unchecked[0]
+
+
+@pytest.mark.parametrize("kind", ["wobble", "spiral", "star", "gear"])
+def test_ten_thousand_boundary_vertices(kind):
+    problem = onto(grid(4980, 20), outlines(kind, 10_000))
+    began = time.process_time()
+    assert diagnose(problem).obstructions == ()
+    # Under a second where nothing else runs.
+    assert time.process_time() - began < 10
+
+
+def test_every_vertex_of_a_ring_sees_too_little():
+    problem = turned_ring(84, 2)
+    began = time.process_time()
+    diagnosis = diagnose(problem)
+    assert time.process_time() - began < 10
+    assert {o.kind for o in diagnosis.obstructions} == {Kind.HIDDEN}
+    assert {int(o.vertices[0]) for o in diagnosis.obstructions} == set(range(problem.n)) - set(problem.fixed.tolist())
