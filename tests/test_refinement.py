@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from meshes import boundary_of, signed_areas, surfaces
+from obstructed import OBSTRUCTED
+from quasiharmonic import Problem
+from quasiharmonic.diagnosis import diagnose
 from quasiharmonic.mesh.topology import edges
-from quasiharmonic.refinement import refine
+from quasiharmonic.refinement import refine, refine_problem
 
 TWO = ([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], [[0, 1, 2], [0, 2, 3]])
 
@@ -112,9 +115,10 @@ def test_nothing_to_split():
         ([[0, 7]], r"\(0, 7\): not an edge"),
         ([[-1, 2]], r"\(-1, 2\): not an edge"),
         ([[2, 2]], r"\(2, 2\): not an edge"),
-        ([[0.0, 2.0]], "edges must hold integers"),
-        ([0, 2], "edges must hold integers"),
-        ([[0, 2, 3]], "edges must hold integers"),
+        ([[0.0, 2.0]], "edges must hold integer vertex indices, not float64"),
+        ([0, 2], r"edges must have shape \(k, 2\), not \(2,\)"),
+        ([[0, 2, 3]], r"edges must have shape \(k, 2\), not \(1, 3\)"),
+        (np.array([[0, 2**64 - 1]], dtype=np.uint64), "edges refers to vertex 18446744073709551615, which no mesh"),
     ],
 )
 def test_wrong_edges_are_named(pairs, message):
@@ -123,7 +127,63 @@ def test_wrong_edges_are_named(pairs, message):
 
 
 def test_wrong_triangles_are_refused():
-    with pytest.raises(ValueError, match="outside 0 … 3"):
+    with pytest.raises(ValueError, match="F refers to vertex 4, but there are only vertices 0 … 3"):
         refine(TWO[0], [[0, 1, 4]], [])
-    with pytest.raises(ValueError, match="F must hold integers"):
+    with pytest.raises(ValueError, match="F must hold integer"):
         refine(TWO[0], [[0.5, 1, 2]], [])
+
+
+@pytest.mark.parametrize(
+    ("V", "message"),
+    [
+        (np.array(TWO[0]) + 1j, "V must hold real numbers"),
+        (TWO[0][0], r"V must have shape \(n, 2\) or \(n, 3\)"),
+        (np.full((4, 2), np.nan), "V is not finite at vertices 0, 1, 2, 3"),
+    ],
+)
+def test_wrong_vertices_are_refused(V, message):
+    with pytest.raises(ValueError, match=message):
+        refine(V, TWO[1], [])
+
+
+def rounds_by_hand(problem):
+    """The same as `refine_problem`, and a function carried along from one mesh to the next."""
+    V, F, number = problem.V, problem.F, 0
+    values = np.sin(np.arange(3 * len(V)).reshape(-1, 3))
+    while len(split := diagnose(Problem(V, F, problem.fixed, problem.target, reference="equilateral")).split):
+        refined = refine(V, F, split)
+        V, F, values, number = refined.V, refined.F, refined.extend(values), number + 1
+    return V, F, values, number
+
+
+def test_problems_are_refined_until_nothing_is_named():
+    most = 0
+    for problem, _ in OBSTRUCTED.values():
+        result = refine_problem(problem)
+        refined, n = result.refined, problem.n
+        V, F, values, number = rounds_by_hand(problem)
+        assert result.rounds == number
+        most = max(most, number)
+        np.testing.assert_array_equal(refined.V, V)
+        np.testing.assert_array_equal(refined.F, F)
+        np.testing.assert_allclose(refined.extend(values[:n]), values, atol=1e-15)
+        np.testing.assert_array_equal(result.problem.V, V)
+        np.testing.assert_array_equal(result.problem.fixed, problem.fixed)
+        assert not len(result.diagnosis.split)
+        # New vertices lie in one old triangle, and triangles in their parents.
+        assert refined.parents.shape == refined.weights.shape == (len(V) - n, 3) or not number
+        assert (np.diff(refined.parents, axis=1) >= 0).all()
+        np.testing.assert_array_equal(refined.weights.sum(axis=1), 1)
+        old = {frozenset(t) for t in problem.F.tolist()}
+        for row in refined.parents.tolist():
+            assert any(set(row) <= t for t in old)
+        np.testing.assert_array_equal(refined.parent[: len(problem.F)], np.arange(len(problem.F)))
+    assert most >= 2
+
+
+def test_rounds_are_limited():
+    problem, _ = next(case for case in OBSTRUCTED.values() if refine_problem(case[0]).rounds > 1)
+    result = refine_problem(problem, most_rounds=1)
+    assert result.rounds == 1
+    assert len(result.diagnosis.split)
+    assert refine_problem(problem, most_rounds=0).problem is problem

@@ -3,33 +3,41 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import check_finite, check_range, index_array, real_array
 from quasiharmonic.mesh.topology import edge_keys
 from quasiharmonic.mesh.topology import edges as sort_edges
+from quasiharmonic.problem import Problem
+
+if TYPE_CHECKING:
+    from quasiharmonic.diagnosis import Diagnosis
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Refined:
     """A mesh some of whose edges were split, and how it came from the old one.
 
     Attributes
     ----------
     V : (n + s, d) float64
-        Vertices: the old ones first, at their old indices, then one for each edge that was split.
+        Vertices: the old ones first, at their old indices, then the new ones.
     F : (f + …, 3) int64
         Triangles. Every old one keeps its index, or leaves it to its first part; further parts follow.
     parent : (f + …,) int64
         The old triangle each new one is a part of.
-    parents : (s, 2) int64
-        The old vertices between which each new one lies, smaller index first.
-    weights : (s, 2) float64
-        Their shares in it.
+    parents : (s, k) int64
+        The old vertices between which each new one lies, ascending: the two ends of the edge that was
+        split, or, after several rounds, up to three corners of the old triangle that was. Where there
+        are fewer than k the last one is repeated.
+    weights : (s, k) float64
+        Their shares in it; 0 for what is repeated.
     """
 
     V: FloatArray
@@ -39,7 +47,7 @@ class Refined:
     weights: FloatArray
 
     def extend(self, values: ArrayLike) -> FloatArray:
-        """Carry values at the old vertices over to the new ones, linear along the old edges.
+        """Carry values at the old vertices over to the new ones, linear on the old triangles.
 
         Parameters
         ----------
@@ -51,9 +59,89 @@ class Refined:
         (n + s, …) float64
         """
         old = np.asarray(values, dtype=np.float64)
-        if len(old) != len(self.V) - len(self.parents):
-            raise ValueError(f"values must have {len(self.V) - len(self.parents)} rows, one a vertex, not {len(old)}")
+        if not old.ndim or len(old) != len(self.V) - len(self.parents):
+            rows = "a number" if not old.ndim else f"{len(old)} rows"
+            raise ValueError(f"values must have {len(self.V) - len(self.parents)} rows, one a vertex, not {rows}")
         return np.concatenate([old, np.einsum("sk,sk...->s...", self.weights, old[self.parents])])
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedProblem:
+    """A problem on a refined mesh.
+
+    Attributes
+    ----------
+    problem : Problem
+        The same vertices are fixed, at the same positions.
+    refined : Refined
+        How its mesh came from the old one.
+    diagnosis : Diagnosis
+        What is known to forbid a map of it; no refinement cures that.
+    rounds : int
+        How often edges were split.
+    """
+
+    problem: Problem
+    refined: Refined
+    diagnosis: Diagnosis
+    rounds: int
+
+
+def refine_problem(problem: Problem, *, most_rounds: int = 20) -> RefinedProblem:
+    """Split the edges that a diagnosis names, and no others, until it names none.
+
+    Parameters
+    ----------
+    problem : Problem
+    most_rounds : int
+        Diagnoses to act upon at most. One is enough as a rule; where much room is lacking, edges that
+        were split may have to be split again.
+
+    Returns
+    -------
+    RefinedProblem
+        The problem as it was, on the same mesh, when no edge is named.
+
+    See Also
+    --------
+    refine : splits edges that the caller names.
+    quasiharmonic.diagnose : names them.
+    """
+    from quasiharmonic.diagnosis import diagnose
+
+    whole = refine(problem.V, problem.F, [])
+    diagnosis = diagnose(problem)
+    rounds = 0
+    while rounds < most_rounds and len(diagnosis.split):
+        whole = _composed(whole, refine(whole.V, whole.F, diagnosis.split))
+        problem = Problem(whole.V, whole.F, problem.fixed, problem.target, reference=problem.reference)
+        diagnosis = diagnose(problem)
+        rounds += 1
+    return RefinedProblem(problem, whole, diagnosis, rounds)
+
+
+def _composed(first: Refined, second: Refined) -> Refined:
+    """Two refinements, one after the other, as one; with three parents for each vertex."""
+    n = len(first.V) - len(first.parents)
+
+    def shares(vertex: int) -> dict[int, float]:
+        if vertex < n:
+            return {vertex: 1.0}
+        row = zip(first.parents[vertex - n].tolist(), first.weights[vertex - n].tolist(), strict=True)
+        return {parent: weight for parent, weight in row if weight}
+
+    combined = [shares(n + k) for k in range(len(first.parents))]
+    for row, weights in zip(second.parents.tolist(), second.weights.tolist(), strict=True):
+        total: dict[int, float] = {}
+        for vertex, weight in zip(row, weights, strict=True):
+            for parent, share in shares(vertex).items():
+                total[parent] = total.get(parent, 0.0) + weight * share
+        combined.append(total)
+    # What is split lies in one old triangle, so that there are three at most.
+    parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in combined], dtype=np.int64).reshape(-1, 3)
+    shared = [[*(row[parent] for parent in sorted(row)), 0.0, 0.0][:3] for row in combined]
+    weights_ = np.array(shared, dtype=np.float64).reshape(-1, 3)
+    return Refined(second.V, second.F, first.parent[second.parent], parents, weights_)
 
 
 def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
@@ -84,7 +172,12 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     ------
     ValueError
         When a pair is not an edge of the mesh, or is on its boundary and ``boundary`` is false; when
-        indices are no integers, have the wrong shape or refer to no vertex.
+        indices are no integers, have the wrong shape or refer to no vertex; when positions are no real
+        numbers, not finite or of the wrong shape.
+
+    See Also
+    --------
+    refine_problem : splits what a diagnosis names.
 
     Examples
     --------
@@ -93,12 +186,13 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     >>> refined.F.tolist(), refined.parent.tolist()
     ([[4, 1, 2], [4, 3, 0], [4, 0, 1], [4, 2, 3]], [0, 1, 0, 1])
     """
-    V = np.array(V, dtype=np.float64)
-    F = _indices("F", F, 3)
-    n = len(V)
-    if F.size and (F.min() < 0 or F.max() >= n):
-        raise ValueError(f"F refers to a vertex outside 0 … {n - 1}")
-    wanted = np.unique(np.sort(_indices("edges", edges, 2), axis=1), axis=0)
+    V = real_array("V", V)
+    if V.ndim != 2 or V.shape[1] not in (2, 3):
+        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
+    check_finite("V", "vertex", "vertices", V)
+    F, n = _rows("F", F, 3), len(V)
+    check_range("F", F, n)
+    wanted = np.unique(np.sort(_rows("edges", edges, 2), axis=1), axis=0)
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
     _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
@@ -160,11 +254,11 @@ def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
     return lengths
 
 
-def _indices(name: str, values: ArrayLike, width: int) -> IntArray:
-    array = np.asarray(values)
-    if array.size and (array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != width):
-        raise ValueError(f"{name} must hold integers in shape (k, {width}), not {array.dtype} {array.shape}")
-    return np.array(array, dtype=np.int64).reshape(-1, width)
+def _rows(name: str, values: ArrayLike, width: int) -> IntArray:
+    array = index_array(name, values)
+    if array.size and (array.ndim != 2 or array.shape[1] != width):
+        raise ValueError(f"{name} must have shape (k, {width}), not {array.shape}")
+    return array.reshape(-1, width)
 
 
 def _refuse(wanted: IntArray, known: IntArray, n: int, why: str) -> None:
