@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import platform
 import subprocess
 import sys
@@ -16,23 +17,28 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic.linsolve import NotPositiveDefinite, available, cholmod, make_solver, mkl, qdldl
+from quasiharmonic.mesh.dissection import nested_dissection
 
 ALL = ("pardiso", "cholmod", "qdldl", "superlu")
 HAS_MKL_WHEEL = platform.machine().lower() in ("x86_64", "amd64") and sys.platform in ("linux", "win32")
 
 
-# The code that large matrices take, on small ones.
-LARGE = {"pardiso for large": (mkl, "_SEQUENTIAL_BELOW"), "cholmod for large": (cholmod, "_SIMPLICIAL_BELOW")}
+# The code that matrices of other sizes take, on small ones.
+OTHER_SIZES = {
+    "pardiso for large": (mkl, "_SEQUENTIAL_BELOW"),
+    "pardiso filled up": (mkl, "_FILL_UP_FROM"),
+    "cholmod for large": (cholmod, "_SIMPLICIAL_BELOW"),
+}
 
 
-@pytest.fixture(params=(*ALL, *LARGE))
+@pytest.fixture(params=(*ALL, *OTHER_SIZES))
 def name(request, monkeypatch):
     backend = request.param.split()[0]
     if backend not in available():
         assert backend != "pardiso" or not HAS_MKL_WHEEL, "mkl is a dependency on this platform"
         pytest.skip(f"the library behind {backend} is not installed")
-    if request.param in LARGE:
-        monkeypatch.setattr(*LARGE[request.param], 0)
+    if request.param in OTHER_SIZES:
+        monkeypatch.setattr(*OTHER_SIZES[request.param], 0)
     return backend
 
 
@@ -82,8 +88,8 @@ def dense(matrix):
     return sp.csr_array((matrix[rows, columns], columns, np.r_[0, np.cumsum(np.arange(n, 0, -1))]), shape=(n, n))
 
 
-def solver_for(triangle, name):
-    return make_solver(triangle.indptr, triangle.indices, name=name)
+def solver_for(triangle, name, **options):
+    return make_solver(triangle.indptr, triangle.indices, name=name, **options)
 
 
 def solve(triangle, rhs, name):
@@ -218,6 +224,21 @@ def test_same_input_same_bits(name):
         results.append(solver.solve(rhs))
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
+
+
+def test_unknowns_in_a_good_order(name):
+    A = stiffness(20)
+    smallest = np.linalg.eigvalsh(both(A).toarray())[0]
+    rng = np.random.default_rng(0)
+    with solver_for(A, name, ordered=True) as solver:
+        for columns in [(), (1,), (2,), (5,)]:
+            solver.factor(A.data)
+            rhs = rng.standard_normal((400, *columns))
+            np.testing.assert_allclose(both(A) @ solver.solve(rhs), rhs, rtol=0, atol=1e-10)
+            indefinite = A.data.copy()
+            indefinite[A.indptr[:-1]] -= 1.5 * smallest
+            with pytest.raises(NotPositiveDefinite, match="not positive definite"):
+                solver.factor(indefinite)
 
 
 # ---- matrices that are not positive definite ----------------------------------------------------------------------
@@ -510,6 +531,86 @@ def test_pardiso_with_all_threads():
             solver.factor(indefinite)
         solver.factor(A.data)
         solver.solve(rhs)
+
+
+@needs_mkl
+def test_pardiso_keeps_an_order_that_is_called_good():
+    """Eliminating the tip of an arrow first fills all of the factor."""
+    n = 1000
+    arrow = sp.csr_array(sp.diags_array(np.full(n, 2.0 * n)) + sp.csr_array(np.eye(1, n).T @ np.ones((1, n))))
+    megabytes = {}
+    for ordered in (False, True):
+        with solver_for(arrow, "pardiso", ordered=ordered) as solver:
+            megabytes[ordered] = solver._handle._iparm[16] / 1024
+    assert megabytes[False] < 1
+    assert megabytes[True] > n * n / 2 * 8 / 2**20
+
+
+@needs_mkl
+@pytest.mark.parametrize("ordered", [False, True])
+def test_pardiso_agrees_with_itself_on_one_thread_and_two(ordered):
+    A = stiffness(180, contrast=1.0)
+    if ordered:
+        points = np.stack(np.divmod(np.arange(A.shape[0]), 180), axis=1) * 1.0
+        order = nested_dissection(points, *sp.triu(A, 1).coords)
+        A = upper(both(A)[order][:, order])
+    rng = np.random.default_rng(0)
+    loads = [rng.standard_normal((A.shape[0], *columns)) for columns in [(), (1,), (2,), (3,)]]
+    library = mkl.load_mkl()
+    answers = []
+    for threads in (1, 2):
+        before = library.MKL_Set_Num_Threads_Local(threads)
+        try:
+            with solver_for(A, "pardiso", ordered=ordered) as solver:
+                solver.factor(A.data)
+                answers.append([solver.solve(load) for load in loads])
+        finally:
+            library.MKL_Set_Num_Threads_Local(before)
+    for one, two in zip(*answers, strict=True):
+        np.testing.assert_allclose(two, one, rtol=0, atol=1e-11 * np.abs(one).max())
+
+
+_WORKERS = """
+import os, sys
+import numpy as np
+from quasiharmonic.linsolve import make_solver, mkl
+from quasiharmonic.surfaces import grid
+from quasiharmonic.laplacian import Laplacian
+mkl.load_mkl()
+V, F = grid(200, 200)
+rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))
+def solve():
+    laplacian = Laplacian(F, len(V), rim, "pardiso", V)
+    laplacian.factor(np.full((3, len(F)), -1.0))
+    laplacian.extend(V @ [1, 1j])
+if sys.argv[1] == "limit":
+    from threadpoolctl import threadpool_limits
+    with threadpool_limits(1):
+        solve()
+else:
+    solve()
+print(len(os.listdir("/proc/self/task")))
+"""
+
+
+@needs_mkl
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts threads by /proc")
+@pytest.mark.parametrize("way", ["limit", "OMP_NUM_THREADS", "MKL_NUM_THREADS"])
+def test_limits_to_the_number_of_threads_are_respected(way):
+    if way == "limit":
+        pytest.importorskip("threadpoolctl")
+    clean = {key: value for key, value in os.environ.items() if key not in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    clean["OPENBLAS_NUM_THREADS"] = "1"  # NumPy's own
+
+    def threads(**environment):
+        run = subprocess.run(
+            [sys.executable, "-c", _WORKERS, way], env=clean | environment, capture_output=True, text=True, check=True
+        )
+        return int(run.stdout)
+
+    assert threads(**({} if way == "limit" else {way: "1"})) == 1
+    if way == "MKL_NUM_THREADS":
+        assert threads(MKL_NUM_THREADS="2", MKL_DYNAMIC="FALSE") > 1, "the count sees nothing"
 
 
 @needs_mkl

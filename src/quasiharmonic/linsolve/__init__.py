@@ -39,7 +39,7 @@ def available() -> tuple[str, ...]:
     return tuple(name for name in _BACKENDS if _backend(name).present())
 
 
-def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto") -> LinearSolver:
+def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", ordered: bool = False) -> LinearSolver:
     """Analyse the pattern of a symmetric matrix with the best backend present, or with the one named.
 
     Parameters
@@ -49,6 +49,9 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto") ->
         with its diagonal entry.
     name : {"auto", "pardiso", "cholmod", "qdldl", "superlu"}
         Which backend to use. "auto" takes the first in this order that is installed and loads.
+    ordered : bool
+        The unknowns are numbered such that eliminating them in turn leaves a sparse factor, as
+        `quasiharmonic.mesh.dissection` numbers them. A backend then looks for no order of its own, if it can be told.
 
     Returns
     -------
@@ -67,7 +70,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto") ->
             backend = _backend(candidate)
             if backend.present():
                 try:
-                    return backend(indptr, indices)
+                    return backend(indptr, indices, ordered=ordered)
                 except ImportError:
                     continue  # installed but broken; the last candidate comes with SciPy and always loads
     if name not in _BACKENDS:
@@ -81,4 +84,4 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto") ->
             f"linear solver {name!r} is not installed; available here are {', '.join(available())}. "
             f"To install it: {backend.requirement}"
         )
-    return backend(indptr, indices)
+    return backend(indptr, indices, ordered=ordered)

@@ -37,6 +37,9 @@ class LinearSolver(ABC):
         Row starts of the upper triangle of A in compressed sparse rows, as in ``scipy.sparse.triu(A, format="csr")``.
     indices : (nnz,) integer array
         Column indices, ascending within each row. Every row starts with its diagonal entry.
+    ordered : bool
+        The unknowns are numbered such that eliminating them in turn leaves a sparse factor, and no other order need be
+        looked for.
 
     Raises
     ------
@@ -53,7 +56,8 @@ class LinearSolver(ABC):
     name: ClassVar[str]
     requirement: ClassVar[str]
 
-    def __init__(self, indptr: ArrayLike, indices: ArrayLike) -> None:
+    def __init__(self, indptr: ArrayLike, indices: ArrayLike, *, ordered: bool = False) -> None:
+        self._ordered = ordered
         self._indptr, self._indices = _checked_pattern(indptr, indices)
         self.n = len(self._indptr) - 1
         self.nnz = len(self._indices)

@@ -36,6 +36,8 @@ class Cholmod(LinearSolver):
         self._values[self._indptr[:-1]] = 1.0  # 0.5 refuses to look at a matrix that is zero
         small = self.n < _SIMPLICIAL_BELOW
         mode, ordering = ("simplicial", "amd") if small else ("auto", "default")
+        if self._ordered:
+            ordering = "natural"
         self._old = hasattr(cholmod, "analyze")
         if self._old:
             self._symbolic: Any = cholmod.analyze(self._matrix, mode=mode, ordering_method=ordering)

@@ -20,11 +20,16 @@ _ANALYSE, _FACTOR, _SOLVE, _FORWARD_ONLY, _RELEASE = 11, 22, 33, 331, -1
 _MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3
 _CLASSIC_TWO_LEVEL, _IMPROVED_TWO_LEVEL = 1, 10
 
-# Below this many unknowns: minimum degree ordering, one thread. Above: nested dissection, all threads. Ordering by
-# dissection takes three times as long (85 against 29 ms at 20k) and pays in parallel factorisation, which at this size
-# saves less than 3 of 8 ms and at 300k three quarters. Small tasks on all threads also suffer badly when the machine is
-# busy with something else, because MKL's threads wait for each other by spinning.
+# Below this many unknowns: minimum degree ordering, one thread. Above: dissection, all threads. At 10k METIS takes
+# three times as long to order (25 against 10 ms), and what it then saves, in parallel factorisation, is 1 ms of 4.
+# Small tasks on all threads also suffer badly when the machine is busy with something else, because MKL's threads wait
+# for each other by spinning.
 _SEQUENTIAL_BELOW = 30_000
+
+# From 10,000 unknowns on the improved two-level algorithm takes a path that is more than twice as fast (MKL 2024.2 and
+# 2026.2, a planar mesh: 9,801 unknowns are analysed in 9.8 ms and factored in 7.6, 10,201 in 4.8 and 3.0). So matrices
+# a little smaller get unknowns of their own on top, ones on the diagonal: with 10,000 the 9,801 take 5.0 and 2.9 ms.
+_FAST_FROM, _FILL_UP_FROM = 10_000, 2_500
 
 _NOT_POSITIVE_DEFINITE = {-4, -7}
 _OUT_OF_MEMORY = {-2, -9}
@@ -51,25 +56,38 @@ class Pardiso(LinearSolver):
         return find_mkl() is not None
 
     def _analyse(self) -> None:
-        self._handle = _Handle(self._indptr, self._indices, self._values, sequential=self.n < _SEQUENTIAL_BELOW)
+        indptr, indices, values = self._indptr, self._indices, self._values
+        self._size = _FAST_FROM if _FILL_UP_FROM <= self.n < _FAST_FROM else self.n
+        if self._size > self.n:
+            extra = np.arange(self.n, self._size, dtype=np.int32)
+            indptr = np.append(indptr, self.nnz + 1 + extra - self.n)
+            indices = np.append(indices, extra)
+            values = np.ones(indices.size)
+        self._entries = values[: self.nnz]
+        sequential = self.n < _SEQUENTIAL_BELOW
+        self._handle = _Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
         self._release_once = weakref.finalize(self, self._handle.release)
         self._handle.check(_ANALYSE)
-        self._ones = np.ones((self.n, 1), order="F")
+        self._ones = np.ones((self._size, 1), order="F")
 
     def _factor(self) -> None:
+        if self._size > self.n:
+            self._entries[:] = self._values
         self._handle.check(_FACTOR)
         # The improved two-level algorithm takes the root of a negative pivot and goes on. The NaN spreads to all that
         # depends on it, and half a solve with one right-hand side, 5 % of the factorisation's time, finds it.
-        if self._handle.sequential:
+        if self._handle.improved:
             forward = np.empty_like(self._ones)
             self._handle.check(_FORWARD_ONLY, self._ones, forward)
             if not np.isfinite(forward.sum()):
                 raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a negative pivot")
 
     def _solve(self, b: Floats) -> Floats:
+        if self._size > self.n:
+            b = np.asfortranarray(np.concatenate([b, np.zeros((self._size - self.n, b.shape[1]))]))
         x = np.empty_like(b, order="F")
         self._handle.check(_SOLVE, b, x)
-        return x
+        return np.asfortranarray(x[: self.n])
 
     def _release(self) -> None:
         self._release_once()
@@ -82,27 +100,30 @@ class _Handle:
     moment it takes to release the memory.
     """
 
-    def __init__(self, indptr: Ints, indices: Ints, values: Floats, *, sequential: bool) -> None:
+    def __init__(self, indptr: Ints, indices: Ints, values: Floats, *, sequential: bool, ordered: bool) -> None:
         self.sequential = sequential
+        order = np.arange(len(indptr) - 1, dtype=np.int32) if ordered else None
         self._library = load_mkl()
-        self._arrays = (indptr, indices, values)
+        self._arrays = (indptr, indices, values, order)
         self._memory = np.zeros(64, dtype=np.int64)
         self._iparm = np.zeros(64, dtype=np.int32)
         self._iparm[0] = 1  # take nothing from the defaults
         self._iparm[1] = _MINIMUM_DEGREE if sequential else _PARALLEL_DISSECTION
+        self._iparm[4] = ordered
         # No iterative refinement: zero is off for Cholesky (a negative count refines in extended precision).
         self._iparm[7] = 0
         # The plain algorithm is slower to factor and takes four times as long for two right-hand sides. The classic
-        # two-level one reports negative pivots but insists on nested dissection. The improved one takes any ordering,
-        # but with minimum degree and several threads its solution of single right-hand sides is wrong (MKL 2026.2).
-        self._iparm[23] = _IMPROVED_TWO_LEVEL if sequential else _CLASSIC_TWO_LEVEL
+        # two-level one reports negative pivots but insists on METIS's ordering. The improved one takes any; but on
+        # several threads it may crash at a negative pivot when the order of elimination is a chain, as of a mesh
+        # numbered row by row (MKL 2026.2; never seen in a thousand indefinite matrices ordered by dissection).
+        self.improved = sequential or ordered
+        self._iparm[23] = _IMPROVED_TWO_LEVEL if self.improved else _CLASSIC_TWO_LEVEL
         self._iparm[34] = 1  # indices count from zero
 
         self._phase = ctypes.c_int(0)
         self._columns = ctypes.c_int(1)
         self._error = ctypes.c_int(0)
         constant = [ctypes.byref(ctypes.c_int(value)) for value in (1, 1, 2)]  # factors, which, positive definite
-        nothing = ctypes.c_void_p(None)
         self._head = (
             _address(self._memory),
             *constant,
@@ -111,7 +132,7 @@ class _Handle:
             _address(values),
             _address(indptr),
             _address(indices),
-            nothing,
+            _address(order),
             ctypes.byref(self._columns),
             _address(self._iparm),
             ctypes.byref(ctypes.c_int(0)),  # print nothing
@@ -136,11 +157,14 @@ class _Handle:
         self._columns.value = 1 if b is None else b.shape[1]
         self._error.value = 0
         # The setting is local to the calling thread and overrides the environment's; zero takes it back.
-        before = self._library.MKL_Set_Num_Threads_Local(1) if self.sequential else 0
+        # With several threads and any ordering but METIS's, the improved two-level algorithm's solution of single
+        # right-hand sides is wrong (MKL 2026.2), of two or more right.
+        alone = self.sequential or (self.improved and b is not None and b.shape[1] == 1)
+        before = self._library.MKL_Set_Num_Threads_Local(1) if alone else 0
         try:
             self._library.pardiso(*self._head, _address(b), _address(x), ctypes.byref(self._error))
         finally:
-            if self.sequential:
+            if alone:
                 self._library.MKL_Set_Num_Threads_Local(before)
         return self._error.value
 

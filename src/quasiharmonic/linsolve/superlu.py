@@ -28,8 +28,11 @@ class SuperLU(LinearSolver):
         lower.eliminate_zeros()
         full = csc_array(upper + lower)
         filler = np.where(full.indices == np.repeat(np.arange(self.n), np.diff(full.indptr)), self.n + 1.0, -1.0)
-        ordering = self._splu(csc_array((filler, full.indices, full.indptr), shape=full.shape), "MMD_AT_PLUS_A")
-        self._order = np.argsort(ordering.perm_c)
+        if self._ordered:
+            self._order = np.arange(self.n)
+        else:
+            ordering = self._splu(csc_array((filler, full.indices, full.indptr), shape=full.shape), "MMD_AT_PLUS_A")
+            self._order = np.argsort(ordering.perm_c)
         permuted = full[self._order][:, self._order].tocsc()
         permuted.sort_indices()
         # Where each entry of the permuted full matrix comes from in the upper triangle.
