@@ -358,7 +358,9 @@ class TestLinearSolver:
         monkeypatch.setattr(solver, "factor", fail, raising=False)
         result = solve(problem, linear_solver="superlu")
         assert result.status is Status.UNSOLVABLE
-        assert len(result.history) == 3
+        assert result.stages[0].iterations == 2
+        # Untangling has a matrix of its own, and goes on from the best map.
+        assert np.sum(signed_areas(problem.F, result.uv) <= 0) < result.history[2].flipped
         assert np.all(np.isfinite(result.uv))
 
     def test_another_backend_takes_over(self, monkeypatch):

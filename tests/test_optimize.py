@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Descent, Problem, solve
+from quasiharmonic.deformation_energy import signed_areas
+from quasiharmonic.derivatives import check_energy, random_deformation
+from quasiharmonic.energies import Deformation
 from quasiharmonic.functionals import beltrami_energy
 from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize.alternating import alternating, own_tensor
 from quasiharmonic.optimize.lbfgs import lbfgs
 from quasiharmonic.optimize.newton import _gather, _Model, newton
 from quasiharmonic.optimize.patches import patches
+from quasiharmonic.optimize.shaking import _left_of, _nearest, shaking
+from quasiharmonic.optimize.untangling import GRADINGS, Regularized, iterate_of, untangled, untangling
 from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
 from quasiharmonic.tensor import PARAMETERIZATIONS, TANH
 from test_inject import star_problem, turned_ring
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import problems
 
 BOTH = list(PARAMETERIZATIONS)
 
@@ -155,7 +167,7 @@ class TestPatches:
         for vertex in vertices:
             w[vertex] += 0.25
         dw = objective.mesh.derivatives(w)
-        return objective, Iterate(objective, TANH.field(TANH.invert(own_tensor(dw))), w, dw)
+        return objective, Iterate(objective, TANH.field(TANH.invert(own_tensor(dw))), w)
 
     def test_only_the_patch_changes(self):
         vertex = 5 * 13 + 6
@@ -188,13 +200,113 @@ class TestPatches:
         assert path(patches, objective, start, iterations=5) == [start]
 
 
+class TestUntangling:
+    def tangled(self, seed=0):
+        """A grid whose inner vertices lie anywhere in the square."""
+        V, F = grid(8, 8)
+        w = V[:, 0] + 1j * V[:, 1]
+        rim = boundary_of(F)
+        inner = np.setdiff1d(np.arange(len(V)), rim)
+        rng = np.random.default_rng(seed)
+        w[inner] = rng.random(inner.size) + 1j * rng.random(inner.size)
+        return F, w, rim
+
+    @pytest.mark.parametrize("epsilon", [3.0, 0.1, 1e-4])
+    def test_derivatives_of_the_energy_on_both_sides_of_zero(self, epsilon, rng):
+        positive = random_deformation(60)
+        for d in (positive, Deformation.of(positive.q, positive.p)):
+            assert check_energy(Regularized(epsilon), d).passed
+
+    def test_energy_becomes_a_barrier(self):
+        """As ε falls it tends to (a + b + λ(D² + 1))/D where D > 0, and to infinity where D < 0."""
+        d = Deformation.of(np.array([1.0 + 0j, 0.5]), np.array([0.5 + 0j, 1.0]))
+        positive, inverted = Regularized(1e-9).density(d)
+        assert positive == pytest.approx((1.25 + 1e-4 * (0.75**2 + 1)) / 0.75)
+        assert inverted > 1e15
+
+    @pytest.mark.parametrize("grading", GRADINGS)
+    @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+    def test_rights_what_is_thrown_together_at_random(self, grading, scale):
+        F, w, rim = self.tangled()
+        *_, end = untangled(F, scale * w, rim, grading=grading)
+        assert signed_areas(F, w).min() < 0
+        assert signed_areas(F, end).min() > 0
+        np.testing.assert_array_equal(end[rim], scale * w[rim])
+
+    def test_nothing_to_do_and_nothing_to_be_done(self):
+        V, F = grid(4, 4)
+        w = V[:, 0] + 1j * V[:, 1]
+        assert list(untangled(F, w, boundary_of(F), grading=0.5)) == []
+        assert list(untangled(F, 0 * w, boundary_of(F), grading=0.5)) == []
+
+    def test_gives_up_where_no_map_exists(self):
+        """An inverted triangle all of whose vertices are held."""
+        F, w, rim = self.tangled()
+        inner = next(t for t in F if not np.isin(t, rim).any())
+        w[inner] = [0.4 + 0.4j, 0.5 + 0.6j, 0.6 + 0.4j]
+        seen = list(untangled(F, w, np.append(rim, inner), grading=0.0))
+        assert 0 < len(seen) < 1000
+        assert np.all(np.isfinite(seen[-1].view(float)))
+
+    def test_leaves_numpys_errors_to_the_caller(self):
+        F, w, rim = self.tangled()
+        for _ in untangled(F, w, rim, grading=0.0):
+            assert np.geterr()["divide"] == "warn"
+
+    def test_limits_iterations(self):
+        objective = Objective(Problem(*turned_ring(180)))
+        assert len(path(untangling, objective, iterations=3)) == 4
+
+
+class TestShaking:
+    def test_part_of_a_square_left_of_a_line(self):
+        square = np.array([0, 1, 1 + 1j, 1j])
+        half = _left_of(square, 0.25 + 0j, 0.25 + 1j)
+        assert sorted(half.tolist(), key=lambda z: (z.real, z.imag)) == [0, 1j, 0.25, 0.25 + 1j]
+        assert len(_left_of(square, -1 - 1j, -1 + 1j)) == 0
+        np.testing.assert_array_equal(_left_of(square, 2 - 1j, 2 + 1j), square)
+
+    def test_nearest_point_of_an_outline(self):
+        square = np.array([0, 1, 1 + 1j, 1j])
+        assert _nearest(square, 0.4 - 2j) == 0.4
+        assert _nearest(square, 3 + 3j) == 1 + 1j
+        assert _nearest(square, 0.9 + 0.5j) == 1 + 0.5j
+
+    def test_goes_around_a_fold(self):
+        """A free vertex must lie in a wedge behind a fold of the target, and starts in front of it."""
+        case = problems.make(*problems.parse("jam:80:0.943"))
+        problem = Problem(case.V, case.F, case.fixed, case.target)
+        objective = Objective(problem)
+        tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
+        *_, w = untangled(problem.F, tutte.w, problem.fixed, grading=0.0)
+        stuck = iterate_of(objective, w)
+        assert stuck.flipped > 0
+        assert path(patches, objective, stuck, iterations=4)[-1].flipped == stuck.flipped
+        end = path(shaking, objective, stuck, iterations=50)[-1]
+        assert end.flipped == 0
+        np.testing.assert_array_equal(end.w[problem.fixed], w[problem.fixed])
+
+    def test_draws_the_same_numbers_every_time(self):
+        objective, start = TestPatches().displaced(5 * 13 + 6)
+        first, again = (path(shaking, objective, start, iterations=5)[-1] for _ in range(2))
+        np.testing.assert_array_equal(first.w, again.w)
+        assert first.flipped == 0
+
+    def test_untangles_first_what_is_too_much_for_local_repair(self):
+        objective = Objective(Problem(*star_problem(depth=0.2, n=1000)))
+        seen = path(shaking, objective, iterations=3)
+        assert seen[0].flipped > 50
+        assert seen[-1].flipped < seen[0].flipped
+
+
 class TestStrategy:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
             (
                 {"optimizer": "sgd"},
-                "optimizer must be one of vector-adam, l-bfgs, newton, alternating, patches, not 'sgd'",
+                "optimizer must be one of vector-adam, l-bfgs, newton, alternating, untangling, patches, "
+                "shaking, coarse-to-fine, not 'sgd'",
             ),
             ({"parameterization": "log"}, "parameterization must be one of tanh, si-log"),
             ({"functional": "v3"}, "functional must be one of dirichlet"),

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import predicates
-from quasiharmonic.predicates import SegmentRelation, box_pairs, orientation, orientation_or_nonfinite, segment_relation
+from quasiharmonic.predicates import (
+    SegmentRelation,
+    box_pairs,
+    box_pairs_between,
+    orientation,
+    orientation_or_nonfinite,
+    segment_relation,
+)
 
 
 def exact_orientation(a, b, c):
@@ -189,3 +196,15 @@ def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
         }
         assert len(found) == len(expected)
         assert set(found) == expected
+
+
+@pytest.mark.parametrize("chunk", [3, 1 << 17])
+def test_box_pairs_between_two_kinds(rng, monkeypatch, chunk):
+    monkeypatch.setattr(predicates, "_PAIR_CHUNK", chunk)
+    for count, other in ((0, 3), (1, 1), (5, 0), (3, 40), (57, 8)):
+        lo, low = rng.integers(0, 20, (count, 2)).astype(float), rng.integers(0, 20, (other, 2)).astype(float)
+        hi, high = lo + rng.integers(0, 5, (count, 2)), low + rng.integers(0, 5, (other, 2))
+        found = [p for i, j in box_pairs_between(lo, hi, low, high) for p in zip(i.tolist(), j.tolist(), strict=True)]
+        meet = (lo[:, None] <= high).all(axis=2) & (low <= hi[:, None]).all(axis=2)
+        assert len(found) == meet.sum()
+        assert set(found) == set(map(tuple, np.argwhere(meet).tolist()))

@@ -30,6 +30,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,7 +127,9 @@ class Certificate:
         }
 
 
-def certify(F: ArrayLike, uv: ArrayLike, *, boundary: bool = True) -> Certificate:
+def certify(
+    F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[IntArray] | None = None
+) -> Certificate:
     """Judge a map exactly, on its coordinates as stored.
 
     Parameters
@@ -140,6 +143,9 @@ def certify(F: ArrayLike, uv: ArrayLike, *, boundary: bool = True) -> Certificat
     boundary : bool
         Judge the boundary too, so that `Certificate.bijective` is known. All components count
         together: islands that overlap are not bijective.
+    loops : sequence of (l,) int64, optional
+        The boundary loops of a mesh that is known to be a surface, as `boundary_loops` gives them. They are taken
+        on trust, and to find them is half of the work.
 
     Returns
     -------
@@ -173,15 +179,15 @@ def certify(F: ArrayLike, uv: ArrayLike, *, boundary: bool = True) -> Certificat
     if np.any(sign <= 0):
         text = f"of {len(F)} triangles, {_counted(flipped, degenerate, nonfinite)}"
         reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
-    loops: list[IntArray] = []
+    known: list[IntArray] = []
     crossings, overwound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
     if boundary and len(F):
-        loops, broken = _loops(F, len(uv))
+        known, broken = _loops(F, len(uv)) if loops is None else (list(loops), [])
         reasons += broken
         if not broken:
-            overwound = _overwound(F, uv, sign, loops)
-            if np.isfinite(uv[np.concatenate(loops)]).all():
-                crossings, found = judge_loops(loops, uv)
+            overwound = _overwound(F, uv, sign, known)
+            if np.isfinite(uv[np.concatenate(known)]).all():
+                crossings, found = judge_loops(known, uv)
                 reasons += found
         if overwound.size:
             text = f"triangles wind more than once around {named('vertex', 'vertices', overwound)}"
@@ -193,7 +199,7 @@ def certify(F: ArrayLike, uv: ArrayLike, *, boundary: bool = True) -> Certificat
         nonfinite=nonfinite,
         bijective=not reasons if boundary else None,
         reasons=tuple(reasons),
-        loops=tuple(loops),
+        loops=tuple(known),
         crossings=crossings,
         overwound=overwound,
     )
@@ -305,12 +311,13 @@ def _overwound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArra
     of them passes the direction of the x axis exactly if its next corner lies below the vertex and
     its last does not; as many do as there are turns.
     """
-    y = uv[:, 1]
-    turns = np.zeros(len(uv), dtype=np.int64)
-    for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        level = y[F[:, corner]]
-        passing = (y[F[:, following]] < level) & (y[F[:, last]] >= level)
-        turns += np.bincount(F[passing, corner], minlength=len(uv))
+    y, turns = uv[:, 1].copy(), np.zeros(len(uv), dtype=np.int64)
+    for start in range(0, len(F), _TRIANGLE_CHUNK):
+        chunk = F[start : start + _TRIANGLE_CHUNK]
+        level = y.take(chunk)
+        for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            passing = (level[:, following] < level[:, corner]) & (level[:, last] >= level[:, corner])
+            np.add.at(turns, chunk[:, corner].compress(passing), 1)
     turns[F[sign <= 0]] = 0
     turns[np.concatenate(loops)] = 0
     return np.flatnonzero(turns > 1)

@@ -1,19 +1,19 @@
 """Functionals of the tensor field that vanish exactly at injective maps (§7.3).
 
-========  ==============================================================  =====================
-name      value, summed over u and v                                      solves beyond (u, v)
-========  ==============================================================  =====================
-neumann   V₁ = ½ ‖L w − g‖²                                               1
-sobolev   V₂ = ½ ‖L w − g‖² in the norm of L†                             1, with another factor
-dirichlet V₃ = ½ wᴴ L w − area                                            0
-poisson   V₄ = ½ gᴴ L† g − area                                           1, with another factor
-========  ==============================================================  =====================
+=========  =================================================  ======================
+name       value, summed over u and v                         solves beyond (u, v)
+=========  =================================================  ======================
+neumann    V₁ = ½ ‖L w − g‖²                                  1
+sobolev    V₂ = ½ ‖L w − g‖² in the norm of L†                1, with another factor
+dirichlet  V₃ = ½ wᴴ L w − area                               0
+poisson    V₄ = ½ gᴴ L† g − area                              1, with another factor
+=========  =================================================  ======================
 
 Here ``L = Gᵀ A G``, ``w = u + i v`` is the quasi-harmonic map, and ``g = g_u + i g_v = −i D w`` the
 Neumann data that an injective map onto the target must have (eq. 17). ``V₂ = V₃ + V₄``.
 
-Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh, and is handed
-on as the gradient in the Beltrami coefficient μ.
+Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh, from which the
+gradient in the Beltrami coefficient μ and then that in ξ follow (`quasiharmonic.tensor`).
 
 V₄ sees the target through ``C b`` only: it is blind to interior pins, and to a boundary loop's position
 relative to the others. Alone it serves one loop, or loops kept concentric, and no pins. Nor is it bounded
@@ -64,7 +64,7 @@ class Functional(ABC):
 
     @abstractmethod
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """``∂V/∂Re μ + i ∂V/∂Im μ`` there; (f,) complex128."""
+        """``∂V/∂Re ξ + i ∂V/∂Im ξ`` there; (f,) complex128."""
 
 
 class QuasiHarmonicMap(Protocol):
@@ -79,6 +79,8 @@ class QuasiHarmonicMap(Protocol):
         Its derivatives.
     dirichlet : float
         Its V₃.
+    dirichlet_gradient : (f,) complex128
+        The gradient of V₃ in ξ.
     """
 
     @property
@@ -89,6 +91,8 @@ class QuasiHarmonicMap(Protocol):
     def dw(self) -> Derivatives: ...
     @property
     def dirichlet(self) -> float: ...
+    @property
+    def dirichlet_gradient(self) -> ComplexArray: ...
 
 
 class Dirichlet(Functional):
@@ -105,7 +109,7 @@ class Dirichlet(Functional):
         return at.dirichlet
 
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        return beltrami_gradient(self.mesh, at.field, at.dw)
+        return at.dirichlet_gradient
 
 
 class Neumann(Functional):
@@ -123,7 +127,7 @@ class Neumann(Functional):
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
         residual = neumann_residual(self.problem, self.laplacian, at.w)
         spread = self.mesh.derivatives(self.laplacian.extend(residual))
-        return at.field.pull_twist(*twist(self.mesh, at.dw, spread))
+        return at.field.pull(at.field.pull_twist(*twist(self.mesh, at.dw, spread)))
 
 
 class Poisson(Functional):
@@ -153,7 +157,7 @@ class Poisson(Functional):
 
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
         d = self.mesh.derivatives(self.response(at))
-        return -0.5 * at.field.pull_twist(*twist(self.mesh, d, d))
+        return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
 
 
 class Sobolev(Poisson):
@@ -170,7 +174,7 @@ class Sobolev(Poisson):
         return 0.5 * work(residual, at.w - self.response(at))
 
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        return beltrami_gradient(self.mesh, at.field, at.dw) + super().gradient(at)
+        return at.dirichlet_gradient + super().gradient(at)
 
 
 FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson)}
@@ -178,14 +182,31 @@ FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev
 
 def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
     """V₃ of any map, ``Σ 2m |q − μp|² / (1 − |μ|²)``: its A-Dirichlet energy less its signed area."""
-    residual = dw.q - field.mu * dw.p
-    return 2.0 * float((mesh.m * (residual.real**2 + residual.imag**2) / field.defect).sum())
+    return beltrami_gradient(mesh, field, dw)[0]
 
 
-def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> ComplexArray:
-    """Gradient of `beltrami_energy` in μ with the map held; at the quasi-harmonic map also the whole one."""
+def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[float, ComplexArray]:
+    """V₃ of any map and its gradient in μ with the map held; at the quasi-harmonic map that is all of it.
+
+    Returns
+    -------
+    energy : float
+        ``Σ 2m |q − μp|² / (1 − |μ|²)``: the map's A-Dirichlet energy less its signed area.
+    gradient : (f,) complex128
+        ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
+    """
     residual = dw.q - field.mu * dw.p
-    return -4.0 * (mesh.m / field.defect**2) * residual * (dw.p.conj() - field.mu * dw.q.conj())
+    weight = mesh.m / field.defect
+    density = residual.real**2 + residual.imag**2
+    density *= weight
+    gradient = dw.q.conj()
+    gradient *= field.mu
+    np.subtract(dw.p.conj(), gradient, out=gradient)
+    gradient *= residual
+    weight /= field.defect
+    weight *= -4.0
+    gradient *= weight
+    return 2.0 * float(density.sum()), gradient
 
 
 def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatArray, ComplexArray]:

@@ -1,11 +1,11 @@
 """Beyond det A = 1: tensors of two Beltrami coefficients and their conjugate maps (§8.1, §D). Theory, for study.
 
 For any elliptic A, the equations ``∇·(A∇u) = 0`` and ``∇v = * A ∇u`` are one complex Beltrami equation for
-``f = u + i v``,
+``f = u + i v``::
 
     f_z̄ = μ f_z + ν conj(f_z),      |μ| + |ν| < 1,      * = [[0, −1], [1, 0]],
 
-and with ``d = |1 + ν|² − |μ|²``
+and with ``d = |1 + ν|² − |μ|²``::
 
         1  ⎡ |1 − μ|² − |ν|²     2 Im(ν − μ)     ⎤                       1         ⎡ a22 − a11 − i (a12 + a21) ⎤
     A = ─  ⎢                                     ⎥ ,   [μ, ν] = ──────────────── · ⎢                           ⎥
@@ -14,6 +14,7 @@ and with ``d = |1 + ν|² − |μ|²``
 as Astala, Iwaniec and Martin (2008, §16.1) have it. The paper's eq. 32 has ``−2 Im μ`` in both off-diagonal
 places and calls ν complex. That is right for real ν, which is what a symmetric tensor has (three numbers
 a triangle: μ and ν). Of a complex ν it keeps the symmetric part only, and the Beltrami equation fails.
+Determinant and eigenvalues are::
 
     det A = (|1 − ν|² − |μ|²) / (|1 + ν|² − |μ|²)
     eigenvalues (1 + |μ| − ν) / (1 − |μ| + ν) and (1 − |μ| − ν) / (1 + |μ| + ν)       for real ν

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.functionals import FUNCTIONALS, Functional, beltrami_energy
+from quasiharmonic.functionals import FUNCTIONALS, Functional, beltrami_gradient
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.mesh.reference import Derivatives, Reference
+from quasiharmonic.mesh.reference import Derivatives, Reference, blocks
 from quasiharmonic.problem import Problem
 from quasiharmonic.tensor import PARAMETERIZATIONS, TensorField
 
@@ -62,11 +63,14 @@ class Objective:
             When rounding leaves no positive definite Laplacian.
         """
         field = self.parameterization.field(xi)
-        self.laplacian.factor(self.mesh.edge_stiffness(field.entries()))
+        stiffness = np.empty((3, xi.size))
+        for part in blocks(xi.size):
+            stiffness[:, part] = self.mesh[part].edge_stiffness(field[part].entries())
+        self.laplacian.factor(stiffness)
         w = self.laplacian.extend(self._boundary)
         if not np.isfinite(w.view(np.float64)).all():
             raise NotPositiveDefinite("the solution is not finite")
-        return Iterate(self, field, w, self.mesh.derivatives(w))
+        return Iterate(self, field, w)
 
     def step(self, start: Iterate, step: ComplexArray) -> Iterate:
         """Evaluate at ``ξ + step``, the tensors kept within the numbers' range and the step shortened when
@@ -87,12 +91,16 @@ class Objective:
     def bounded(self, xi: ComplexArray) -> ComplexArray:
         """``xi`` with moduli clipped to where the rounded tensor is still positive definite."""
         bound = self.parameterization.bound
-        modulus = np.sqrt(xi.real**2 + xi.imag**2)
-        far = modulus > bound
-        if far.any():
-            xi = xi.copy()
-            xi[far] *= bound / modulus[far]
-        return xi
+        inside = xi
+        for part in blocks(xi.size):
+            block = xi[part]
+            square = block.real**2 + block.imag**2
+            if square.max() > bound**2:
+                if inside is xi:
+                    inside = xi.copy()
+                far = square > bound**2
+                inside[part][far] *= bound / np.sqrt(square[far])
+        return inside
 
 
 @dataclass(frozen=True)
@@ -104,14 +112,11 @@ class Iterate:
     field : TensorField
     w : (n,) complex128
         The quasi-harmonic map in the problem's frame.
-    dw : Derivatives
-        Its derivatives and the images' signed areas.
     """
 
     objective: Objective
     field: TensorField
     w: ComplexArray
-    dw: Derivatives
 
     @property
     def xi(self) -> ComplexArray:
@@ -119,19 +124,43 @@ class Iterate:
         return self.field.xi
 
     @cached_property
-    def flipped(self) -> int:
-        """Number of triangles whose image's area is not positive, in floating point."""
-        return int(np.count_nonzero(~(self.dw.area > 0)))
+    def dw(self) -> Derivatives:
+        """Derivatives of the map and the images' signed areas."""
+        return self.objective.mesh.derivatives(self.w)
 
     @cached_property
+    def _sweep(self) -> _Sweep:
+        """All that the descent of V₃ asks for, in one pass over the triangles."""
+        flipped, energy, area, gradient = 0, 0.0, 0.0, np.empty(self.xi.size, dtype=np.complex128)
+        for part in blocks(self.xi.size):
+            mesh, field = self.objective.mesh[part], self.field[part]
+            dw = mesh.derivatives(self.w)
+            flipped += dw.area.size - int(np.count_nonzero(dw.area > 0))
+            area += float(dw.area.sum())
+            more, in_mu = beltrami_gradient(mesh, field, dw)
+            energy += more
+            gradient[part] = field.pull(in_mu)
+        return _Sweep(flipped, energy, area, gradient)
+
+    @property
+    def flipped(self) -> int:
+        """Number of triangles whose image's area is not positive, in floating point."""
+        return self._sweep.flipped
+
+    @property
     def dirichlet(self) -> float:
         """V₃, whatever the objective's functional."""
-        return beltrami_energy(self.objective.mesh, self.field, self.dw)
+        return self._sweep.dirichlet
+
+    @property
+    def dirichlet_gradient(self) -> ComplexArray:
+        """The gradient of V₃ in ξ; (f,) complex128."""
+        return self._sweep.gradient
 
     @cached_property
     def energy(self) -> float:
         """V₃ over the map's signed area (over the sum of unsigned areas where that is not positive)."""
-        area = float(self.dw.area.sum())
+        area = self._sweep.area
         if not area > 0:
             area = float(np.abs(self.dw.area).sum())
         return self.dirichlet / area if area > 0 else np.inf
@@ -144,4 +173,11 @@ class Iterate:
     @cached_property
     def gradient(self) -> ComplexArray:
         """Its gradient in ξ, ``∂/∂Re ξ + i ∂/∂Im ξ``; (f,) complex128."""
-        return self.field.pull(self.objective.functional.gradient(self))
+        return self.objective.functional.gradient(self)
+
+
+class _Sweep(NamedTuple):
+    flipped: int
+    dirichlet: float
+    area: float
+    gradient: ComplexArray

@@ -6,7 +6,7 @@ doubles are rational numbers, and no answer depends on how arithmetic rounds. Al
 
 1. the determinant in floating point, with a bound on its error (one pass over the array);
 2. the same after scaling each triple by a power of two to magnitude one, then as a sum of sixteen
-   doubles that equals the determinant exactly, distilled until its sign shows;
+   doubles that equals the determinant exactly [1]_, distilled until its sign shows [2]_ [3]_;
 3. integers of any size, for triples whose coordinates span more than 130 orders of magnitude.
 
 IEEE 754 doubles with gradual underflow are assumed, which is what NumPy has unless another library
@@ -152,6 +152,11 @@ def _scaled(x: FloatArray) -> SignArray:
 
 def _expanded(x: FloatArray) -> SignArray:
     """Orientation by expansion, for coordinates of magnitude up to one that are 0 or ≥ 2⁻⁴⁴⁰."""
+    return np.sign(_sum(_components(x))).astype(np.int8)
+
+
+def _components(x: FloatArray) -> FloatArray:
+    """Sixteen doubles, as a rule small ones first, whose sum is the determinant exactly; (16, k)."""
     (ax, bx), (ax_tail, bx_tail) = _two_sum(x[0:4:2], -x[4])
     (ay, by), (ay_tail, by_tail) = _two_sum(x[1:4:2], -x[5])
     # (ax + ax_tail)(by + by_tail) − (ay + ay_tail)(bx + bx_tail), product by product, small ones first.
@@ -159,17 +164,17 @@ def _expanded(x: FloatArray) -> SignArray:
         np.stack([ax_tail, -ay_tail, ax_tail, ax, -ay_tail, -ay, ax, -ay]),
         np.stack([by_tail, bx_tail, by, by_tail, bx, bx_tail, by, bx]),
     )
-    return _sign_of_sum(np.concatenate([error[:2], product[:2], error[2:6], error[6:], product[2:6], product[6:]]))
+    return np.concatenate([error[:2], product[:2], error[2:6], error[6:], product[2:6], product[6:]])
 
 
-def _sign_of_sum(terms: FloatArray) -> SignArray:
-    """Exact sign of the sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow.
+def _sum(terms: FloatArray) -> FloatArray:
+    """Sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow: off by 2⁻⁴⁸ of itself at most.
 
     Each sweep replaces the terms by others of the same exact sum, the last of which is the rounded
     sum, the rest what was lost on the way [2]_. A sum is decided when the last outweighs the rest,
     which it does after at most t - 1 sweeps [3]_ and as a rule after two or three.
     """
-    sign = np.zeros(terms.shape[1], dtype=np.int8)
+    total = np.zeros(terms.shape[1])
     left = np.arange(terms.shape[1])
     while left.size:
         for i in range(1, len(terms)):
@@ -177,9 +182,9 @@ def _sign_of_sum(terms: FloatArray) -> SignArray:
         # Doubled, the computed weight of the rest is surely above the true one.
         rest = 2.0 * np.abs(terms[:-1]).sum(axis=0)
         decided = (np.abs(terms[-1]) > rest) | (rest == 0.0)
-        sign[left[decided]] = np.sign(terms[-1, decided])
+        total[left[decided]] = terms[-1, decided] + terms[:-1, decided].sum(axis=0)
         left, terms = left[~decided], terms[:, ~decided]
-    return sign
+    return total
 
 
 def _two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -212,6 +217,28 @@ def _in_integers(x: FloatArray) -> int:
     ax, ay, bx, by, cx, cy = (numerator * (unit // denominator) for numerator, denominator in ratios)
     det: int = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
     return (det > 0) - (det < 0)
+
+
+def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Twice the signed area of triangles, accurate however thin they are.
+
+    Parameters
+    ----------
+    a, b, c : (k, 2) float64
+        Corners, finite, with differences of magnitude about one.
+
+    Returns
+    -------
+    (k,) float64
+        Off by 2⁻⁴⁸ of itself at most, so zero exactly for corners on a line, as long as no product of
+        differences, or of what was rounded off them, underflows.
+    """
+    x = np.concatenate([a.T, b.T, c.T])
+    area = np.empty(x.shape[1])
+    for start in range(0, area.size, _EXACT_CHUNK):
+        chunk = slice(start, start + _EXACT_CHUNK)
+        area[chunk] = _sum(_components(x[:, chunk]))
+    return area
 
 
 class SegmentRelation(IntEnum):
@@ -296,27 +323,58 @@ def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArr
     i, j : (m,) int64
         Indices of boxes that meet, ``i < j``, each pair once.
     """
-    depth = max(len(lo) - 1, 0).bit_length()
+    tree = _box_tree(lo, hi, max(len(lo) - 1, 0).bit_length())
+    for i, j in _meeting(tree, tree):
+        yield i[i < j], j[i < j]
+
+
+def box_pairs_between(
+    lo: FloatArray, hi: FloatArray, other_lo: FloatArray, other_hi: FloatArray
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of closed boxes that meet, one of each of two kinds; as `box_pairs`.
+
+    Yields
+    ------
+    i, j : (m,) int64
+        Indices of a box (k, 2) and of another (l, 2) that it meets, each pair once.
+    """
+    depth = max(len(lo) - 1, len(other_lo) - 1, 0).bit_length()
+    yield from _meeting(_box_tree(lo, hi, depth), _box_tree(other_lo, other_hi, depth))
+
+
+_BoxTree = list[tuple[FloatArray, FloatArray]]
+
+
+def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
+    """Boxes, the boxes around each two of them, and so on up to the one around all."""
     # Missing leaves are boxes that nothing meets.
     padding = ((0, (1 << depth) - len(lo)), (0, 0))
     tree = [(np.pad(lo, padding, constant_values=np.inf), np.pad(hi, padding, constant_values=-np.inf))]
     for _ in range(depth):
         lo, hi = tree[-1]
         tree.append((np.minimum(lo[::2], lo[1::2]), np.maximum(hi[::2], hi[1::2])))
+    return tree
+
+
+def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArray]]:
+    """Leaves of two trees of the same depth that meet; of a tree with itself, those with ``i ≤ j``."""
     # The deepest portion first, so that what waits stays small however many pairs there are.
-    waiting = [(depth, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))]
+    waiting = [(len(one) - 1, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))]
     while waiting:
         level, i, j = waiting.pop()
-        lo, hi = tree[level]
-        meet = (lo.take(i, 0) <= hi.take(j, 0)) & (lo.take(j, 0) <= hi.take(i, 0))
-        i, j = i[meet[:, 0] & meet[:, 1]], j[meet[:, 0] & meet[:, 1]]
+        (lo, hi), (other_lo, other_hi) = one[level], other[level]
+        meet = (lo.take(i, 0) <= other_hi.take(j, 0)) & (other_lo.take(j, 0) <= hi.take(i, 0))
+        meet = meet[:, 0] & meet[:, 1]
+        i, j = i[meet], j[meet]
         if level == 0:
-            yield i[i < j], j[i < j]
+            yield i, j
             continue
-        same = i[i == j]
-        i, j = i[i < j], j[i < j]
-        i = np.concatenate([2 * same, 2 * same, 2 * same + 1, 2 * i, 2 * i, 2 * i + 1, 2 * i + 1])
-        j = np.concatenate([2 * same, 2 * same + 1, 2 * same + 1, 2 * j, 2 * j + 1, 2 * j, 2 * j + 1])
+        i, j = (
+            np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1]),
+            np.concatenate([2 * j, 2 * j + 1, 2 * j, 2 * j + 1]),
+        )
+        if one is other:
+            i, j = i[i <= j], j[i <= j]
         for start in range(0, i.size, _PAIR_CHUNK):
             chunk = slice(start, start + _PAIR_CHUNK)
             waiting.append((level - 1, i[chunk], j[chunk]))

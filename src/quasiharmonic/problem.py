@@ -11,6 +11,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import check_finite, check_range, index_array, real_array
 from quasiharmonic.laplacian import Laplacian
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh, rest_frames
 from quasiharmonic.mesh.topology import Edges, components, edges, named, named_edges, trace_loops
@@ -57,6 +58,9 @@ class Problem:
         As given, as float64 and int64.
     loops : list of (l,) int64
         Boundary loops, the surface to their left.
+    derived : dict
+        What other modules make of the mesh and the choice of fixed vertices and keep here by a name, for this
+        problem and those that `moved` makes of it.
     """
 
     def __init__(
@@ -84,13 +88,14 @@ class Problem:
         self._lock = Lock()
         self._laplacians: dict[str, Laplacian] = {}
         self._meshes: dict[Reference, ReferenceMesh] = {}
+        self.derived: dict[str, object] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         # Factorisations live in a library's memory and stay behind when a problem is pickled.
-        return {name: value for name, value in self.__dict__.items() if name not in ("_laplacians", "_lock")}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_laplacians", "_lock", "derived")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _laplacians={}, _lock=Lock())
+        self.__dict__.update(state, _laplacians={}, _lock=Lock(), derived={})
 
     @contextmanager
     def exclusive(self) -> Iterator[Problem]:
@@ -130,7 +135,7 @@ class Problem:
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
         """The Laplacian of this mesh and these fixed vertices, analysed once and kept."""
         if linear_solver not in self._laplacians:
-            self._laplacians[linear_solver] = Laplacian(self.F, self.n, self.fixed, linear_solver)
+            self._laplacians[linear_solver] = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
         return self._laplacians[linear_solver]
 
     def mesh(self, kind: Reference) -> ReferenceMesh:
@@ -205,61 +210,21 @@ class Frame:
         return np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent) + self.centre
 
 
-def _array(name: str, values: ArrayLike) -> NDArray[Any]:
-    try:
-        return np.asarray(values)
-    except ValueError as error:
-        raise ValueError(f"{name} is not an array: its rows differ in length") from error
-
-
-def _real(name: str, values: ArrayLike) -> FloatArray:
-    array = _array(name, values)
-    if array.dtype.kind not in "iufb":
-        raise ValueError(f"{name} must hold real numbers, not {array.dtype}")
-    return np.array(array, dtype=np.float64, order="C")
-
-
-def _indices(name: str, values: ArrayLike) -> IntArray:
-    array = _array(name, values)
-    if array.size == 0:
-        array = array.astype(np.int64)
-    if array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must hold integer vertex indices, not {array.dtype}")
-    if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
-        raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
-    return np.array(array, dtype=np.int64, order="C")
-
-
-def _finite(name: str, one: str, values: FloatArray) -> None:
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if bad.size:
-        raise ValueError(
-            f"{name} is not finite at {named(one, one[:-2] + 'ices' if one == 'vertex' else one + 's', bad)}"
-        )
-
-
-def _in_range(name: str, indices: IntArray, n: int) -> None:
-    bad = np.unique(indices[(indices < 0) | (indices >= n)])
-    if bad.size:
-        there = f"only vertices 0 … {n - 1}" if n else "no vertices"
-        raise ValueError(f"{name} refers to {named('vertex', 'vertices', bad)}, but there are {there}")
-
-
 def _vertices(V: ArrayLike) -> FloatArray:
-    array = _real("V", V)
+    array = real_array("V", V)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise ValueError(f"V must have shape (n, 2) or (n, 3), not {array.shape}")
-    _finite("V", "vertex", array)
+    check_finite("V", "vertex", "vertices", array)
     return array
 
 
 def _triangles(F: ArrayLike, n: int) -> IntArray:
-    array = _indices("F", F)
+    array = index_array("F", F)
     if array.size == 0:
         raise ValueError("the mesh has no triangles")
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"F must have shape (f, 3), triangles only, not {array.shape}")
-    _in_range("F", array, n)
+    check_range("F", array, n)
     return array
 
 
@@ -282,7 +247,9 @@ def _surface(F: IntArray, n: int) -> Edges:
             "orient all triangles alike"
         )
     if not found.boundary.size:
-        raise ValueError("the surface is closed: it has no boundary to place; cut it open first")
+        raise ValueError(
+            "the surface is closed: it has no boundary to place; cut it open first (cut_open; qhm map --cut)"
+        )
     if components(F, n).any():
         first = np.unique(components(F, n))
         raise ValueError(
@@ -312,10 +279,10 @@ def _positive_areas(V: FloatArray, F: IntArray) -> None:
 
 
 def _fixed(fixed: ArrayLike, n: int, found: Edges) -> IntArray:
-    array = _indices("fixed", fixed)
+    array = index_array("fixed", fixed)
     if array.ndim != 1:
         raise ValueError(f"fixed must have shape (k,), not {array.shape}")
-    _in_range("fixed", array, n)
+    check_range("fixed", array, n)
     times = np.bincount(array, minlength=n)
     if times.max(initial=0) > 1:
         raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
@@ -329,8 +296,8 @@ def _fixed(fixed: ArrayLike, n: int, found: Edges) -> IntArray:
 
 
 def _target(target: ArrayLike, k: int) -> FloatArray:
-    array = _real("target", target)
+    array = real_array("target", target)
     if array.shape != (k, 2):
         raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
-    _finite("target", "row", array)
+    check_finite("target", "row", "rows", array)
     return array

@@ -49,6 +49,10 @@ class Status(Enum):
         "Every triangle is strictly positive, decided exactly. The distortion falls no further because triangles "
         "are as small as double precision can resolve: an energy that minds their size would open them up."
     )
+    UNIMPROVED = (
+        "Every triangle is strictly positive, decided exactly, but this is the map that was given: no injective map of "
+        "less distortion was found. A smaller eta may help."
+    )
     UNSOLVABLE = (
         "No linear solver could factor the system any more; this is the best map so far. "
         "Another linear solver or reference triangle may help."

@@ -17,8 +17,10 @@ from quasiharmonic.problem import Problem
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
 # The longer way that si-log's ξ has to go to the same tensor wants longer steps.
 SI_LOG_STEPS = ((0, 0.5),)
+# Vertices from which on a coarse mesh, made, solved and refined again, is quicker than ten iterations on the mesh.
+_LARGE = 6000
 # Tries at local repair: most succeed in the first few, and a failing one costs as much as many Newton steps.
-_PATCHES = 60
+_PATCHES, _FEW_SHAKES, _SHAKES = 30, 30, 60
 
 
 @dataclass(frozen=True)
@@ -27,9 +29,11 @@ class Descent:
 
     Attributes
     ----------
-    optimizer : {"vector-adam", "l-bfgs", "newton", "alternating", "patches"}
-        Newton and alternation descend V₃ whatever the functional (§9.2, §F.2); patches moves vertices around
-        the last inverted triangles.
+    optimizer : {"vector-adam", "l-bfgs", "newton", "alternating", "untangling", "patches", "shaking", "coarse-to-fine"}
+        Newton and alternation descend V₃ whatever the functional (§9.2, §F.2). The three after them move vertices and
+        not tensors: untangling all of them, patches those around the last inverted triangles, and shaking the same
+        from random starts. Coarse-to-fine does all of that on a coarse mesh, if this one is large, and carries the
+        map that it finds to this one.
     parameterization : {"tanh", "si-log"}
         How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
     functional : {"dirichlet", "neumann", "sobolev", "poisson"}
@@ -37,12 +41,13 @@ class Descent:
     reference : {"equilateral", "rest", "corrected"}
         Shape of the triangles, unless the problem itself names one.
     iterations : int
-        Steps to take at most.
+        Steps to take at most; for patches, how many to try, and for shaking, how many to try in vain.
     schedule : sequence of (int, float)
         VectorAdam's step lengths at given iterations, linear in between and constant after the last. Empty
         for those that suit the parameterisation.
     resume : bool
-        Start from the best map so far instead of ξ = 0.
+        Start from the tensors of the lowest V₃ so far (patches and shaking: from the map with the fewest inverted
+        triangles) instead of ξ = 0.
 
     Raises
     ------
@@ -50,7 +55,9 @@ class Descent:
         When a word is none of those above.
     """
 
-    optimizer: Literal["vector-adam", "l-bfgs", "newton", "alternating", "patches"] = "vector-adam"
+    optimizer: Literal[
+        "vector-adam", "l-bfgs", "newton", "alternating", "untangling", "patches", "shaking", "coarse-to-fine"
+    ] = "vector-adam"
     parameterization: Literal["tanh", "si-log"] = "tanh"
     functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
     reference: Reference = "equilateral"
@@ -77,17 +84,25 @@ class Descent:
     @property
     def name(self) -> str:
         """How reports call it."""
-        words: list[str] = [self.optimizer, self.parameterization]
+        words: list[str] = [self.optimizer] if self.moves_vertices else [self.optimizer, self.parameterization]
         if self.optimizer in ("vector-adam", "l-bfgs"):
             words.append(self.functional)
         return ", ".join(words)
 
     @property
+    def moves_vertices(self) -> bool:
+        """Whether positions are what the optimiser moves, and tensors only follow."""
+        return self.optimizer in ("untangling", "patches", "shaking")
+
+    @property
     def patience(self) -> tuple[int, float]:
         """The stage has settled when within so many iterations none was righted and the energy fell by less.
 
-        As a fraction of itself. Newton's steps are dear, and where they lead anywhere they do so at once.
+        As a fraction of itself. Newton's steps are dear, and where they lead anywhere they do so at once. What
+        moves vertices knows by itself when to end.
         """
+        if self.moves_vertices:
+            return self.iterations, 0.0
         return (40, 0.1) if self.optimizer == "newton" else (300, 1e-3)
 
     @property
@@ -106,36 +121,37 @@ def speed(problem: Problem) -> list[Descent]:
     """The stages that find a map soonest, the first of which usually suffices.
 
     Boundaries alone want tanh, pins want si-log: the spike that a pinned point draws needs distortion that
-    grows slowly towards it, and tanh never gets there. Newton brings the last few triangles near to being
-    righted where short Adam steps would take hundreds, and rights most of them; local repair does the rest.
+    grows slowly towards it, and tanh never gets there. What is left then are a few triangles in tight places,
+    which moving vertices rights sooner than moving tensors does; or else the map is far from any solution in
+    parts, and Newton's method brings it nearer. All of this is tried on a coarse mesh first if the mesh is large,
+    and soon if it is not.
     """
-    tanh = [Descent(iterations=100), *_finish("tanh", 1000)]
     if problem.pins.size:
-        return [Descent(parameterization="si-log", iterations=400), *_finish("si-log", 60), *tanh, _LAST]
-    # From ξ = 0: where the target overlaps itself, tanh's first steps lead into a valley without an end.
-    afresh = replace(_finish("si-log", 300)[0], resume=False)
-    return [*tanh, afresh, Descent("patches", iterations=_PATCHES, resume=True), _LAST]
+        first, newton = Descent(parameterization="si-log", iterations=400), Descent("newton", "si-log", iterations=60)
+    else:
+        first, newton = Descent(iterations=100), Descent("newton", iterations=300)
+    coarse = replace(first, optimizer="coarse-to-fine")
+    patches = Descent("patches", iterations=_PATCHES, resume=True)
+    return [
+        *([coarse, first, patches] if problem.n >= _LARGE else [first, patches, coarse]),
+        Descent("untangling", iterations=300, resume=True),
+        Descent("shaking", iterations=_FEW_SHAKES, resume=True),
+        replace(newton, resume=True),
+        Descent("untangling", iterations=600, resume=True),
+        Descent("shaking", iterations=_FEW_SHAKES),
+        Descent("shaking", iterations=_SHAKES, resume=True),
+    ]
 
 
 def quality(problem: Problem) -> list[Descent]:
     """The stages that keep angles: si-log on the rest mesh's own triangles, then whatever finds a map (§10.1)."""
     return [
         Descent(parameterization="si-log", reference="corrected", iterations=1000),
-        *(replace(stage, reference="corrected") for stage in _finish("si-log", 60)),
+        Descent("newton", "si-log", reference="corrected", iterations=60, resume=True),
         *speed(problem),
     ]
 
 
-def _finish(parameterization: Literal["tanh", "si-log"], steps: int) -> list[Descent]:
-    """Newton and local repair from the best so far."""
-    return [
-        Descent("newton", parameterization, iterations=steps, resume=True),
-        Descent("patches", parameterization, iterations=_PATCHES, resume=True),
-    ]
-
-
-# When all else has failed: short steps from the best so far, until they settle or the caller's iterations are spent.
-_LAST = Descent(iterations=10**9, schedule=((0, 0.05), (200, 0.01)), resume=True)
 STRATEGIES = {"speed": speed, "quality": quality}
 
 

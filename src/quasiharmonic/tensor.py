@@ -10,12 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+# In place of a divisor that vanishes together with what it divides.
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,7 @@ class Parameterization:
 
     def field(self, xi: ComplexArray) -> TensorField:
         """The tensor field of ``xi`` (f,) complex128."""
-        rho = np.sqrt(xi.real**2 + xi.imag**2)
-        ratio, defect, slope = self.radial(rho)
-        return TensorField(xi, rho, ratio * xi, ratio, defect, slope)
+        return TensorField(xi, self)
 
     def invert(self, mu: ComplexArray) -> ComplexArray:
         """The ξ of Beltrami coefficients, clipped where ``|μ| ≥ 1`` or ξ would exceed the bound; (f,) complex128."""
@@ -58,7 +60,7 @@ class Parameterization:
 
 @dataclass(frozen=True)
 class TensorField:
-    """𝒜 on every triangle, with what is needed to differentiate it.
+    """𝒜 on every triangle, with what is needed to differentiate it, each computed when first asked for.
 
     Attributes
     ----------
@@ -69,11 +71,39 @@ class TensorField:
     """
 
     xi: ComplexArray
-    rho: FloatArray
-    mu: ComplexArray
-    ratio: FloatArray
-    defect: FloatArray
-    slope: FloatArray
+    parameterization: Parameterization
+
+    def __getitem__(self, part: slice) -> TensorField:
+        """The field on some of the triangles."""
+        return TensorField(self.xi[part], self.parameterization)
+
+    @cached_property
+    def _square(self) -> FloatArray:
+        return self.xi.real**2 + self.xi.imag**2
+
+    @cached_property
+    def rho(self) -> FloatArray:
+        return np.sqrt(self._square)
+
+    @cached_property
+    def _radial(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self.parameterization.radial(self.rho)
+
+    @property
+    def ratio(self) -> FloatArray:
+        return self._radial[0]
+
+    @property
+    def defect(self) -> FloatArray:
+        return self._radial[1]
+
+    @property
+    def slope(self) -> FloatArray:
+        return self._radial[2]
+
+    @cached_property
+    def mu(self) -> ComplexArray:
+        return self.ratio * self.xi
 
     def entries(self) -> FloatArray:
         """Rows a11, a12, a22 of 𝒜 (eq. 33), without the area factor; (3, f) float64."""
@@ -107,25 +137,28 @@ class TensorField:
 
     def pull(self, grad: ComplexArray) -> ComplexArray:
         """Gradient in ξ from the gradient in μ: the transpose of dμ/dξ, which is symmetric."""
-        safe = np.where(self.rho > 0, self.rho, 1.0)
-        unit = self.xi / safe
-        radial = (self.slope - self.ratio) * (np.conj(unit) * grad).real
-        return self.ratio * grad + radial * unit
+        # ρ² that vanishes needs no care but in the division: the term it divides vanishes with it.
+        radial = (self.slope - self.ratio) / np.maximum(self._square, _TINY)
+        radial *= (self.xi.conj() * grad).real
+        out: ComplexArray = self.ratio * grad
+        out += radial * self.xi
+        return out
 
 
 def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     decay = np.exp(-2.0 * rho)
-    defect = 4.0 * decay / (1.0 + decay) ** 2
-    safe = np.where(rho > 0, rho, 1.0)
-    ratio = np.where(rho > 0, np.tanh(rho) / safe, 1.0)
-    return ratio, defect, defect
+    defect = 4.0 * decay
+    decay += 1.0
+    decay *= decay
+    defect /= decay
+    rho = np.maximum(rho, _TINY)
+    return np.tanh(rho) / rho, defect, defect
 
 
 def _si_log(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     log = np.log1p(rho)
     omega = 1.0 / (1.0 + log)
-    safe = np.where(rho > 0, rho, 1.0)
-    ratio = np.where(rho > 0, log * omega / safe, 1.0)
+    ratio = np.where(rho > 0, log * omega / np.maximum(rho, _TINY), 1.0)
     return ratio, omega * (2.0 - omega), omega**2 / (1.0 + rho)
 
 

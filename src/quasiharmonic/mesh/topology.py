@@ -52,23 +52,26 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     Edges
         Each kind in ascending order of its undirected edge.
     """
-    F = np.asarray(F, dtype=np.int64)
-    tail = F.ravel()
-    head = F[:, (1, 2, 0)].ravel()
-    backward = tail > head
-    key = edge_keys(tail, head, n) * 2 + backward
+    F = np.ascontiguousarray(F, dtype=np.int64)
+    tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
+    key = edge_keys(tail, head, n)
+    key *= 2
+    key += tail > head
     key.sort()
-    edge = key >> 1
-    first = np.flatnonzero(np.concatenate(([True], edge[1:] != edge[:-1]))) if edge.size else edge
-    count = np.diff(first, append=edge.size)
     direction = key & 1
+    edge = np.right_shift(key, 1, out=key)
+    starts = np.ones(edge.size, dtype=bool)
+    np.not_equal(edge[1:], edge[:-1], out=starts[1:])
+    first = np.flatnonzero(starts)
+    count = np.diff(first, append=edge.size)
 
     def unpack(start: IntArray) -> IntArray:
-        lo, hi = np.divmod(edge[start], max(n, 1))
-        return np.stack([lo, hi], axis=1)
+        pairs = np.empty((start.size, 2), dtype=np.int64)
+        np.divmod(edge[start], max(n, 1), out=(pairs[:, 0], pairs[:, 1]))
+        return pairs
 
     pair = first[count == 2]
-    opposed = direction[pair] != direction[np.minimum(pair + 1, max(edge.size - 1, 0))]
+    opposed = direction[pair] != direction[pair + 1]
     single = first[count == 1]
     boundary = unpack(single)
     flip = direction[single] == 1
@@ -78,7 +81,9 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
 
 def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> IntArray:
     """One integer for each undirected edge between vertices below ``n``, whichever way it is given."""
-    keys: IntArray = np.minimum(tail, head) * n + np.maximum(tail, head)
+    keys: IntArray = np.minimum(tail, head)
+    keys *= n
+    keys += np.maximum(tail, head)
     return keys
 
 
@@ -143,17 +148,19 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
     F = np.asarray(F, dtype=np.int64)
     # Two edges of a triangle connect its three vertices.
-    tail, head = F[:, (0, 1)].ravel(), F[:, (1, 2)].ravel()
+    tail, head = F[:, :2].ravel(), F[:, 1:].ravel()
     label = np.arange(n)
+    # Any smaller neighbour will do to begin with, and there is nothing to look up yet.
+    label[np.maximum(tail, head)] = np.minimum(tail, head)
     while True:
+        while not np.array_equal(label, root := label[label]):
+            label = root
         one, other = label[tail], label[head]
         apart = one != other
         if not apart.any():
             return label
         tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
         np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
-        while not np.array_equal(label, root := label[label]):
-            label = root
 
 
 def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from quasiharmonic.mesh.reference import blocks
 from quasiharmonic.objective import Iterate, Objective
 
 # Less momentum than Adam's usual 0.9 / 0.999 is the largest single gain: the landscape changes as fast as
@@ -49,12 +50,17 @@ def vector_adam(
     square = np.zeros(start.xi.shape)
     here = start
     for k in range(1, iterations + 1):
-        g = here.gradient
-        mean = first * mean + (1 - first) * g
-        square = second * square + (1 - second) * (g.real**2 + g.imag**2)
+        gradient, step = here.gradient, np.empty_like(mean)
         length = float(np.interp(k - 1, times, lengths)) * np.sqrt(1 - second**k) / (1 - first**k)
-        # A triangle whose gradient has never differed from zero stays where it is.
-        root = np.sqrt(square)
-        root[root == 0] = 1.0
-        here = objective.step(here, -length * mean / root)
+        for part in blocks(mean.size):
+            g, average, squares = gradient[part], mean[part], square[part]
+            average *= first
+            average += (1 - first) * g
+            squares *= second
+            squares += (1 - second) * (g.real**2 + g.imag**2)
+            root = np.sqrt(squares)
+            # A triangle whose gradient has never differed from zero stays where it is.
+            root[root == 0] = np.inf
+            np.multiply(average, -length / root, out=step[part])
+        here = objective.step(here, step)
         visit(here)

@@ -1,0 +1,160 @@
+"""Local repair from random starts, for what is left when a descent from any sensible start ends in front of a wall.
+
+A free vertex lies to the left of every fixed edge that it forms a triangle with: in the intersection of their
+half-planes. Where the target folds back that may be a wedge, a millionth as wide as it is long, that begins at the
+fold and opens away from it. A vertex on the near side of the fold misses it by next to nothing, and no descent leads
+around the fold. So a patch around an inverted triangle is started anew, again and again: from a quasi-harmonic map of
+random tensors, or with a vertex of that triangle put somewhere into its intersection and held there while the others
+make room. A patch is taken on if no more triangles are inverted than before; this lets the map drift until it falls
+into place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.certificate import flipped_triangles
+from quasiharmonic.deformation_energy import signed_areas
+from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.optimize.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around
+from quasiharmonic.optimize.untangling import GRADINGS, iterate_of, untangled
+from quasiharmonic.tensor import TANH
+
+BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+Generator = np.random.Generator
+
+# Rings around an inverted triangle, and sizes of the random ξ; one of them is drawn.
+_RINGS = 2, 3, 4, 6, 8, 12
+_SPREADS = 0.0, 0.5, 1.5
+# Placed vertices lie this much of the way from a corner of the intersection to its middle, in powers of ten.
+_DEPTHS = -3.5, 0.0
+
+
+def shaking(
+    objective: Objective,
+    start: Iterate,
+    visit: Callable[[Iterate], None],
+    *,
+    iterations: int,
+) -> None:
+    """Right the last inverted triangles by solving patches around them from random starts.
+
+    The numbers are drawn from a generator of its own, always the same.
+
+    Parameters
+    ----------
+    objective : Objective
+        Its functional is not looked at.
+    start : Iterate
+        If its inverted triangles are too many for local repair, all of it is untangled first.
+    visit : callable
+        Called after every patch that left fewer inverted triangles; raises `Stop` to end.
+    iterations : int
+        So many patches in a row may be of no use.
+    """
+    problem, solver = objective.problem, objective.laplacian.solver.name
+    rng = np.random.default_rng(0)
+    w = start.w
+    left = flipped_triangles(problem.F, problem.positions(w))
+    if left.size > MOST_FLIPS:
+        for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
+            visit(iterate_of(objective, w))
+        left = flipped_triangles(problem.F, problem.positions(w))
+    in_vain = 0
+    while 0 < left.size <= MOST_FLIPS and in_vain < iterations:
+        in_vain += 1
+        patch = patch_around(objective, int(rng.choice(left)), int(rng.choice(_RINGS)), MOST_TRIANGLES)
+        if patch is None:
+            continue
+        moved = w.copy()
+        try:
+            moved[patch.vertices] = _shaken(rng, objective, patch, w[patch.vertices])
+        except NotPositiveDefinite:
+            continue
+        now = flipped_triangles(problem.F, problem.positions(moved))
+        if now.size <= left.size:
+            fewer, w, left = now.size < left.size, moved, now
+            if fewer:
+                in_vain = 0
+                visit(iterate_of(objective, w))
+
+
+def _shaken(rng: Generator, objective: Objective, patch: Patch, w: ComplexArray) -> ComplexArray:
+    """Another map of a patch."""
+    solver = objective.laplacian.solver.name
+    grading = float(rng.choice(GRADINGS))
+    place = _place(rng, objective, patch, w) if rng.random() < 0.5 else None
+    held = patch.held.copy()
+    if place is not None:
+        vertex, there = place
+        w, held[vertex] = w.copy(), True
+        w[vertex] = there
+    w = last_untangled(patch, _random_map(rng, patch, w, held, solver), held, grading, solver)
+    if place is not None and signed_areas(patch.F, w).min() <= 0:
+        w = last_untangled(patch, w, patch.held, grading, solver)
+    return w
+
+
+def _random_map(rng: Generator, patch: Patch, w: ComplexArray, held: BoolArray, linear_solver: str) -> ComplexArray:
+    """A quasi-harmonic map of random tensors with ``held`` vertices where ``w`` has them."""
+    xi = rng.choice(_SPREADS) * (rng.standard_normal(len(patch.F)) + 1j * rng.standard_normal(len(patch.F)))
+    mesh = ReferenceMesh(np.zeros((len(w), 2)), patch.F, "equilateral")
+    laplacian = Laplacian(patch.F, len(w), np.flatnonzero(held), linear_solver)
+    laplacian.factor(mesh.edge_stiffness(TANH.field(xi).entries()))
+    return laplacian.extend(w)
+
+
+def _place(rng: Generator, objective: Objective, patch: Patch, w: ComplexArray) -> tuple[int, complex] | None:
+    """A free vertex of an inverted triangle, or next to one, and a random place to the left of the fixed edges
+    around it; None where there is no such place.
+    """
+    near = np.zeros(len(w), dtype=bool)
+    near[patch.F[signed_areas(patch.F, w) <= 0]] = True
+    if rng.random() < 0.5:
+        near[patch.F[near[patch.F].any(axis=1)]] = True
+    candidates = np.flatnonzero(near & ~patch.held)
+    if not candidates.size:
+        return None
+    vertex = int(rng.choice(candidates))
+    fixed = np.isin(patch.vertices, objective.problem.fixed)
+    t, k = np.nonzero(np.equal(patch.F, vertex))
+    tails, heads = patch.F[t, (k + 1) % 3], patch.F[t, (k + 2) % 3]
+    both = fixed[tails] & fixed[heads]
+    within = w if rng.random() < 0.5 else objective.problem.frame.inward(objective.problem.target)
+    low, high = complex(within.real.min(), within.imag.min()), complex(within.real.max(), within.imag.max())
+    area = np.array([low, complex(high.real, low.imag), high, complex(low.real, high.imag)])
+    for tail, head in zip(w[tails[both]], w[heads[both]], strict=True):
+        area = _left_of(area, tail, head)
+        if len(area) < 3:
+            return None
+    depth = 10 ** rng.uniform(*_DEPTHS)
+    corner = rng.choice(np.append(area, _nearest(area, w[vertex])))
+    return vertex, complex((1 - depth) * corner + depth * area.mean())
+
+
+def _left_of(area: ComplexArray, tail: complex, head: complex) -> ComplexArray:
+    """Corners of the part of a convex polygon to the left of a line."""
+    side = (np.conj(head - tail) * (area - tail)).imag
+    kept = []
+    for p, q, s, t in zip(area, np.roll(area, -1), side, np.roll(side, -1), strict=True):
+        if s > 0:
+            kept.append(p)
+        if (s > 0) != (t > 0):
+            kept.append(p + (q - p) * (s / (s - t)))
+    return np.array(kept, dtype=np.complex128)
+
+
+def _nearest(area: ComplexArray, point: complex) -> complex:
+    """The point of a convex polygon's outline that is nearest to another."""
+    side = np.roll(area, -1) - area
+    square = np.maximum(np.abs(side) ** 2, np.finfo(np.float64).tiny)
+    along = np.clip((np.conj(side) * (point - area)).real / square, 0, 1)
+    on = area + along * side
+    return complex(on[np.argmin(np.abs(on - point))])

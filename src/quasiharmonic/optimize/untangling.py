@@ -1,0 +1,270 @@
+"""Untangling: Newton's method for the positions themselves, when a search over tensors has left triangles inverted.
+
+The regularised energy of Garanzha et al. (2021),
+
+    φ = (|p|² + |q|² + λ (D² + 1)) / χ(D),      D = |p|² − |q|²,      χ(D) = (D + √(ε² + D²)) / 2,
+
+is finite for inverted triangles, and becomes a barrier against them as ε falls. A triangle or two against the
+boundary with a millionth of a triangle's room are a small part of V₃, which hardly sees them; here they come to
+outweigh all others.
+
+Reference triangles are equilateral, their sides as long as the target's boundary edges near them to some power: with
+1 a limb that shrinks is as good as one that does not, with 0 all triangles are to be alike. Either gets past what
+stops the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
+from quasiharmonic.energies import Deformation, Isotropic
+from quasiharmonic.functionals import work
+from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.optimize.alternating import own_tensor
+from quasiharmonic.tensor import TANH
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
+
+# Powers of the boundary edges' lengths, tried in turn.
+GRADINGS = 0.5, 0.0, 1.0
+# Weight of areas against angles.
+_LAMBDA = 1e-4
+# The first ε, as a fraction of the least determinant; and what is done at each ε: so many steps, or as many as
+# lower the energy by such a fraction.
+_FIRST, _STEPS, _WORTHWHILE = 0.2, 20, 1e-3
+# With ε this far below the least determinant hardly a triangle has ever been righted.
+_HOPELESS = 5e-3
+# Smallest reference triangle, relative to the largest: their areas must stay within the numbers' range.
+_SMALLEST = 1e-100
+# Raised diagonals, one after the other until a factorisation exists.
+_SHIFTS = 0.0, 1e-10, 1e-6, 1e-3
+# Of the decrease that the gradient promises (Armijo's condition), and how often a step is halved.
+_SUFFICIENT, _HALVINGS = 1e-4, 24
+
+
+class Regularized(Isotropic):
+    """The energy above; ``φ`` in ``a = |p|²`` and ``b = |q|²``.
+
+    Parameters
+    ----------
+    epsilon : float
+        ε > 0: at a determinant of −ε and below, an inverted triangle is dear.
+    """
+
+    def __init__(self, epsilon: float) -> None:
+        self.epsilon = epsilon
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``N/χ`` with ``N = a + b + λ (D² + 1)``."""
+        _, chi, numerator = self._parts(d)
+        return numerator / chi
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``(1 ± G)/χ`` with ``G = 2λD − N/ρ``, since ``χ' = χ/ρ`` with ``ρ = √(ε² + D²)``."""
+        root, chi, numerator = self._parts(d)
+        by_det = 2 * _LAMBDA * d.det - numerator / root
+        return (1 + by_det) / chi, (1 - by_det) / chi
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """By ``S = a + b`` and D: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, and φ_SS = 0."""
+        root, chi, numerator = self._parts(d)
+        mixed = -1 / (chi * root)
+        pure = 2 * _LAMBDA * (1 - 2 * d.det / root) / chi + 2 * numerator / root**3
+        return pure + 2 * mixed, -pure, pure - 2 * mixed
+
+    def _parts(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        root = np.hypot(self.epsilon, d.det)
+        # D + ρ without cancellation.
+        chi = np.where(d.det > 0, 0.5 * (d.det + root), 0.5 * self.epsilon**2 / (root + np.abs(d.det)))
+        return root, chi, d.a + d.b + _LAMBDA * (d.det**2 + 1)
+
+
+def untangling(
+    objective: Objective,
+    start: Iterate,
+    visit: Callable[[Iterate], None],
+    *,
+    iterations: int,
+) -> None:
+    """Right inverted triangles by moving vertices.
+
+    Parameters
+    ----------
+    objective : Objective
+        Its functional is not looked at.
+    start : Iterate
+    visit : callable
+        Called with every map; raises `Stop` to end.
+    iterations : int
+        Steps to take at most, over all gradings.
+    """
+    for grading in GRADINGS:
+        problem, solver = objective.problem, objective.laplacian.solver.name
+        for w in untangled(problem.F, start.w, problem.fixed, grading=grading, linear_solver=solver):
+            visit(iterate_of(objective, w))
+            iterations -= 1
+            if iterations <= 0:
+                return
+
+
+def iterate_of(objective: Objective, w: ComplexArray) -> Iterate:
+    """A map with its own tensors: where it is injective, it is their quasi-harmonic map (eq. 39).
+
+    In the tanh parameterisation, which reaches them all.
+    """
+    return Iterate(objective, TANH.field(TANH.invert(own_tensor(objective.mesh.derivatives(w)))), w)
+
+
+def untangled(
+    F: IntArray, w: ComplexArray, held: IntArray, *, grading: float, linear_solver: str = "auto"
+) -> Iterator[ComplexArray]:
+    """Newton steps down the regularised energy, ε falling.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles; every vertex belongs to one.
+    w : (n,) complex128
+        A map.
+    held : (k,) int64
+        Vertices that stay.
+    grading : float
+        Power of the boundary edges' lengths.
+    linear_solver : str
+        A name of `quasiharmonic.linsolve`, or ``"auto"``.
+
+    Yields
+    ------
+    (n,) complex128
+        The map after every step, until no triangle is inverted in floating point, or no more will be righted.
+    """
+    sizes = _sizes(F, w, grading, linear_solver)
+    if sizes is None:
+        return
+    # Around what is computed, and not around a yield, which would carry the state to the caller.
+    with np.errstate(all="ignore"):
+        descent = _Descent(F, w, held, sizes, linear_solver)
+    least = descent.least
+    descent.energy.epsilon = np.hypot(1e-9, _FIRST * least)
+    while not least > 0 and descent.energy.epsilon > _HOPELESS * abs(least):
+        before = descent.value()
+        for _ in range(_STEPS):
+            with np.errstate(all="ignore"):
+                after = descent.step(before)
+            if after is None:
+                break
+            yield descent.w
+            if descent.least > 0:
+                return
+            if after > (1 - _WORTHWHILE) * before:
+                break
+            before = after
+        least = descent.least
+        if not np.isfinite(least):
+            return
+        root = np.hypot(least, descent.energy.epsilon)
+        descent.energy.epsilon *= 1 - 0.5 * root / (abs(least) + root)
+
+
+def _sizes(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> FloatArray | None:
+    """Side of every triangle's reference, (f,) float64, or None where the map has no extent.
+
+    The logarithms of the boundary edges' lengths, carried inwards as by Tutte's embedding; in all, the references
+    have the area of the map, inverted triangles counted as positive.
+    """
+    n = len(w)
+    area = float(np.abs(signed_areas(F, w)).sum())
+    rim = boundary_edges(F, n)
+    length = np.abs(w[rim[:, 1]] - w[rim[:, 0]])
+    if not (0 < area < np.inf and np.all(length > 0)):
+        return None
+    # At a boundary vertex the mean over the edges that leave it and arrive; one each, but where a patch is pinched.
+    ends = np.bincount(rim.ravel(), minlength=n)
+    log = np.zeros(n, dtype=np.complex128)
+    log += np.bincount(rim.ravel(), np.repeat(np.log(length), 2), n) * (grading / np.maximum(ends, 1))
+    if grading != 0:
+        laplacian = Laplacian(F, n, np.flatnonzero(ends), linear_solver)
+        unit = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
+        laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit))
+        log = laplacian.extend(log)
+    sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
+    sizes = np.maximum(sizes, _SMALLEST * sizes.max())
+    return sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
+
+
+class _Descent:
+    """A map, and steps down its energy at the present ε."""
+
+    def __init__(self, F: IntArray, w: ComplexArray, held: IntArray, sizes: FloatArray, linear_solver: str) -> None:
+        self.energy = Regularized(1.0)
+        corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
+        rest = (sizes[:, None, None] * corners).reshape(-1, 2)
+        # All triangles count alike, however small.
+        weights = (sizes**2).mean() / sizes**2
+        self._deformed = DeformationEnergy(
+            rest, F, self.energy, weights=weights, rest_F=np.arange(3 * len(F)).reshape(-1, 3)
+        )
+        self._system = NewtonSystem(F, self._deformed.g, len(w), held, linear_solver)
+        self.w = w
+        self._at = self._deformed.deform(w)
+
+    @property
+    def least(self) -> float:
+        """The least determinant."""
+        return float(self._at.det.min())
+
+    def value(self) -> float:
+        """The energy."""
+        with np.errstate(all="ignore"):
+            return self._deformed.value_of(self._at)
+
+    def step(self, before: float) -> float | None:
+        """Take a step from where the energy is ``before``; the energy there, or None where no step lowers it."""
+        system = self._system
+        gradient = self._deformed.gradient_of(self._at, self.w.size)[system.free]
+        system.assemble(self._deformed.curvature_of(self._at))
+        for shift in _SHIFTS:
+            try:
+                system.factor(shift)
+                direction = system.solve(-gradient)
+            except NotPositiveDefinite:
+                continue
+            promise = -work(gradient, direction)
+            if promise > 0:
+                break
+        else:
+            return None
+        full = np.zeros_like(self.w)
+        full[system.free] = direction
+        start, t = self.w, 1.0
+        for _ in range(_HALVINGS):
+            after = self._moved(start + t * full, before - _SUFFICIENT * t * promise)
+            if after is not None:
+                break
+            t *= 0.5
+        else:
+            return None
+        # Far from the minimum, barriers fall by powers and Newton's step is several times too short.
+        while t >= 1 and (further := self._moved(start + 2 * t * full, after)) is not None:
+            t, after = 2 * t, further
+        return after
+
+    def _moved(self, w: ComplexArray, bound: float) -> float | None:
+        """Go there if the energy is below a bound."""
+        at = self._deformed.deform(w)
+        value = self._deformed.value_of(at)
+        if not value < bound:
+            return None
+        self.w, self._at = w, at
+        return value

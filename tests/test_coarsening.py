@@ -1,0 +1,266 @@
+"""Coarse meshes, the way back from them, and the search that takes it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from meshes import boundary_of, lift, random_annulus, signed_areas
+from quasiharmonic import Descent, Problem, Status, distortion, flipped_triangles, inject, is_injective, solve
+from quasiharmonic.coarse_problem import coarse_problem
+from quasiharmonic.mesh.coarsening import coarsen, touching
+from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.prolongation import _places, prolong
+from quasiharmonic.strategy import speed
+from quasiharmonic.surfaces import disk, grid, random_delaunay
+from quasiharmonic.targets import arc_length, letter
+
+
+def meshes():
+    pinned = random_delaunay(1200, seed=5)
+    return [
+        ("disk", *disk(20), ()),
+        ("grid", *grid(40, 30), ()),
+        ("irregular, pinned", *pinned, (len(pinned[0]) - 1, len(pinned[0]) - 40)),
+        ("annulus", *random_annulus(1500, seed=2), ()),
+    ]
+
+
+def coarsened(V, F, pins=(), goal=0):
+    held = np.zeros(len(V), dtype=bool)
+    held[boundary_of(F)] = True
+    held[list(pins)] = True
+    return held, coarsen(F, len(V), held, goal)
+
+
+def turned(F):
+    """Triangles as a set: each from its smallest vertex on."""
+    first = F.argmin(axis=1)[:, None] + np.arange(3)
+    return set(map(tuple, np.take_along_axis(F, first % 3, axis=1).tolist()))
+
+
+@pytest.mark.parametrize(("name", "V", "F", "pins"), meshes(), ids=lambda x: x if isinstance(x, str) else "")
+class TestCoarsen:
+    def test_gives_a_surface_with_the_same_boundary(self, name, V, F, pins):
+        held, coarse = coarsened(V, F, pins)
+        found, fine = edges(coarse.F, len(V)), edges(F, len(V))
+        assert not found.nonmanifold.size
+        assert not found.inconsistent.size
+        assert set(map(tuple, found.boundary.tolist())) == set(map(tuple, fine.boundary.tolist()))
+        assert np.isin(np.flatnonzero(held), coarse.F).all()
+        # Euler's characteristic: no handle and no hole has come or gone.
+        euler = [
+            np.unique(T).size - len(e.interior) - len(e.boundary) + len(T) for T, e in ((coarse.F, found), (F, fine))
+        ]
+        assert euler[0] == euler[1]
+        assert np.unique(coarse.F).size < 0.45 * len(V)
+
+    def test_leads_back_to_the_mesh(self, name, V, F, pins):
+        """Round by round: rings hold the vertices that were there, and fans fill them."""
+        _, coarse = coarsened(V, F, pins)
+        triangles = turned(coarse.F)
+        for number in reversed(range(len(coarse.rounds))):
+            for vertices, rings in coarse.rounds[number]:
+                for vertex, ring in zip(vertices.tolist(), rings.tolist(), strict=True):
+                    fan = turned(np.array([(ring[0], *pair) for pair in pairwise(ring[1:])]))
+                    star = turned(np.array([(vertex, *pair) for pair in zip(ring, ring[1:] + ring[:1], strict=True)]))
+                    assert fan <= triangles
+                    assert not star & triangles
+                    triangles = (triangles - fan) | star
+            if number in coarse.levels:
+                assert triangles == turned(coarse.levels[number])
+        assert triangles == turned(F)
+        assert 0 in coarse.levels
+
+    def test_gives_held_vertices_no_new_neighbours(self, name, V, F, pins):
+        held, coarse = coarsened(V, F, pins)
+        n = len(V)
+
+        def at_held(T):
+            e = edges(T, n)
+            pairs = np.sort(np.concatenate([e.interior, e.boundary]), axis=1)
+            return set(map(tuple, pairs[held[pairs].any(axis=1)].tolist()))
+
+        assert at_held(coarse.F) <= at_held(F)
+
+    def test_stops_at_its_goal_and_repeats_itself(self, name, V, F, pins):
+        goal = int(0.7 * len(V))
+        _, coarse = coarsened(V, F, pins, goal)
+        _, again = coarsened(V, F, pins, goal)
+        # A round takes out a fifth at most.
+        assert 0.75 * goal < np.unique(coarse.F).size <= goal
+        np.testing.assert_array_equal(coarse.F, again.F)
+
+
+def test_touching():
+    F = np.array([[0, 1, 2], [2, 1, 3], [3, 4, 5]])
+    np.testing.assert_array_equal(
+        touching(F, np.array([True, False, False, False, True, False])),
+        [True, False, True],
+    )
+
+
+class TestPlaces:
+    @pytest.mark.parametrize("d", range(3, 9))
+    @pytest.mark.parametrize("thin", [1.0, 1e-3, 1e-9])
+    def test_are_seen_from_all_of_the_ring(self, d, thin, rng):
+        """Rings that are seen from their apexes and from little else."""
+        rows = 300
+        # Angles of the fan's sectors: any, with a sum below a full turn; the ring may be reflex at its apex.
+        sectors = rng.random((rows, d - 2)) + 1e-2
+        sectors *= (rng.uniform(0.2, 1.95 * np.pi, rows) / sectors.sum(axis=1))[:, None]
+        sectors = np.minimum(sectors, 0.95 * np.pi)
+        angle = np.concatenate([np.zeros((rows, 1)), np.cumsum(sectors, axis=1)], axis=1)
+        arm = thin ** rng.random((rows, d - 1)) * np.exp(1j * angle)
+        ring = np.concatenate([np.zeros((rows, 1)), arm], axis=1) * np.exp(2j * np.pi * rng.random((rows, 1)))
+        ring += rng.standard_normal((rows, 1))
+        place = _places(ring)
+        spokes = ring - place[:, None]
+        area = (spokes.conj() * np.roll(spokes, -1, axis=1)).imag
+        if thin > 1e-6:
+            assert area.min() > 0
+        else:
+            # Where arms differ by nine orders of magnitude, a few places are lost to rounding.
+            assert np.mean(area.min(axis=1) > 0) > 0.97
+
+    def test_are_the_middle_of_a_regular_ring(self):
+        ring = 3 + 2 * np.exp(2j * np.pi * np.arange(6) / 6)[None]
+        assert _places(ring)[0] == pytest.approx(3)
+
+
+@pytest.mark.parametrize(("name", "V", "F", "pins"), meshes(), ids=lambda x: x if isinstance(x, str) else "")
+def test_injective_maps_stay_injective(name, V, F, pins, rng):
+    """From positions of the coarse vertices alone, also where these are far from even."""
+    held, coarse = coarsened(V, F, pins)
+    used, local = np.unique(coarse.F, return_inverse=True)
+    local = local.reshape(-1, 3).astype(np.int64)
+    fixed = np.flatnonzero(held[used])
+    found = solve(Problem(V[used], local, fixed, V[used][fixed], reference="equilateral"))
+    assert found.injective
+    uv = found.uv
+    for _ in range(100):
+        # Vertices at random towards one of their neighbours, as long as triangles stay positive.
+        some = local[rng.choice(len(local), 3)]
+        free = some[~np.isin(some[:, 0], fixed)]
+        moved = uv.copy()
+        moved[free[:, 0]] += 0.8 * (uv[free[:, 1]] - uv[free[:, 0]])
+        if is_injective(local, moved):
+            uv = moved
+    assert not np.array_equal(uv, found.uv)
+    w = np.full(len(V), np.nan, dtype=complex)
+    w[used] = uv @ (1, 1j)
+    out = prolong(w, coarse, held)
+    np.testing.assert_array_equal(out[held], w[held])
+    assert flipped_triangles(F, np.stack([out.real, out.imag], axis=1)).size == 0
+
+
+def on_letter(character, rings=50):
+    V, F = disk(rings)
+    (loop,) = boundary_loops(F, len(V))
+    return lift(V), F, loop, arc_length(V[loop], letter(character)[0])
+
+
+@pytest.fixture(scope="module")
+def posed():
+    return Problem(*on_letter("S", rings=50))
+
+
+class TestSearch:
+    def test_large_meshes_are_solved_without_being_factored(self, posed):
+        problem = posed.moved(posed.target)
+        steps = []
+        result = solve(problem, callback=steps.append)
+        assert result.injective
+        assert [s.name.split(",")[0] for s in result.stages] == ["coarse-to-fine"]
+        assert problem._laplacians == {}
+        np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
+        assert steps == result.history
+        assert [s.iteration for s in steps] == list(range(len(steps)))
+        assert result.iterations == len(steps) - 1
+        assert (steps[-1].flipped, steps[-1].energy) == (0, 0.0)
+        assert result.mu.shape == (len(problem.F),)
+        assert np.all(np.abs(result.mu) < 1)
+
+    def test_its_maps_are_no_worse(self, posed):
+        def mean(uv):
+            d = distortion(posed.V, posed.F, uv)
+            return float((d.mips * d.share).sum())
+
+        direct = solve(posed, strategy=[s for s in speed(posed) if s.optimizer != "coarse-to-fine"])
+        assert mean(solve(posed).uv) < 2 * mean(direct.uv)
+
+    def test_is_repeated_for_a_moved_target(self, posed):
+        shifted = posed.moved(2 * posed.target + 1)
+        assert coarse_problem(shifted)._coarsening is coarse_problem(posed)._coarsening
+        first, second = solve(posed), solve(shifted)
+        np.testing.assert_allclose(second.uv, 2 * first.uv + 1, atol=1e-9)
+        coarse = coarse_problem(posed).problem
+        assert coarse._laplacians
+        assert coarse_problem(shifted).problem._laplacians is coarse._laplacians
+
+    def test_serves_pins_and_holes(self):
+        V, F = random_annulus(4000, seed=3)
+        fixed = np.append(boundary_of(F), [int(np.argmin(np.abs(V - (0, 0.7)).sum(axis=1)))])
+        target = V[fixed] @ [[1, 0.4], [0, 1]]
+        target[-1] += 0.02
+        strategy = [Descent("coarse-to-fine", "si-log", iterations=400)]
+        result = solve(Problem(lift(V), F, fixed, target), strategy=strategy)
+        assert result.injective
+        assert result.stages[0].name.startswith("coarse-to-fine, si-log")
+
+    def test_goes_on_where_the_coarse_problem_fails(self, posed, monkeypatch):
+        found = solve(posed)
+
+        def fails(problem, stage, linear_solver, budget, callback):
+            return solve(problem, strategy=[Descent(iterations=1)], callback=callback)
+
+        monkeypatch.setattr(inject, "_on_coarse", fails)
+        result = solve(posed)
+        assert result.injective
+        assert [s.name.split(",")[0] for s in result.stages] == [
+            "coarse-to-fine",
+            "vector-adam",
+        ]
+        assert not result.stages[0].kept
+        assert result.iterations == len(result.history) - 1
+        assert not np.array_equal(result.uv, found.uv)
+
+    def test_is_left_out_where_it_does_not_serve(self, posed):
+        small = Problem(*on_letter("C", rings=12))
+        assert coarse_problem(small) is None
+        names = [s.optimizer for s in speed(small)]
+        assert names.index("coarse-to-fine") == 2
+        assert coarse_problem(Problem(posed.V, posed.F, posed.fixed, posed.target, reference="rest")) is None
+        recorded = solve(Problem(*on_letter("C")), record=1)
+        assert "coarse-to-fine" not in recorded.stages[0].name
+
+    def test_interrupted(self, posed):
+        def stop(step):
+            if step.iteration == 3:
+                raise KeyboardInterrupt
+
+        result = solve(posed, callback=stop)
+        assert result.status is Status.INTERRUPTED
+        assert result.certificate.flipped.size > 0
+        # Not the middle of the target, but the coarse map carried here.
+        assert np.count_nonzero(signed_areas(posed.F, result.uv) > 0) > len(posed.F) // 2
+
+    def test_flat_coarse_triangles_have_shapes(self):
+        V, F = grid(120, 120)
+        problem = Problem(V, F, boundary_of(F), V[boundary_of(F)] @ [[1, 0.3], [0, 1]])
+        result = solve(problem)
+        assert result.injective
+        coarse = coarse_problem(problem).problem
+        edge = np.linalg.norm(coarse.V[coarse.F] - coarse.V[np.roll(coarse.F, 1, axis=1)], axis=2)
+        assert np.isfinite(coarse.V).all()
+        assert edge.min() > 0
+
+
+def test_degrees_stay_low():
+    V, F = disk(60)
+    _, coarse = coarsened(V, F)
+    degree = Counter(coarse.F.ravel().tolist())
+    assert max(degree.values()) <= 14

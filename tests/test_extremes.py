@@ -1,0 +1,296 @@
+"""Extreme numbers and meshes, each with the outcome that is defined for it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from meshes import boundary_of, signed_areas
+from obstructed import OBSTRUCTED, circle, eared, moved, onto
+from quasiharmonic import (
+    Problem,
+    Status,
+    certify,
+    diagnose,
+    distortion,
+    flipped_triangles,
+    injective_map,
+    io,
+    polish,
+    refine_problem,
+)
+from quasiharmonic.cli import main
+from quasiharmonic.diagnosis import Kind
+from quasiharmonic.surfaces import disk, grid, random_delaunay
+from test_inject import star_problem
+
+SCALES = [1e-300, 1e-150, 1e-12, 1.0, 1e12, 1e150, 1e300]
+
+
+def through_all(V, F, fixed, target, **more):
+    """The certified map of a problem that has one, after everything else has been tried on it too."""
+    problem = Problem(V, F, fixed, target, **more)
+    assert diagnose(problem).obstructions == ()
+    result = injective_map(V, F, fixed, target, **more)
+    assert result.status is Status.INJECTIVE
+    assert result.certificate.bijective
+    assert np.isfinite(result.uv).all()
+    np.testing.assert_array_equal(result.uv[fixed], target)
+    return result.uv
+
+
+class TestScales:
+    @pytest.mark.parametrize("scale", SCALES)
+    @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
+    def test_of_the_rest_mesh(self, scale, reference):
+        V, F, fixed, target = star_problem(n=100)
+        uv = through_all(V * scale, F, fixed, target, reference=reference)
+        # Nothing depends on it but rounding.
+        np.testing.assert_allclose(uv, through_all(V, F, fixed, target, reference=reference), atol=1e-6)
+
+    @pytest.mark.parametrize("scale", SCALES)
+    def test_of_the_target(self, scale):
+        V, F, fixed, target = star_problem(n=100)
+        uv = through_all(V, F, fixed, target * scale)
+        np.testing.assert_allclose(uv / scale, through_all(V, F, fixed, target), atol=1e-6)
+
+    @pytest.mark.parametrize(("rest", "image"), [(1e-150, 1e-150), (1e150, 1e150), (1e-150, 1e150), (1e150, 1e-150)])
+    def test_of_both_in_a_polish(self, rest, image):
+        V, F, fixed, target = star_problem(n=60)
+        uv = through_all(V * rest, F, fixed, target * image)
+        better = polish(V * rest, F, uv, fixed=fixed, energy="mips", max_iterations=5)
+        assert better.injective
+        before, after = (distortion(V * rest, F, w) for w in (uv, better.uv))
+        assert np.isfinite(before.mips).all()
+        assert after.summary("mips").mean < before.summary("mips").mean
+        np.testing.assert_allclose(before.mips, distortion(V, F, uv / image).mips, rtol=1e-9)
+
+    @pytest.mark.parametrize("image", [1e-300, 1e300])
+    def test_measures_whose_numbers_have_no_double(self, image):
+        V, F = disk(3)
+        found = distortion(V / image, F, V * image)
+        np.testing.assert_allclose(found.mips, 0, atol=1e-9)
+        assert not found.flipped.size
+        json.dumps(found.to_dict(), allow_nan=False)
+
+    @pytest.mark.parametrize("scale", [1e-150, 1e150])
+    @pytest.mark.parametrize("name", ["no kernel", "nothing sees all", "too few edges across"])
+    def test_of_obstructions(self, scale, name):
+        problem, _ = OBSTRUCTED[name]
+        found = [diagnose(problem.moved(problem.target * s)) for s in (1.0, scale)]
+        assert found[0].obstructions
+        assert [o.message for o in found[0].obstructions] == [o.message for o in found[1].obstructions]
+
+    @pytest.mark.parametrize("scale", [1e-150, 1e150])
+    def test_in_files(self, scale, tmp_path, capsys):
+        V, F, fixed, target = star_problem(n=60)
+        uv = np.zeros((len(V), 2))
+        uv[fixed] = target * scale
+        io.write_obj(tmp_path / "in.obj", io.MeshData(V / scale, F).with_map(uv))
+        assert main(["map", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]) == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], target * scale)
+
+
+class TestOffsets:
+    @pytest.mark.parametrize("offset", [1e3, 1e6, 1e8])
+    def test_of_many_times_the_size(self, offset):
+        V, F, fixed, target = star_problem(n=100)
+        away = offset * np.array([1.0, -0.7])
+        uv = through_all(V, F, fixed, target + away)
+        assert signed_areas(F, uv - away).min() > 0
+        through_all(V + offset, F, fixed, target)
+
+    def test_beyond_what_doubles_hold(self):
+        """The positions themselves have become a point: an impossible problem, and no other kind of failure."""
+        V, F, fixed, target = star_problem(n=100)
+        result = injective_map(V, F, fixed, target + 1e17)
+        assert result.status is Status.IMPOSSIBLE
+        assert {o.kind for o in result.diagnosis.obstructions} >= {Kind.SIGNED_AREA, Kind.COLLAPSED_EDGE}
+        assert np.isfinite(result.uv).all()
+        with pytest.raises(ValueError, match="zero area in the rest mesh"):
+            injective_map(V + 1e17, F, fixed, target)
+
+    def test_one_vertex_far_off(self):
+        V, F, fixed, target = star_problem(n=100)
+        target = target.copy()
+        target[0] *= 1e12
+        result = injective_map(V, F, fixed, target, max_iterations=60)
+        assert np.isfinite(result.uv).all()
+        assert result.injective == (not flipped_triangles(F, result.uv).size)
+
+
+class TestSinglePrecision:
+    def write(self, path, uv):
+        V, F = disk(4)
+        io.write_obj(path, io.MeshData(V, F).with_map(uv(V)))
+        return str(path)
+
+    def test_triangles_below_its_spacing_are_reported(self, tmp_path, capsys):
+        path = self.write(tmp_path / "far.obj", lambda V: V + 1e8)
+        assert main(["check", path]) == 0
+        assert "Injective" in capsys.readouterr().out
+        assert main(["check", path, "--as", "float32", "--json", "-"]) == 1
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["precision"] == "float32"
+        # All of a disk of radius 1 is one place where single precision counts by eights.
+        assert len(facts["degenerate"]) == facts["triangles"]
+
+    def test_only_those(self, tmp_path, capsys):
+        def shrunk(V):
+            uv = V + 1.0
+            uv[:7] = 1.0 + 1e-9 * V[:7]  # the innermost ring, smaller than 2⁻²³
+            return uv
+
+        path = self.write(tmp_path / "part.obj", shrunk)
+        assert main(["check", path, "--json", "-"]) == 0
+        capsys.readouterr()
+        assert main(["check", path, "--as", "float32", "--json", "-"]) == 1
+        facts = json.loads(capsys.readouterr().out)
+        _, F = disk(4)
+        assert sorted(facts["degenerate"] + facts["flipped"]) == np.flatnonzero((F < 7).sum(axis=1) >= 2).tolist()
+
+    def test_beyond_its_range(self, tmp_path, capsys):
+        path = self.write(tmp_path / "large.obj", lambda V: V * 1e60)
+        assert main(["check", path]) == 0
+        capsys.readouterr()
+        assert main(["check", path, "--as", "float32", "--json", "-"]) == 1
+        said = json.loads(capsys.readouterr().out)["certificate"]
+        assert said["nonfinite"]
+        assert said["bijective"] is False
+
+
+class TestRestMeshes:
+    def flat(self):
+        V, F, fixed, target = star_problem(n=100)
+        inner = next(t for t in F if not np.isin(t, fixed).any())
+        V = V.copy()
+        V[inner[0]] = V[inner[1]]
+        return V, F, fixed, target
+
+    def test_without_area_need_the_callers_word(self):
+        V, F, fixed, target = self.flat()
+        for reference in (None, "rest"):
+            with pytest.raises(ValueError, match="zero area in the rest mesh; choose the reference 'equilateral'"):
+                injective_map(V, F, fixed, target, reference=reference)
+        for reference in ("equilateral", "corrected"):
+            uv = through_all(V, F, fixed, target, reference=reference)
+        with pytest.raises(ValueError, match="zero area"):
+            polish(V, F, uv, fixed=fixed)
+
+    @pytest.mark.parametrize("squash", [[0, 0, 0], [1, 0, 0]])
+    @pytest.mark.parametrize("reference", ["equilateral", "corrected"])
+    def test_that_are_a_point_or_a_line(self, squash, reference):
+        V, F, fixed, target = star_problem(n=100)
+        through_all(V * squash, F, fixed, target, reference=reference)
+
+    def test_of_wild_proportions(self):
+        V, F, fixed, target = star_problem(n=100)
+        through_all(V * [1, 1e-6, 1], F, fixed, target, reference="rest")
+        through_all(V * [1, 1e-6, 1], F, fixed, target)
+
+
+class TestCollinearRuns:
+    @pytest.mark.parametrize("turn", [0.0, 0.3])
+    def test_along_straight_sides(self, turn):
+        V, F = grid(9, 7)
+        fixed = boundary_of(F)
+        target = V[fixed] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        # In the turned one rounding bends the sides by an ulp, which some ears do not survive.
+        problem = Problem(V, F, fixed, target)
+        if turn:
+            refine_problem(problem)
+        else:
+            through_all(V, F, fixed, target)
+
+    @pytest.mark.parametrize("raised", [0.0, 1.0, -1.0])
+    def test_an_ear_on_them_has_no_room(self, raised):
+        """The middle of three vertices on a slanting line, and what one unit in its last place makes of it."""
+        tip = [1.5, 0.5 - raised * np.spacing(0.5)]
+        problem = moved(eared(), {0: [0, 0], 1: tip, 2: [3, 1], 3: [0, 4]})
+        flat = [o for o in diagnose(problem).obstructions if o.kind is Kind.INVERTED_TRIANGLE]
+        assert len(flat) == (raised <= 0)
+        refined = refine_problem(problem)
+        assert not refined.diagnosis.forbids_injective
+        new = refined.problem
+        assert injective_map(new.V, new.F, new.fixed, new.target, reference="equilateral").injective
+
+    def test_in_a_certificate(self):
+        V, F = grid(5, 5)
+        assert certify(F, V).bijective
+        over = V.copy()
+        over[boundary_of(F)[2]] = V[boundary_of(F)[1]] / 2  # back along the side
+        assert not certify(F, over).bijective
+
+
+class TestSmallMeshes:
+    ONE = np.eye(3)[:, :2], np.array([[0, 1, 2]])
+    TWO = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+
+    @pytest.mark.parametrize("mesh", [ONE, TWO])
+    def test_without_a_free_vertex(self, mesh):
+        V, F = mesh
+        fixed = np.arange(len(V))
+        uv = through_all(V, F, fixed, V)
+        assert polish(V, F, uv, fixed=fixed).injective
+        assert np.allclose(distortion(V, F, uv).mips, 0)
+        mirrored = injective_map(V, F, fixed, V * [-1, 1])
+        assert mirrored.status is Status.IMPOSSIBLE
+        assert mirrored.diagnosis.obstructions[0].kind is Kind.REVERSED
+
+    def test_of_nothing(self):
+        V, F = np.empty((0, 2)), np.empty((0, 3), dtype=int)
+        with pytest.raises(ValueError, match="no triangles"):
+            injective_map(V, F, [], V)
+        with pytest.raises(ValueError, match="no triangles"):
+            distortion(V, F, V)
+        assert not certify(F, V).injective
+        assert flipped_triangles(F, V).size == 0
+
+    def test_one_free_vertex(self):
+        V, F = np.array([[0, 0], [1, 0], [0, 1], [0.3, 0.3]]), np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3]])
+        through_all(V, F, [2, 0, 1], V[[2, 0, 1]] * 7 - 3)
+
+
+class TestTargetsThatCrossThemselves:
+    def test_are_mapped_where_that_is_possible(self):
+        """A band that laps over itself: injective triangle by triangle, and said not to be bijective."""
+        V, F = grid(24, 3)
+        t, radius = -2 * np.pi * 1.3 * V[:, 0], 1 + V[:, 1]
+        fixed = boundary_of(F)
+        target = np.stack([radius * np.cos(t), radius * np.sin(t)], axis=1)[fixed]
+        result = injective_map(V, F, fixed, target)
+        assert result.status is Status.INJECTIVE
+        assert result.certificate.bijective is False
+
+    def test_are_impossible_where_they_turn_too_little(self):
+        V, F = random_delaunay(60, seed=1)
+        (loop,) = onto((V, F), circle(len(boundary_of(F)))).loops
+        t = 2 * np.pi * (np.arange(len(loop)) + 0.3) / len(loop)
+        result = injective_map(V, F, loop, np.stack([np.sin(t), np.sin(2 * t)], axis=1))
+        assert result.status is Status.IMPOSSIBLE
+        assert Kind.TURNING_NUMBER in {o.kind for o in result.diagnosis.obstructions}
+        assert np.isfinite(result.uv).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_none(bad):
+    V, F = disk(3)
+    fixed = boundary_of(F)
+    broken = V.copy()
+    broken[4, 1] = bad
+    target = V[fixed].copy()
+    target[2, 0] = bad
+    with pytest.raises(ValueError, match="V is not finite at vertex 4"):
+        injective_map(broken, F, fixed, V[fixed])
+    with pytest.raises(ValueError, match="target is not finite at row 2"):
+        injective_map(V, F, fixed, target)
+    with pytest.raises(ValueError, match="uv is not finite at vertex 4"):
+        polish(V, F, broken, fixed=fixed)
+    with pytest.raises(ValueError, match="uv is not finite at vertex 4"):
+        distortion(V, F, broken)
+    # To judge a broken map is what certificates are for.
+    certificate = certify(F, broken)
+    assert certificate.nonfinite.tolist() == np.flatnonzero((F == 4).any(axis=1)).tolist()
+    assert not certificate.injective
