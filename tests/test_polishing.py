@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, lift
-from quasiharmonic import polishing
+from quasiharmonic import newton_descent
 from quasiharmonic.certificate import is_injective
 from quasiharmonic.deformation_energy import signed_areas
 from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, conformal_area_blend
@@ -247,13 +247,13 @@ def test_what_the_exact_test_refuses_is_not_taken(monkeypatch):
         asked.append(uv)
         return len(asked) == 3
 
-    monkeypatch.setattr(polishing, "is_injective", strict)
+    monkeypatch.setattr(newton_descent, "is_injective", strict)
     result = polish(V, F, uv, fixed=fixed, max_iterations=1)
     # Refused twice, halved twice.
     np.testing.assert_allclose(result.uv - uv, (asked[0] - uv) / 4, atol=1e-14)
     np.testing.assert_array_equal(result.uv, asked[2])
     assert np.abs(full.uv - uv).max() >= np.abs(asked[0] - uv).max()
-    monkeypatch.setattr(polishing, "is_injective", lambda F, uv: False)
+    monkeypatch.setattr(newton_descent, "is_injective", lambda F, uv: False)
     result = polish(V, F, uv, fixed=fixed)
     assert result.status is Status.EXHAUSTED
     np.testing.assert_array_equal(result.uv, uv)

@@ -34,6 +34,9 @@ class DeformationEnergy:
         are measured as they are.
     weights : (f,) array, optional
         A factor for each triangle's energy, not negative; 1 by default.
+    rest_F : (f, 3) array of int, optional
+        Rows of ``V`` between which each triangle lies at rest, where it is not those of ``F``: rest triangles
+        need not fit together.
 
     Raises
     ------
@@ -57,10 +60,11 @@ class DeformationEnergy:
         *,
         area: float | None = None,
         weights: ArrayLike | None = None,
+        rest_F: ArrayLike | None = None,
     ) -> None:
         self.energy = energy
         self.F = np.asarray(F, dtype=np.int64)
-        shapes = rest_shapes(V, self.F)
+        shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))
         if shapes.flat.size:
             raise ValueError(
                 f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "

@@ -4,23 +4,23 @@ On a triangle a map is affine and ``w = p z + q z̄ + const`` in complex numbers
 derivatives p and q. Its singular values are ``σ₁ = |p| + |q|`` and ``σ₂ = |p| − |q|``, the second one
 negative where the triangle is inverted, and ``det J = |p|² − |q|²``. An *isotropic* energy, one that
 does not change when triangle or image are turned, is a function ``φ(a, b)`` of ``a = |p|²`` and
-``b = |q|²``, and in (p, q) its second derivative falls apart by itself:
+``b = |q|²``, and in (p, q) its second derivative falls apart by itself::
 
     across p (turning it)      2 φ_a
     across q (turning it)      2 φ_b                                               ┐ four numbers, no
     along p and q              ⎡ 2 φ_a + 4a φ_aa      4 √(ab) φ_ab    ⎤            │ eigensolver
                                ⎣ 4 √(ab) φ_ab         2 φ_b + 4b φ_bb ⎦            ┘ needed
 
-==================  =====================  ==============================================  ===========
-energy              in singular values     φ, with D = det J = a − b                       paper
-==================  =====================  ==============================================  ===========
-`MIPS`              σ₁/σ₂ + σ₂/σ₁ − 2      4b / D                                          §10
-`SymmetricDirichlet`  Σ σᵢ² + σᵢ⁻² − 4     2 (D − 1)²/D + 4b (1 + D⁻²)                     §3
-`ARAP`              Σ (σᵢ − 1)²            2 (√a − 1)² + 2b                                E₁, §11.1.1
-`AreaPreserving`    (σ₁σ₂ − 1)²            (D − 1)²                                        E₂, §11.1.2
-`AreaBarrier`       σ₁σ₂ + 1/(σ₁σ₂) − 2    (D − 1)²/D                                      E_a, §10.2
-`MassSpring`        lengths of the sides   not isotropic; in `quasiharmonic.springs`       E₃, §11.1.3
-==================  =====================  ==============================================  ===========
+====================  ===================  ============================  ===========
+energy                in singular values   φ, with D = det J = a − b     paper
+====================  ===================  ============================  ===========
+`MIPS`                σ₁/σ₂ + σ₂/σ₁ − 2    4b / D                        §10
+`SymmetricDirichlet`  Σ σᵢ² + σᵢ⁻² − 4     2 (D − 1)²/D + 4b (1 + D⁻²)   §3
+`ARAP`                Σ (σᵢ − 1)²          2 (√a − 1)² + 2b              E₁, §11.1.1
+`AreaPreserving`      (σ₁σ₂ − 1)²          (D − 1)²                      E₂, §11.1.2
+`AreaBarrier`         σ₁σ₂ + 1/(σ₁σ₂) − 2  (D − 1)²/D                    E_a, §10.2
+`MassSpring`          lengths of sides     in `quasiharmonic.springs`    E₃, §11.1.3
+====================  ===================  ============================  ===========
 
 All are zero at isometries (MIPS at similarities) and nowhere negative. All but MIPS compare lengths, so
 the map must be brought to the surface's scale first; `DeformationEnergy` does that.

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import check_finite, check_range, index_array, real_array
 from quasiharmonic.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import named
 from quasiharmonic.predicates import orientation
 
 FloatArray = NDArray[np.float64]
@@ -147,8 +147,10 @@ class Distortion:
         order = np.argsort(value, kind="stable")
         below = np.cumsum(share[order])
         median, p95 = value[order[np.searchsorted(below, [0.5 * below[-1], 0.95 * below[-1]])]].tolist()
+        with np.errstate(invalid="ignore"):  # what is infinite either way has no mean
+            mean = float(np.sum(share / below[-1] * value))
         return Summary(
-            mean=float(np.sum(share / below[-1] * value)),
+            mean=mean,
             median=median,
             p95=p95,
             minimum=float(value[order[0]]),
@@ -164,7 +166,7 @@ class Distortion:
             for name, values in self.per_triangle().items()
         }
         return {
-            "scale": self.scale,
+            "scale": self.scale if np.isfinite(self.scale) else None,
             "flat": int(self.flat.size),
             "flipped": int(self.flipped.size),
             **summaries,
@@ -209,25 +211,47 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     >>> round(found.summary("isometric").maximum, 6)
     1.414214
     """
-    F = np.asarray(F)
-    if F.ndim != 2 or F.shape[1] != 3 or F.dtype.kind not in "iu":
-        raise ValueError(f"F must be an integer array of shape (f, 3), not {F.dtype} of shape {F.shape}")
+    F, V, uv = index_array("F", F), real_array("V", V), real_array("uv", uv)
+    if F.ndim != 2 or F.shape[1] != 3:
+        raise ValueError(f"F must have shape (f, 3), not {F.shape}")
     if not F.size:
         raise ValueError("the mesh has no triangles")
-    V, uv = np.asarray(V, dtype=np.float64), np.asarray(uv, dtype=np.float64)
     if V.ndim != 2 or V.shape[1] not in (2, 3):
         raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
     if uv.shape != (len(V), 2):
         raise ValueError(f"uv must have shape ({len(V)}, 2), a position for every vertex, not {uv.shape}")
-    if not (F.min() >= 0 and F.max() < len(V)):
-        raise ValueError(f"F refers to vertices beyond the {len(V)} that there are")
+    check_range("F", F, len(V))
     for name, array in (("V", V), ("uv", uv)):
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        if bad.size:
-            raise ValueError(f"{name} is not finite at {named('vertex', 'vertices', bad)}")
+        check_finite(name, "vertex", "vertices", array)
     # What leaves the numbers' range in extreme maps becomes inf, 0 or NaN as the formulas have it.
     with np.errstate(all="ignore"):
-        return _measured(V, F.astype(np.int64), uv)
+        return _measured(V, F, uv)
+
+
+def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
+    """Mean-ratio quality of planar triangles, ``4√3 · area / (a² + b² + c²)`` for edges a, b, c.
+
+    Parameters
+    ----------
+    points : (n, 2) array
+        Finite.
+    F : (f, 3) array of int
+
+    Returns
+    -------
+    (f,) float64
+        1 for an equilateral triangle, 0 for one without area, negative for one wound clockwise. The sign is
+        exact.
+    """
+    corners = np.asarray(points, dtype=np.float64)[np.asarray(F, dtype=np.int64)]
+    sign = orientation(*(corners[:, k] for k in range(3)))
+    sides = corners - np.roll(corners, 1, axis=1)
+    longest = np.abs(sides).max(axis=(1, 2), initial=0.0)
+    # In units of the longest side, so that no square leaves the numbers' range.
+    a, b, c = (sides / np.where(longest > 0, longest, 1.0)[:, None, None]).transpose(1, 0, 2)
+    squares = (a * a).sum(axis=1) + (b * b).sum(axis=1) + (c * c).sum(axis=1)
+    area = np.maximum(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, np.finfo(float).tiny)
+    return np.asarray(sign * 4 * np.sqrt(3) * area / np.where(squares > 0, squares, 1.0))
 
 
 def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
@@ -260,7 +284,7 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     undefined = np.where(defined, 0.0, np.nan)
     return Distortion(
         share=shapes.m / np.float64(total),
-        scale=scale / units,
+        scale=scale / units if units else np.inf,
         sigma1=sigma1 * units,
         sigma2=sigma2 * units,
         mips=MIPS().density(scaled) + undefined,

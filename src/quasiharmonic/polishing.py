@@ -1,25 +1,16 @@
-"""Less distortion without leaving the injective maps: projected Newton from a map that is injective (§10, §11).
-
-    assemble ──▶ factor ──▶ direction ──▶ t = min(1, 0.9 × first collapse) ──▶ less energy? ──▶ injective, exactly?
-       ▲                                          │ ▲            no: t/2 ◀──────────┴────────────────┘ yes
-       └──────────────────────────────────────────┼─┴── t = 1 went well: 2t, 4t, … as long as the energy falls
-                                                  └── next map
-
-The second derivative of the energy is made positive definite triangle by triangle, in closed form
-(`quasiharmonic.energies`). While collapsing triangles cut the steps short, negative eigenvalues enter with
-their absolute values, which aims less far and gets further; afterwards they are clamped at zero, which
-converges faster.
-"""
+"""Less distortion without leaving the injective maps, from a map that is injective (§10, §11)."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.certificate import certify, flipped_triangles, is_injective
+from quasiharmonic.arrays import check_finite, real_array
+from quasiharmonic.certificate import certify, flipped_triangles
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.energies import (
     ARAP,
@@ -30,14 +21,12 @@ from quasiharmonic.energies import (
     SymmetricDirichlet,
     conformal_area_blend,
 )
-from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.mesh.topology import named
-from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.newton_descent import NewtonDescent, in_units
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
 
 FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 #: What a polish can lower, by name. ARAP gets a tenth of the area barrier: alone it lets triangles collapse.
 ENERGIES: dict[str, Energy] = {
@@ -46,21 +35,6 @@ ENERGIES: dict[str, Energy] = {
     "blend": conformal_area_blend(),
     "arap": Combination((1.0, ARAP()), (0.1, AreaBarrier())),
 }
-
-# Of the step at which the first triangle would collapse.
-_FRACTION = 0.9
-# Of the decrease that the gradient promises (Armijo's condition).
-_SUFFICIENT = 1e-4
-# The step is halved, and then doubled, this often before the direction is given up.
-_HALVINGS = 30
-# Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
-# by the first, and where triangles span many orders of magnitude they are as small as that.
-_SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
-# A step that lowers the energy by less than this part of the tolerance is idle; after so many in a row the
-# map has come to rest short of convergence.
-_IDLE, _PATIENCE = 1e-2, 3
-# A mean energy this small is rounding: the map is an isometry, or a similarity.
-_NOTHING = 1e-12
 
 
 def polish(
@@ -177,7 +151,11 @@ def polish_map(
         raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
     # What leaves the numbers' range is met by comparisons: it is never below anything.
     with np.errstate(all="ignore"):
-        descent = _Descent(problem, start, chosen, weights, linear_solver)
+        # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
+        exponent = int(np.frexp(np.abs(start).max())[1])
+        area = float(signed_areas(problem.F, in_units(start, exponent)).sum())
+        deformation = DeformationEnergy(problem.V, problem.F, chosen, area=area, weights=weights)
+        descent = NewtonDescent(deformation, start, problem.fixed, exponent, linear_solver)
     history: list[Step] = []
 
     def report() -> None:
@@ -198,7 +176,7 @@ def polish_map(
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     uv = descent.positions(descent.w)
-    certificate = certify(problem.F, uv)
+    certificate = certify(problem.F, uv, loops=problem.loops)
     seconds = time.perf_counter() - began
     name = energy if isinstance(energy, str) else type(energy).__name__
     stage = Stage(
@@ -220,6 +198,32 @@ def polish_map(
     )
 
 
+def polished(
+    problem: Problem,
+    result: MapResult,
+    *,
+    energy: str | Energy,
+    max_iterations: int = 200,
+    callback: Callable[[Step], object] | None = None,
+) -> MapResult:
+    """Polish the injective map of a result, by the linear solver that found it; stages and history are continued."""
+    further = polish_map(
+        problem,
+        result.uv,
+        energy=energy,
+        max_iterations=max_iterations,
+        linear_solver=result.linear_solver,
+        callback=callback,
+    )
+    return replace(
+        further,
+        stages=result.stages + further.stages,
+        history=result.history + further.history,
+        path=result.path,
+        seconds=result.seconds + further.seconds,
+    )
+
+
 def energy_named(energy: str | Energy) -> Energy:
     """Look an energy up by its name, and refuse what a polish cannot lower."""
     if isinstance(energy, str):
@@ -236,14 +240,18 @@ def energy_named(energy: str | Energy) -> Energy:
     return energy
 
 
-def _start(problem: Problem, uv: ArrayLike) -> FloatArray:
-    """The start as float64, checked."""
-    start = np.array(uv, dtype=np.float64)
+def given_map(problem: Problem, uv: ArrayLike) -> FloatArray:
+    """A user's map of the problem's mesh as float64, checked; a copy."""
+    start = real_array("uv", uv)
     if start.shape != (problem.n, 2):
         raise ValueError(f"uv must have shape ({problem.n}, 2), a position for every vertex, not {start.shape}")
-    broken = np.flatnonzero(~np.isfinite(start).all(axis=1))
-    if broken.size:
-        raise ValueError(f"uv is not finite at {named('vertex', 'vertices', broken)}")
+    check_finite("uv", "vertex", "vertices", start)
+    return start
+
+
+def _start(problem: Problem, uv: ArrayLike) -> FloatArray:
+    """The start as float64, checked."""
+    start = given_map(problem, uv)
     flipped = flipped_triangles(problem.F, start)
     if flipped.size:
         raise ValueError(
@@ -251,101 +259,3 @@ def _start(problem: Problem, uv: ArrayLike) -> FloatArray:
             "a polish starts from an injective map"
         )
     return start
-
-
-class _Descent:
-    """The map at hand and how to get to the next."""
-
-    def __init__(
-        self, problem: Problem, uv: FloatArray, energy: Energy, weights: ArrayLike | None, linear_solver: str
-    ) -> None:
-        self._F = problem.F
-        self._fixed, self._pinned = problem.fixed, uv[problem.fixed]
-        # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
-        self._exponent = int(np.frexp(np.abs(uv).max())[1])
-        self.w: ComplexArray = np.ldexp(uv, -self._exponent).view(np.complex128).ravel()
-        self.energy = DeformationEnergy(
-            problem.V, problem.F, energy, area=float(signed_areas(problem.F, self.w).sum()), weights=weights
-        )
-        self.system = NewtonSystem(problem.F, self.energy.g, problem.n, problem.fixed, linear_solver)
-        self._deformation = self.energy.deform(self.w)
-        self.value = self.first = self.energy.value_of(self._deformation)
-        self._cut = True
-        self._idle = 0
-
-    def positions(self, w: ComplexArray) -> FloatArray:
-        """A map as the caller gets it, the fixed vertices to the last bit."""
-        uv = np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent)
-        uv[self._fixed] = self._pinned
-        return uv
-
-    def step(self, tolerance: float) -> Status | None:
-        """Take one step; a status where there is no other to take."""
-        gradient = self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
-        # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
-        for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
-            direction, promise, newton = self._direction(gradient, negative)
-            small = newton and 0.5 * promise <= tolerance * (self.value + _NOTHING)
-            if small and negative < 0 and self._cut:
-                continue  # the reflected model is pessimistic: only the clamped one may declare an end
-            before = self.value
-            moved = self._search(direction, promise)
-            if small and negative == 0:
-                return Status.POLISHED
-            if moved:
-                self._idle = 0 if before - self.value > _IDLE * tolerance * before else self._idle + 1
-                return Status.EXHAUSTED if self._idle >= _PATIENCE else None
-        return Status.EXHAUSTED
-
-    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
-        """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
-        or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
-        """
-        self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
-        for shift in _SHIFTS:
-            try:
-                self.system.factor(shift)
-                direction = self.system.solve(-gradient)
-            except NotPositiveDefinite:
-                continue
-            promise = -_dot(gradient, direction)
-            if promise >= 0:
-                return direction, promise, True
-        direction = self.system.solve_diagonal(-gradient)
-        return direction, -_dot(gradient, direction), False
-
-    def _search(self, direction: ComplexArray, promise: float) -> bool:
-        """Move along a direction, as far as is good; False where no step lowers the energy enough."""
-        if not promise > 0:
-            return False
-        full = np.zeros_like(self.w)
-        full[self.system.free] = direction
-        limit = _FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
-        start, before = self.w, self.value
-        longest = min(1.0, limit)
-        halved = longest * 0.5 ** np.arange(_HALVINGS)
-        # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
-        doubled = 2.0 ** np.arange(1, _HALVINGS)
-        for t in (*halved, *doubled[doubled <= limit]):
-            if self._accept(start + t * full, before - _SUFFICIENT * min(t, 1.0) * promise):
-                break
-        else:
-            return False
-        self._cut = t < 1
-        # Far from the minimum, barriers fall by powers and Newton's step is several times too short.
-        while t >= 1 and 2 * t <= limit and self._accept(start + 2 * t * full, self.value):
-            t *= 2
-        return True
-
-    def _accept(self, w: ComplexArray, bound: float) -> bool:
-        """Go there if the energy is below a bound and every triangle, exactly, positive."""
-        deformation = self.energy.deform(w)
-        value = self.energy.value_of(deformation)
-        if not (value < bound and is_injective(self._F, self.positions(w))):
-            return False
-        self.w, self._deformation, self.value = w, deformation, value
-        return True
-
-
-def _dot(a: ComplexArray, b: ComplexArray) -> float:
-    return float(np.sum(a.real * b.real + a.imag * b.imag))

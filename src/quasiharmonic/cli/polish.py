@@ -7,7 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import TypeAlias
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.mesh.reference import Reference
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.result import MapResult, Step
+
+    Lower: TypeAlias = Callable[[Problem, NDArray[np.float64], Callable[[Step], None] | None], MapResult]
 
 
 def add_parser(commands: Commands) -> None:
@@ -37,9 +48,27 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, polish, write, judge, report."""
+
+    def lower(problem: Problem, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
+        from quasiharmonic.polishing import polish_map
+
+        return polish_map(
+            problem,
+            uv,
+            energy=options.energy,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+
+    # Whatever is wrong with the rest triangles, the polish has the better words for it.
+    return improve(options, lower, reference="equilateral")
+
+
+def improve(options: argparse.Namespace, lower: Lower, reference: Reference | None = None) -> int:
+    """Read a map, lower its distortion, write, judge, report; for every command that does so."""
     from quasiharmonic import io
     from quasiharmonic.measures import distortion
-    from quasiharmonic.polishing import polish_map
     from quasiharmonic.problem import Problem
 
     from . import map, progress, report
@@ -49,16 +78,9 @@ def run(options: argparse.Namespace) -> int:
     uv = io.map_of(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
-        problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
+        problem = Problem(*io.problem_arrays(mesh, fixed), reference=reference)
         with progress.line() as show:
-            result = polish_map(
-                problem,
-                uv,
-                energy=options.energy,
-                max_iterations=options.max_iterations,
-                linear_solver=options.linear_solver,
-                callback=show,
-            )
+            result = lower(problem, uv, show)
     certificate = map.write(options.output, mesh, result)
     with report.after_writing(options.output):
         before, after = (distortion(problem.V, problem.F, w).to_dict() for w in (uv, result.uv))

@@ -1,0 +1,70 @@
+"""``qhm harmonise``: a map in a file → an injective one of less distortion, by any energy."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.result import MapResult, Step
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "harmonise",
+        help="lower an energy that does not mind inversions, within the injective maps",
+        description="Lower the distortion of the map that the input's texture coordinates (vt) give, by an energy that "
+        "need not mind inversions, and keep it injective or make it so. Where polish has the energy it is faster.",
+        epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips "
+        "and symmetric-dirichlet, a map that is not injective included), nothing written.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with a map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
+    )
+    parser.add_argument("--energy", choices=arguments.HARMONISED, default="arap", help="(default: arap)")
+    parser.add_argument(
+        "--eta",
+        type=float,
+        nargs="+",
+        metavar="ETA",
+        help="weight of the energy against injectivity, one for each round (default: four rounds, as suits the energy)",
+    )
+    parser.add_argument(
+        "--iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
+    )
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, harmonise, write, judge, report."""
+    from . import polish
+
+    def lower(problem: Problem, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
+        from quasiharmonic.harmonising import harmonise_map
+
+        return harmonise_map(
+            problem,
+            uv,
+            energy=options.energy,
+            eta=options.eta,
+            iterations=options.iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+
+    return polish.improve(options, lower)

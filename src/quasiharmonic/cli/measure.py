@@ -1,0 +1,68 @@
+"""``qhm measure``: how much a map distorts, in all and triangle by triangle."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.measures import Distortion
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "measure",
+        help="measure a map's distortion, and export it triangle by triangle",
+        description="Measure what the map that the input's texture coordinates (vt) give does to every triangle. "
+        "Means and quantiles are weighted by the surface's area; measures of size are taken after the map has been "
+        "scaled to it.",
+        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written.",
+    )
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ file with a map, injective or not")
+    parser.add_argument(
+        "--export", type=Path, metavar="FILE", help="write every measure of every triangle as .csv, .npz or .ply"
+    )
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, measure, export, report."""
+    from quasiharmonic import io
+    from quasiharmonic.measures import distortion
+
+    from . import report
+
+    report.check_json(options.json, inputs=(options.input, options.export))
+    if options.export is not None:
+        report.check_export(options.export, inputs=(options.input,))
+    mesh = io.read_mesh(options.input)
+    uv = io.map_of(mesh)
+    with report.about(options.input):
+        found = distortion(mesh.V, mesh.F, uv)
+    if options.export is not None:
+        # What is coloured by first is what bounds the error of a texture.
+        values = {"isometric": found.isometric, **found.per_triangle()}
+        io.write_per_triangle(options.export, mesh.V, mesh.F, uv, values)
+    facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
+    report.emit(facts, options.json, _table(found, len(mesh.F)))
+    return 0
+
+
+def _table(found: Distortion, count: int) -> str:
+    """A line for each measure."""
+    lines = [f"{'':20}{'mean':>12}{'median':>12}{'95 %':>12}{'min':>12}{'max':>12}  at"]
+    for name, values in found.per_triangle().items():
+        if (values != values).all():
+            lines.append(f"{name:20}  undefined: no triangle has area")
+            continue
+        s = found.summary(name)
+        numbers = "".join(f"{value:12.4g}" for value in (s.mean, s.median, s.p95, s.minimum, s.maximum))
+        lines.append(f"{name:20}{numbers}  {s.highest}")
+    lines.append(f"{len(found.flipped)} of {count} triangles inverted, {len(found.flat)} without area in the rest mesh")
+    return "\n".join(lines)
