@@ -127,11 +127,76 @@ def test_missing_glyph_and_missing_font(tmp_path):
         (lambda: targets.regular_polygon(2), "at least 3 points, not 2"),
         (lambda: targets.star(2), "at least 3 tips, not 2"),
         (lambda: targets.star(5, 1.0), "between 0 and 1, not 1.0"),
+        (lambda: targets.ring(0), "between 0 and 1, not 0"),
+        (lambda: targets.ring(0.5, 2), "at least 3 points, not 2"),
+        (lambda: targets.word("GS", overlap=0), "overlap must be positive"),
+        (lambda: targets.word(""), "a word needs a letter"),
     ],
 )
 def test_impossible_shapes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_fonts_by_name_and_by_file():
+    bold = targets.letter("G", "DejaVu Sans:bold")
+    assert all(np.array_equal(a, b) for a, b in zip(bold, targets.letter("G"), strict=True))
+    assert targets.signed_area(targets.letter("G", "DejaVu Sans")[0]) < 0.8 * targets.signed_area(bold[0])
+    with pytest.raises(ValueError, match=r"no font of the name 'DejaVu Sanz' is installed; there is .*DejaVu Sans"):
+        targets.letter("G", "DejaVu Sanz")
+
+
+def test_what_is_no_font(tmp_path):
+    (tmp_path / "fake.ttf").write_text("not a font")
+    with pytest.raises(ValueError, match=r"fake\.ttf is not a font that can be read"):
+        targets.letter("G", tmp_path / "fake.ttf")
+
+
+def test_tolerance_of_letters():
+    fine = targets.letter("S", tolerance=1e-7)[0]
+    for tolerance in (1e-2, 1e-4):
+        assert 0.2 * tolerance < distance(fine, targets.letter("S", tolerance=tolerance)[0]).max() < tolerance
+
+
+@pytest.mark.parametrize(("text", "holes"), [("QH", 1), ("LOVE", 1), ("G", 0), ("mesh", 2), ("R8", 3)])
+def test_letters_of_a_word_make_one_piece(text, holes):
+    pytest.importorskip("shapely")
+    outer, *inner = targets.word(text)
+    assert targets.signed_area(outer) > 0
+    assert all(targets.signed_area(c) < 0 for c in inner)
+    assert len(inner) == holes
+    # Overlaps are small, so little of the letters is covered twice.
+    alone = sum(targets.signed_area(c) for character in text for c in targets.letter(character))
+    assert 0.9 * alone < sum(map(targets.signed_area, [outer, *inner])) <= alone + 1e-12
+    first = targets.letter(text[0])[0]
+    assert outer[:, 0].min() == pytest.approx(first[:, 0].min())
+
+
+def test_words_that_fall_apart():
+    pytest.importorskip("shapely")
+    with pytest.raises(ValueError, match=r"1 part of 'hi' \(a dot, an accent\) touches no other"):
+        targets.word("hi")
+
+
+def test_words_need_shapely(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "shapely", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs Shapely: pip install 'quasiharmonic\[shapes\]'"):
+        targets.word("QH")
+
+
+def test_nesting():
+    square = targets.rectangle(1, 1) - 0.5
+    islands = [2 * square, 8 * square[::-1], 4 * square, 6 * square, square / 2 + (3.5, 0)]
+    ordered = targets.nested(islands)
+    assert [targets.signed_area(c) for c in ordered] == [64, -36, 16, -4, -0.25]
+    # Turned around, a contour keeps its first point.
+    assert ordered[0][0].tolist() == islands[1][0].tolist()
+    assert [targets.signed_area(c) for c in targets.filled(islands)] == [64]
+    assert [targets.signed_area(c) for c in targets.filled([square, square + 2])] == [1, 1]
+    with pytest.raises(ValueError, match="encloses no area"):
+        targets.nested([np.array([(0, 0), (1, 1), (2, 2)])])
+    with pytest.raises(ValueError, match=r"contour 1 must be \(k, 2\)"):
+        targets.nested([square, np.zeros((2, 2))])
 
 
 # --- correspondence
@@ -217,6 +282,15 @@ def test_curved_loop_is_seen_upright():
     placed = targets.arc_length(V[loop], targets.disk())
     towards = V[loop, :2] / np.linalg.norm(V[loop, :2], axis=1)[:, None]
     assert (towards * placed).sum(axis=1).min() > 0.9
+
+
+def test_curved_hole_is_seen_from_the_side_where_it_runs_as_the_contour_does():
+    V, F = surfaces.annulus(8)
+    hole = boundary_loops(F, len(V))[1]
+    for turn in (0, 1.0):
+        flat = V @ np.array([(np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))])
+        lifted = np.column_stack([flat, np.zeros(len(V))])
+        assert targets.arc_length(lifted[hole], flat[hole]) == pytest.approx(flat[hole])
 
 
 @pytest.mark.parametrize("normal", np.vstack([np.eye(3), -np.eye(3), [(0, 0, 0), (1, 2, 3)]]))

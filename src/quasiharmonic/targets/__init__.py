@@ -1,23 +1,31 @@
 """Places to map a boundary to: outlines, and which boundary vertex goes where on them."""
 
+from quasiharmonic.targets.boundary import boundary_to
+from quasiharmonic.targets.chords import flattened_edges
+from quasiharmonic.targets.contours import filled, nested, signed_area
 from quasiharmonic.targets.correspondence import arc_length
-from quasiharmonic.targets.outlines import (
-    disk,
-    ellipse,
-    letter,
-    rectangle,
-    regular_polygon,
-    signed_area,
-    star,
-)
+from quasiharmonic.targets.glyphs import letter, word
+from quasiharmonic.targets.outlines import disk, ellipse, rectangle, regular_polygon, ring, star
+from quasiharmonic.targets.polylines import read_polylines
+from quasiharmonic.targets.specification import outline
+from quasiharmonic.targets.svg import read_svg
 
 __all__ = [
     "arc_length",
+    "boundary_to",
     "disk",
     "ellipse",
+    "filled",
+    "flattened_edges",
     "letter",
+    "nested",
+    "outline",
+    "read_polylines",
+    "read_svg",
     "rectangle",
     "regular_polygon",
+    "ring",
     "signed_area",
     "star",
+    "word",
 ]

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.targets.contours import checked, corners, signed_area
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+# Vertices of a loop and where along a contour they go.
+Held = Sequence[tuple[int, float]]
 
 
 def arc_length(
@@ -49,65 +56,134 @@ def arc_length(
         outline has corners; when two successive vertices of the loop coincide, or all but; when
         there is no vertex ``start``.
     """
-    points = _checked(loop, "loop", (2, 3))
-    contour = _checked(outline, "outline", (2,))
+    points = checked(loop, "loop", (2, 3))
+    contour = checked(outline, "outline")
     n = len(points)
-    s, length = _arc(points)
-    t, _ = _arc(contour)
-    corners = _corners(contour, corner_angle)
-    if n < len(corners):
-        raise ValueError(
-            f"the loop has {n} vertices, too few to keep the {len(corners)} corners of the outline: "
-            "refine the boundary, or let fewer bends count as corners (corner_angle)"
-        )
+    s = arc(points)
     if start is None:
-        start = _best_start(points, contour)
+        start = best_start(s, seen_flat(points, contour), contour)
     elif not 0 <= start < n:
         raise ValueError(f"start = {start}, but the loop has vertices 0 to {n - 1}")
-
-    turned = np.roll(np.arange(n), -start)
-    along = (s[turned] - s[start]) % 1.0
-    # The first corner is where the start goes; the circle ends where it began.
-    fixed = np.concatenate([[0], 1 + _match(along[1:], t[corners[1:]])])
-    place = np.interp(along, np.append(along[fixed], 1.0), np.append(t[corners], 1.0))
-    stuck = np.flatnonzero(np.diff(place, append=1.0) <= 0)
-    if stuck.size:
-        first, second = turned[stuck[0]], turned[(stuck[0] + 1) % n]
-        raise ValueError(f"vertices {first} and {second} of the loop coincide (its length is {length:.3g})")
-    result = np.empty((n, 2))
-    for axis in range(2):
-        column = np.append(contour[:, axis], contour[0, axis])
-        result[turned, axis] = np.interp(place, np.append(t, 1.0), column)
-    return result
+    return spread(s, contour, [(start, 0.0)], corner_angle=corner_angle)
 
 
-def _checked(curve: ArrayLike, name: str, widths: tuple[int, ...]) -> FloatArray:
-    points = np.asarray(curve, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] not in widths or len(points) < 3:
-        wanted = " or ".join(f"(k, {w})" for w in widths)
-        raise ValueError(f"{name} must be {wanted} with k at least 3, not {points.shape}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"point {int(np.argmin(np.isfinite(points).all(axis=1)))} of {name} is not finite")
-    return points
+def spread(
+    s: FloatArray,
+    contour: FloatArray,
+    pins: Held,
+    *,
+    corner_angle: float,
+    names: IntArray | None = None,
+) -> FloatArray:
+    """Lay a loop along a contour, some of its vertices given; each corner gets the vertex nearest along the way.
+
+    Parameters
+    ----------
+    s : (n,) float64
+        Where the vertices lie along their loop, as `arc` tells.
+    contour : (k, 2) float64
+    pins : sequence of (int, float)
+        Vertices of the loop and where along the contour they go, both in order around; at least one.
+    corner_angle : float
+        Degrees.
+    names : (n,) int64, optional
+        What the vertices are called in messages; by default their positions in the loop.
+
+    Returns
+    -------
+    (n, 2) float64
+
+    Raises
+    ------
+    ValueError
+        When there are fewer vertices than corners between two pins, or two vertices coincide.
+    """
+    names = np.arange(len(s)) if names is None else names
+    t = arc(contour)
+    sharp = corners(contour, corner_angle)
+    place = np.empty(len(s))
+    for stretch in stretches(s, pins):
+        here, wanted = stretch.within(t, sharp)
+        run, along, count = stretch.run, stretch.along, len(stretch.run) - 1
+        if count - 1 < len(here):
+            raise _too_few(names[run[0]], names[run[-1]], count - 1, len(here))
+        chosen = 1 + _match(along[1:-1], wanted)
+        way = np.interp(along, along[[0, *chosen, count]], np.concatenate([[0.0], wanted, [1.0]]))
+        stuck = np.flatnonzero(np.diff(way) <= 0)
+        if stuck.size:
+            raise ValueError(f"vertices {names[run[stuck[0]]]} and {names[run[stuck[0] + 1]]} of the loop coincide")
+        place[run[:-1]] = (stretch.begin + stretch.gap * way[:-1]) % 1.0
+        # Without rounding, so that corners are met exactly.
+        place[run[chosen]] = t[here]
+        place[run[0]] = stretch.begin
+    return at(contour, place)
 
 
-def _arc(points: FloatArray) -> tuple[FloatArray, float]:
-    """Where the points lie along their closed curve of length 1, and the length it has."""
+@dataclass(frozen=True)
+class Stretch:
+    """Everything from one pin to the next, both included.
+
+    Attributes
+    ----------
+    run : (c + 1,) int64
+        Vertices of the loop.
+    along : (c + 1,) float64
+        Where they lie, from 0 to 1.
+    begin : float
+        Where along the contour the first one goes.
+    gap : float
+        How far from there the last one goes.
+    """
+
+    run: IntArray
+    along: FloatArray
+    begin: float
+    gap: float
+
+    def within(self, t: FloatArray, some: IntArray) -> tuple[IntArray, FloatArray]:
+        """Those of some points of the contour that lie strictly in this stretch, in order, and where from 0 to 1."""
+        local = (t[some] - self.begin) % 1.0 / self.gap
+        order = np.argsort(local)
+        order = order[(local[order] > 0) & (local[order] < 1)]
+        return some[order], local[order]
+
+
+def stretches(s: FloatArray, pins: Held) -> Iterator[Stretch]:
+    """Take a loop apart at its pins."""
+    n = len(s)
+    for (first, begin), (last, end) in zip(pins, [*pins[1:], pins[0]], strict=True):
+        run = (first + np.arange(((last - first) % n or n) + 1)) % n
+        along = (s[run] - s[first]) % 1.0
+        # All the way around a single pin is not nowhere.
+        along[-1] = along[-1] or 1.0
+        yield Stretch(run, along / along[-1], begin, (end - begin) % 1.0 or 1.0)
+
+
+def _too_few(first: int, last: int, free: int, wanted: int) -> ValueError:
+    if first == last:
+        what = f"the loop has {free + 1} vertices, too few to keep the {wanted + 1} corners of the outline"
+    else:
+        what = (
+            f"there are {free} boundary vertices between {first} and {last}, "
+            f"too few to keep the {wanted} corners of the outline there"
+        )
+    return ValueError(f"{what}: refine the boundary, or let fewer bends count as corners (corner_angle)")
+
+
+def arc(points: FloatArray) -> FloatArray:
+    """Where the points lie along their closed curve, the whole of which has length 1; (n,) from 0."""
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     ends = np.cumsum(steps)
     if ends[-1] == 0:
         raise ValueError("all points of a closed curve coincide")
-    return np.concatenate([[0.0], ends[:-1] / ends[-1]]), float(ends[-1])
+    return np.concatenate([[0.0], ends[:-1] / ends[-1]])
 
 
-def _corners(contour: FloatArray, corner_angle: float) -> IntArray:
-    """Indices of the first point and of every corner, ascending."""
-    ahead = np.roll(contour, -1, axis=0) - contour
-    before = np.roll(ahead, 1, axis=0)
-    cross = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
-    bend = np.abs(np.arctan2(cross, (before * ahead).sum(axis=1))) >= np.radians(corner_angle)
-    bend[0] = True
-    return np.flatnonzero(bend)
+def at(contour: FloatArray, place: FloatArray) -> FloatArray:
+    """Points of a contour by where they lie along it, from 0 to 1; (n, 2)."""
+    t = np.append(arc(contour), 1.0)
+    closed = np.concatenate([contour, contour[:1]])
+    return np.stack([np.interp(place, t, closed[:, axis]) for axis in range(2)], axis=1)
 
 
 def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
@@ -131,19 +207,25 @@ def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
     return chosen
 
 
-def _best_start(points: FloatArray, contour: FloatArray) -> int:
-    """Vertex to begin with so that the two curves are as close as they can be.
+def best_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
+    """Vertex to begin with so that a loop and a contour are as close as they can be.
 
     With z and w the curves as complex functions of arc length, ∫ |z(s + δ) − w(s)|² ds is least
     where Re ∫ z(s + δ) w̄(s) ds is greatest: a correlation, for all δ at once by FFT.
+
+    Parameters
+    ----------
+    s : (n,) float64
+        Where the vertices lie along the loop.
+    flat : (n, 2) float64
+        How the loop looks in the plane.
+    contour : (k, 2) float64
     """
-    flat = _seen_flat(points)
-    s, _ = _arc(points)
-    t, _ = _arc(contour)
-    m = max(1024, 4 * len(points))
+    t = arc(contour)
+    m = max(1024, 4 * len(s))
     z, w = (
-        np.interp(np.arange(m) / m, np.append(at, 1.0), np.append(curve, curve[0]))
-        for at, curve in ((s, flat[:, 0] + 1j * flat[:, 1]), (t, contour[:, 0] + 1j * contour[:, 1]))
+        np.interp(np.arange(m) / m, np.append(where, 1.0), np.append(curve, curve[0]))
+        for where, curve in ((s, flat[:, 0] + 1j * flat[:, 1]), (t, contour[:, 0] + 1j * contour[:, 1]))
     )
     z, w = z - z.mean(), w - w.mean()
     match = np.fft.ifft(np.fft.fft(z) * np.conj(np.fft.fft(w))).real
@@ -152,13 +234,13 @@ def _best_start(points: FloatArray, contour: FloatArray) -> int:
     return int(np.argmin(np.minimum(away, 1 - away)))
 
 
-def _seen_flat(points: FloatArray) -> FloatArray:
-    """A loop as it looks from where it runs counterclockwise, the y-axis upwards; (n, 2)."""
+def seen_flat(points: FloatArray, contour: FloatArray) -> FloatArray:
+    """A loop as it looks from where it runs as the contour does, the y-axis upwards; (n, 2)."""
     if points.shape[1] == 2:
         return points
     centred = points - points.mean(axis=0)
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
-    return np.asarray(centred @ upright(normal)[:2].T)
+    return np.asarray(centred @ upright(normal * np.sign(signed_area(contour)))[:2].T)
 
 
 def upright(normal: FloatArray) -> FloatArray:

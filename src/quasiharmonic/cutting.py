@@ -1,0 +1,112 @@
+"""Closed surfaces, and surfaces with handles, cut open until they fit into the plane."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.mesh.topology import Edges, edge_keys, edges
+from quasiharmonic.problem import Problem
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Opened(NamedTuple):
+    """A surface that was cut open.
+
+    Attributes
+    ----------
+    V : (n + c, d) float64
+        Vertices: the old ones first, then copies of those along the cuts.
+    F : (f, 3) int64
+        The same triangles in the same order; those on one side of a cut refer to the copies.
+    origin : (n + c,) int64
+        The old vertex that each one is or is a copy of.
+    """
+
+    V: FloatArray
+    F: IntArray
+    origin: IntArray
+
+
+def cut_open(V: ArrayLike, F: ArrayLike) -> Opened:
+    """Cut a surface along edges into a disk, which has one boundary loop and fits into any outline without holes.
+
+    Handles and further boundary loops are opened by libigl's ``cut_to_disk``, whose cuts are not the
+    shortest. A closed surface without handles, of which that would leave nothing to cut, is cut along a
+    shortest path between two vertices far from each other. To choose cuts yourself, use ``igl.cut_mesh``.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Vertices.
+    F : (f, 3) array of int
+        Triangles of one connected surface.
+
+    Returns
+    -------
+    Opened
+
+    Raises
+    ------
+    ValueError
+        As `Problem` for what is no connected surface; for one that is a disk already.
+    ModuleNotFoundError
+        When libigl is not installed.
+    """
+    try:
+        import igl
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("cutting a surface needs libigl: pip install 'quasiharmonic[cut]'") from error
+
+    V = np.array(V, dtype=np.float64)
+    F = np.array(F, dtype=np.int64, order="C")
+    found = _checked(V, F)
+    euler = len(V) - len(found.interior) - len(found.boundary) + len(F)
+    if euler == 1:
+        raise ValueError("the surface is a disk already: nothing to cut")
+    paths = [_long_path(V, found.interior)] if euler == 2 else igl.cut_to_disk(F)
+    cut = np.array([pair for path in paths for pair in itertools.pairwise(path)], dtype=np.int64)
+    tail, head = F, np.roll(F, -1, axis=1)
+    # Which sides of triangles are cut, from each corner to the next.
+    marked = np.isin(edge_keys(tail, head, len(V)), edge_keys(cut[:, 0], cut[:, 1], len(V)))
+    opened = Opened(*igl.cut_mesh(V, F, marked))
+    return Opened(opened.V, opened.F.astype(np.int64), opened.origin.astype(np.int64))
+
+
+def _checked(V: FloatArray, F: IntArray) -> Edges:
+    """The edges of a connected surface, closed or not; `ValueError` for anything else."""
+    n = len(V)
+    everywhere = np.arange(n), np.zeros((n, 2))
+    if F.ndim != 2 or not F.size or F.min() < 0 or F.max() >= n:
+        Problem(V, F, *everywhere, reference="equilateral")
+    found = edges(F, n)
+    # A closed surface less one triangle has a boundary, and is a surface if the whole is.
+    closed = not (found.boundary.size or found.inconsistent.size or found.nonmanifold.size)
+    Problem(V, F[:-1] if closed else F, *everywhere, reference="equilateral")
+    return found
+
+
+def _long_path(V: FloatArray, interior: IntArray) -> list[int]:
+    """A shortest path along edges between two vertices that are far from each other, of two edges at least."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
+    n = len(V)
+    # No length is zero, which would be no edge at all.
+    lengths = np.maximum(np.linalg.norm(V[interior[:, 0]] - V[interior[:, 1]], axis=1), np.finfo(np.float64).tiny)
+    graph = csr_array((lengths, interior.T), shape=(n, n))
+    first = int(np.argmax(np.linalg.norm(V - V.mean(axis=0), axis=1)))
+    distance, before = dijkstra(graph, directed=False, indices=first, return_predecessors=True)
+    path = [int(np.argmax(distance))]
+    while path[-1] != first:
+        path.append(int(before[path[-1]]))
+    if len(path) == 2:
+        # Cutting one edge opens nothing; around a neighbour of both ends it does.
+        of_end = [set(interior[(interior == end).any(axis=1)].ravel().tolist()) for end in path]
+        path.insert(1, min((of_end[0] & of_end[1]) - set(path)))
+    return path

@@ -1,0 +1,83 @@
+"""Outlines from plain files of points."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textual import number, read_text
+from quasiharmonic.targets.contours import MOST_POINTS, distinct, nested, signed_area
+
+FloatArray = NDArray[np.float64]
+
+
+def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
+    """Read contours from a text file of points.
+
+    Parameters
+    ----------
+    path : str or path-like
+        One point a line: x and y between blanks, tabs, commas or semicolons. A blank line ends a
+        contour, ``#`` begins a comment, and the first line may be a heading, as ``x,y``. Contours are
+        closed by themselves; repeating the first point at the end does no harm.
+
+    Returns
+    -------
+    list of (k, 2) float64
+        The contours by decreasing area, outer ones counterclockwise and holes clockwise. Those that
+        run the right way begin with the file's first point.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for anything but two numbers on it, for a contour of fewer than three points or
+        without area, for an empty file and for one of more than a million points.
+    """
+    loops: list[list[tuple[float, float]]] = [[]]
+    starts, count = [0], 0
+    for line, raw in enumerate(read_text(path).split(b"\n"), 1):
+        text, comment, _ = raw.partition(b"#")
+        words = text.replace(b",", b" ").replace(b";", b" ").split()
+        if not words:
+            # A line that is nothing but a comment stands within a contour.
+            if loops[-1] and not comment:
+                loops.append([])
+                starts.append(line)
+            continue
+        if line == 1 and not any(map(_is_number, words)):
+            continue
+        if len(words) != 2:
+            raise MeshFileError(path, f"{len(words)} values in place of two, x and y,", line)
+        try:
+            x, y = map(number, words)
+        except ValueError as error:
+            raise MeshFileError(path, str(error), line) from None
+        if not loops[-1]:
+            starts[-1] = line
+        loops[-1].append((x, y))
+        count += 1
+        if count > MOST_POINTS:
+            raise MeshFileError(path, f"more than {MOST_POINTS:,} points", line, "thin them out")
+    contours = []
+    for loop, start in zip(loops, starts, strict=True):
+        if not loop:
+            continue
+        contour = distinct(np.array(loop), 0.0)
+        if len(contour) < 3 or signed_area(contour) == 0:
+            what = f"a contour of {len(contour)} different points that encloses no area begins"
+            raise MeshFileError(path, what, start, "blank lines separate contours, and nothing else")
+        contours.append(contour)
+    if not contours:
+        raise MeshFileError(path, "has no points")
+    return nested(contours)
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        number(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,111 @@
+"""Outlines named in a word, as on the command line: ``letter:G``, ``rect:2x1``, ``drawing.svg``."""
+
+from __future__ import annotations
+
+import math
+from os import PathLike, fspath
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.targets import outlines
+from quasiharmonic.targets.contours import MOST_POINTS
+from quasiharmonic.targets.glyphs import Font, letter, word
+from quasiharmonic.targets.polylines import read_polylines
+from quasiharmonic.targets.svg import read_svg
+
+FloatArray = NDArray[np.float64]
+
+FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
+_POINT_FILES = ".txt", ".csv"
+
+
+def outline(
+    specification: str | PathLike[str], *, font: Font | None = None, tolerance: float = 1e-6
+) -> list[FloatArray]:
+    """Make the outline that a few words or a file specify.
+
+    Parameters
+    ----------
+    specification : str or path
+        One of
+
+        - ``disk``, ``ellipse:2x1`` (half axes), ``ring:0.5`` (the unit disk around a hole of this radius);
+        - ``rect:2x1`` (width and height), ``polygon:6`` (corners), ``star:5`` (tips);
+        - ``letter:G``, ``word:QH`` (letters pushed into each other, which needs Shapely);
+        - the name of a drawing, ``.svg``, or of a file of points, ``.txt`` or ``.csv`` (see `read_svg`
+          and `read_polylines`).
+    font : str or path, optional
+        For letters and words, as `letter` takes it.
+    tolerance : float
+        How far contours may stray from curves: in units of the font size for letters and words, as a
+        share of the larger side for everything else.
+
+    Returns
+    -------
+    list of (k, 2) float64
+        The contours by decreasing area, outer ones counterclockwise and holes clockwise.
+
+    Raises
+    ------
+    ValueError, OSError, ModuleNotFoundError
+        When there is no such form or file, when numbers or letters are wrong, and as `letter`, `word`,
+        `read_svg` and `read_polylines` do.
+
+    Examples
+    --------
+    >>> [contour.tolist() for contour in outline("rect:2x1")]
+    [[[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]]]
+    """
+    text = fspath(specification)
+    name, colon, argument = text.partition(":")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"the tolerance is between 0 and 1, not {tolerance}")
+    if name in ("letter", "word") and colon:
+        return (letter if name == "letter" else word)(argument, font, tolerance=tolerance)
+    if font is not None:
+        raise ValueError(f"a font has no meaning for {text!r}, only for letter: and word:")
+    suffix = Path(text).suffix.lower()
+    if suffix == ".svg":
+        return read_svg(text, tolerance=tolerance)
+    if suffix in _POINT_FILES:
+        return read_polylines(text)
+    # A chord of a circle of diameter 1 with n of them strays by (π / n)² / 4.
+    points = min(MOST_POINTS, max(64, math.ceil(math.pi / math.sqrt(4 * tolerance))))
+    match name, colon:
+        case "disk", "":
+            return [outlines.disk(points=points)]
+        case "ellipse", ":":
+            return [outlines.ellipse(*_pair(text, argument), points=points)]
+        case "ring", ":":
+            return outlines.ring(_number(text, argument), points=points)
+        case "rect", ":":
+            return [outlines.rectangle(*_pair(text, argument))]
+        case "polygon", ":":
+            return [outlines.regular_polygon(_count(text, argument))]
+        case "star", ":":
+            return [outlines.star(_count(text, argument))]
+    raise ValueError(f"{text!r} is no outline that is known; there are {FORMS}")
+
+
+def _number(text: str, argument: str) -> float:
+    try:
+        return float(argument)
+    except ValueError:
+        raise ValueError(f"{text!r}: {argument!r} is not a number") from None
+
+
+def _pair(text: str, argument: str) -> tuple[float, float]:
+    parts = argument.lower().split("x")
+    if len(parts) != 2:
+        raise ValueError(f"{text!r}: two numbers with an x between them are needed, as in 2x1")
+    return _number(text, parts[0]), _number(text, parts[1])
+
+
+def _count(text: str, argument: str) -> int:
+    if not (argument.isascii() and argument.isdigit()):
+        raise ValueError(f"{text!r}: {argument!r} is not a whole number")
+    if len(argument) > 6 or int(argument) > MOST_POINTS // 2:
+        raise ValueError(f"{text!r}: {argument} is far too many")
+    return int(argument)

@@ -1,0 +1,406 @@
+"""Outlines from SVG drawings, files of points, and words that name an outline."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quasiharmonic import targets
+from quasiharmonic.targets.contours import flatten
+from quasiharmonic.targets.svgpath import parse_path
+
+AREA = targets.signed_area
+
+
+def drawing(body, attributes=""):
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {attributes}>{body}</svg>'
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Read a drawing given as text."""
+
+    def run(text, **options):
+        path = tmp_path / "drawing.svg"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return targets.read_svg(path, **options)
+
+    return run
+
+
+# --- path data
+
+
+def points(d):
+    """End points of all pieces, subpath by subpath."""
+    return [[tuple(pieces[0][0]), *(tuple(piece[-1]) for piece in pieces)] for pieces in parse_path(d)]
+
+
+@pytest.mark.parametrize(
+    ("d", "wanted"),
+    [
+        ("M1 2L3 4z", [[(1, 2), (3, 4), (1, 2)]]),
+        ("m1,2 3,4 5,6", [[(1, 2), (4, 6), (9, 12)]]),
+        ("M1 2 3 4 5 6", [[(1, 2), (3, 4), (5, 6)]]),
+        ("M0 0H5V7h-2v-3Z", [[(0, 0), (5, 0), (5, 7), (3, 7), (3, 4), (0, 0)]]),
+        ("M1 1l1 0zl0 1z", [[(1, 1), (2, 1), (1, 1)], [(1, 1), (1, 2), (1, 1)]]),
+        ("M1 1l1 0m5 5l1 1", [[(1, 1), (2, 1)], [(7, 6), (8, 7)]]),
+        ("M.5.5-1-1", [[(0.5, 0.5), (-1, -1)]]),
+        ("M1e1-2E-1L+3.,4", [[(10, -0.2), (3, 4)]]),
+        ("\n M 0 0 \t C 1 1, 2 2 ,3 3 ", [[(0, 0), (3, 3)]]),
+        ("M0 0", []),
+        ("", []),
+    ],
+)
+def test_path_commands(d, wanted):
+    assert points(d) == wanted
+
+
+def test_curves_and_their_smooth_continuations():
+    (pieces,) = parse_path("M0 0C0 1 1 2 2 2S4 1 4 0T5 0 6 0Q7 1 8 0t2 0")
+    assert [len(piece) - 1 for piece in pieces] == [3, 3, 2, 2, 2, 2]
+    assert pieces[1].tolist() == [[2, 2], [3, 2], [4, 1], [4, 0]]  # (1, 2) reflected in (2, 2)
+    assert pieces[2][1].tolist() == [4, 0]  # after a cubic there is nothing to reflect
+    assert pieces[3][1].tolist() == [6, 0]
+    assert pieces[5][1].tolist() == [9, -1]
+    (relative,) = parse_path("M0 0c0 1 1 2 2 2s2 -1 2 -2t1 0 1 0q1 1 2 0t2 0")
+    assert all(np.array_equal(a, b) for a, b in zip(pieces, relative, strict=True))
+
+
+@pytest.mark.parametrize("turn", [0, 30, -75])
+@pytest.mark.parametrize(("large", "sweep"), [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_arcs_lie_on_their_ellipse(turn, large, sweep):
+    """Of the two ellipses through both ends, and of its two arcs, the one that the flags choose."""
+    rx, ry, end = 3.0, 1.5, np.array([1.2, 1.7])
+    (pieces,) = parse_path(f"M0 0A{rx} {ry} {turn} {large} {sweep} {end[0]} {end[1]}")
+    arc = np.concatenate([flatten([piece], 1e-9) for piece in pieces])
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    circle = arc @ np.array([(c, -s), (s, c)]) / (rx, ry)
+    # The centre of the circle through the first, middle and last point.
+    a, b, d = circle[0], circle[len(circle) // 2], circle[-1]
+    centre = np.linalg.solve(2 * np.stack([b - a, d - a]), [b @ b - a @ a, d @ d - a @ a])
+    assert np.linalg.norm(circle - centre, axis=1) == pytest.approx(np.ones(len(circle)), abs=2e-7)
+    angle = np.unwrap(np.arctan2(*(circle - centre).T[::-1]))
+    assert (angle[-1] - angle[0] > 0) == bool(sweep)
+    assert (abs(angle[-1] - angle[0]) > np.pi) == bool(large)
+    assert arc[-1].tolist() == end.tolist()
+
+
+def test_odd_arcs():
+    # Radii too small grow until they reach; without a radius it is a line; to where the pen is, nothing.
+    (pieces,) = parse_path("M0 0A1 1 0 0 1 4 0")
+    half = np.concatenate([flatten([piece], 1e-9) for piece in pieces])
+    assert np.linalg.norm(half - (2, 0), axis=1) == pytest.approx(np.full(len(half), 2), abs=1e-6)
+    assert [len(piece) for piece in parse_path("M0 0A0 1 0 0 1 4 0")[0]] == [2]
+    assert parse_path("M1 1A1 1 0 0 1 1 1") == []
+    # Flags need nothing between them and what follows.
+    (packed,), (spaced,) = parse_path("M0 0a1 1 0 01.5.5"), parse_path("M0 0 a 1 1 0 0 1 0.5 0.5")
+    assert np.array_equal(packed, spaced)
+
+
+@pytest.mark.parametrize(
+    ("d", "message"),
+    [
+        ("L1 1", "begin with M at character 2"),
+        ("1 1", "a command is needed at character 1"),
+        ("M1", "a number is needed at character 3"),
+        ("M1 1L2", "a number is needed"),
+        ("M1 1z2 2", "a command is needed"),
+        ("M1 1Lx", "a number is needed at character 6 .*'M1 1Lx'"),
+        ("M1 1R2 2", "a command is needed at character 5"),
+        ("M0 0A1 1 0 2 0 1 1", "a flag, 0 or 1, is needed"),
+        ("M1,,1", "a number is needed"),
+        ("M1e999 0L1 1", "a number is too large"),
+        ("M0 0ſ1 1 2 2", "a command is needed"),
+    ],
+)
+def test_broken_path_data(d, message):
+    with pytest.raises(ValueError, match=message):
+        parse_path(d)
+
+
+# --- drawings
+
+
+@pytest.mark.parametrize(
+    ("body", "areas", "points"),
+    [
+        ('<rect x="1" y="2" width="3" height="4"/>', [12], 4),
+        ('<rect width="1in" height="2.54cm"/>', [96**2], 4),
+        ('<polygon points="0,0 4,0 4,3"/>', [6], 3),
+        ('<polyline points="0 0 4 0 4 3 0 3"/>', [12], 4),
+        ('<path d="M0 0h4v3h-4z"/>', [12], 4),
+        ('<path d="M0 0h4v3h-4"/>', [12], 4),
+        ('<path d="M0 0h9v9h-9zM1 1h2v2h-2zM5 5h3v3h-3z"/>', [81, -9, -4], 4),
+        ('<path d="M0 0h9v9h-9zM1 1h5v5h-5zM2 2h2v2h-2z"/>', [81, -25, 4], 4),
+        ('<circle r="2" cx="9" cy="9"/>', [4 * np.pi], None),
+        ('<ellipse rx="2" ry="1"/>', [2 * np.pi], None),
+        ('<rect width="4" height="3" rx="1"/>', [8 + np.pi], None),
+        ('<rect width="4" height="3" rx="9" ry="1"/>', [12 - (4 - np.pi) * 2], None),
+        ('<g transform="scale(2 3)"><rect width="1" height="1" transform="rotate(33)"/></g>', [6], 4),
+        ('<g><g transform="matrix(1 2 3 4 5 6)"><rect width="1" height="1"/></g></g>', [2], 4),
+        ('<rect width="1" height="1" transform="skewX(50),skewY(10)"/>', None, 4),
+        ('<svg x="5"><rect width="1" height="1"/></svg>', [1], 4),
+        ('<g display="none"><circle r="9"/></g><rect width="1" height="1"/>', [1], 4),
+        ('<g style="fill:red;display:none"><circle r="9"/></g><rect width="1" height="1"/>', [1], 4),
+        ('<defs><circle r="9"/></defs><title>x</title><rect width="1" height="1"><title>y</title></rect>', [1], 4),
+        ('<q:rect xmlns:q="urn:x" width="9" height="9"/><rect width="1" height="1"/>', [1], 4),
+        ('<path/><rect width="0" height="1"/><circle r="0"/><polygon/><rect width="1" height="1"/>', [1], 4),
+    ],
+)
+def test_shapes(read, body, areas, points):
+    contours = read(drawing(body))
+    if areas:
+        assert [AREA(c) for c in contours] == pytest.approx(areas, rel=1e-5)
+    if points:
+        assert len(contours[0]) == points
+
+
+def test_drawing_stands_as_it_looks(read):
+    (contour,) = read(drawing('<polygon points="0,0 10,0 0,5" transform="translate(1 2)"/>'))
+    assert {tuple(p) for p in contour} == {(1, -2), (11, -2), (1, -7)}
+
+
+def test_transforms_apply_from_right_to_left(read):
+    rect = '<rect width="2" height="1" transform="{}"/>'
+    together = rect.format("translate(3,4) rotate(90) scale(2)")
+    apart = f'<g transform="translate(3 4)"><g transform="rotate(90)">{rect.format("scale(2)")}</g></g>'
+    (one,), (other,) = read(drawing(together)), read(drawing(apart))
+    np.testing.assert_allclose(one, other, atol=1e-14)
+    assert sorted(map(tuple, one.round(12))) == [(1, -8), (1, -4), (3, -8), (3, -4)]
+    (about,) = read(drawing('<rect width="2" height="2" transform="rotate(45 1 1)"/>'))
+    assert about.mean(axis=0) == pytest.approx((1, -1))
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
+def test_tolerance(read, tolerance):
+    (contour,) = read(drawing('<circle r="50"/>'), tolerance=tolerance)
+    middle = (contour + np.roll(contour, -1, axis=0)) / 2
+    assert 0.01 * tolerance < (50 - np.linalg.norm(middle, axis=1).min()) / 100 <= 1.01 * tolerance
+    assert np.linalg.norm(contour, axis=1) == pytest.approx(np.full(len(contour), 50), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not well-formed XML"),
+        ("hello", "not well-formed XML: .* at line 1"),
+        ("<html></html>", "the root element is 'html' at line 1"),
+        ('<svg xmlns="urn:other"/>', "not an SVG drawing"),
+        (drawing("<g>"), "not well-formed XML: mismatched tag"),
+        (drawing(""), "draws no path or shape"),
+        (drawing('<path d="M0 0L1 1"/>'), "encloses an area"),
+        (drawing('<path d="M1 1C1 1 1 1 1 1"/>'), "encloses an area"),
+        (drawing('<path d="M0 0C1e-320 0 0 1e-320 0 0"/>'), "encloses an area"),
+        (drawing("\n\n<text>G</text>"), "a <text> has no outline .* at line 3; turn the text into paths"),
+        (drawing('<use href="#a"/>'), "a <use> has no outline"),
+        (drawing('\n<path d="M0 0L1"/>'), "<path>: path data: a number is needed at character 7 .* at line 2"),
+        (drawing('<rect width="-1" height="1"/>'), "width='-1' is out of range"),
+        (drawing('<rect width="50%" height="1"/>'), "width='50%' is not a length"),
+        (drawing('<circle r="1em"/>'), "r='1em' is not a length"),
+        (drawing('<g transform="spin(3)"/>'), "the transform 'spin\\(3\\)' is not understood"),
+        (drawing('<g transform="scale(1,2,3)"/>'), "is not understood"),
+        (drawing('<g transform="scale(1"/>'), "is not understood"),
+        (drawing('<g transform="scale(inf)"/>'), "is not understood"),
+        (drawing('<svg viewBox="0 0 1 1"/>'), "an inner <svg> with a viewBox"),
+        (drawing('<rect width="1e300" height="1e300" transform="scale(1e300)"/>'), "too large|encloses|infin"),
+        (drawing("<g>" * 300 + "</g>" * 300), "nested more than 200 deep"),
+        (b"\xff\xfe<\x00", "is UTF-16 text"),
+        (b"\x1f\x8b\x08", "compressed by gzip"),
+    ],
+)
+def test_broken_drawings(read, text, message):
+    with pytest.raises(ValueError, match=message):
+        read(text)
+
+
+def test_entity_bombs_and_files_outside(read, tmp_path):
+    lines = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "M0 0"}">' for i in range(12))
+    with pytest.raises(ValueError, match="declares the entity 'e0', and entities are not read at line 1"):
+        read(f"<!DOCTYPE svg [{lines}]>" + drawing('<path d="&e11;"/>'))
+    (tmp_path / "secret").write_text("M0 0h1v1z")
+    declared = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "{(tmp_path / "secret").as_uri()}">]>'
+    with pytest.raises(ValueError, match="declares the entity 'x'"):
+        read(declared + drawing("<g>&x;</g>"))
+    dtd = '<!DOCTYPE svg PUBLIC "-//W3C//DTD SVG 1.1//EN" "http://www.w3.org/Graphics/SVG/1.1/DTD/svg11.dtd">'
+    assert len(read(dtd + drawing('<rect width="1" height="1"/>'))) == 1
+
+
+def test_huge_drawings(read, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="more than 1,000,000 points"):
+        read(drawing('<path d="M0 0' + "c1 9 9 1 0 0" * 9000 + 'z"/>'), tolerance=1e-7)
+    monkeypatch.setattr("quasiharmonic.targets.svgpath.MOST_POINTS", 1000)
+    with pytest.raises(ValueError, match="more than 1,000 pieces"):
+        read(drawing('<path d="M0 0' + "h1v1" * 600 + '"/>'))
+    monkeypatch.setattr("quasiharmonic.targets.svg._MOST_BYTES", 1 << 20)
+    with pytest.raises(ValueError, match="larger than 1 MiB; simplify"):
+        read(drawing(" " * (1 << 20)))
+    with pytest.raises(ValueError, match="tolerance is a share"):
+        read(drawing(""), tolerance=0)
+    with pytest.raises(ValueError, match="there is no such file"):
+        targets.read_svg(tmp_path / "none.svg")
+
+
+SAMPLE = drawing(
+    '<g transform="rotate(9) scale(2,1)"><path d="M1 2c3-4 5.5.5 6 6S7 8 9 9a4 3 20 01 5 1z"/>'
+    '<rect x="30" width="4" height="2" rx=".5"/><circle r="1mm" cx="40"/></g>'
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, len(SAMPLE)), st.integers(0, 6), st.text(max_size=5)), max_size=4))
+def test_damaged_drawings_are_read_or_refused(tmp_path_factory, edits):
+    text = SAMPLE
+    for at, cut, put in edits:
+        text = text[:at] + put + text[at + cut :]
+    path = tmp_path_factory.getbasetemp() / "damaged.svg"
+    path.write_text(text, encoding="utf-8", errors="replace", newline="")
+    try:
+        contours = targets.read_svg(path, tolerance=1e-3)
+    except ValueError:
+        return
+    assert all(np.isfinite(c).all() and len(c) > 2 for c in contours)
+
+
+# --- files of points
+
+
+@pytest.mark.parametrize(
+    ("text", "areas"),
+    [
+        ("0 0\n4 0\n4 3\n0 3\n", [12]),
+        ("0,0\n0,3\n4,3\n4,0", [12]),
+        ("x;y\n0;0\n4;0\n4;3\n", [6]),
+        (
+            "# a frame\n0 0\n# here\n9 0\n9 9 # there\n0 9\n0 0\n\n\n\t1 1\r\n2 1\r\n2 2\r\n\n5 5\n7 5\n7 7\n",
+            [81, -2, -0.5],
+        ),
+        ("1e-3 -2E+1\n+.5 1.\n3 3\n", None),
+    ],
+)
+def test_files_of_points(tmp_path, text, areas):
+    path = tmp_path / "outline.csv"
+    path.write_text(text, newline="")
+    contours = targets.read_polylines(path)
+    if areas:
+        assert [AREA(c) for c in contours] == pytest.approx(areas)
+
+
+def test_first_point_stays_first(tmp_path):
+    for text in ("1 0\n1 1\n0 0\n", "1 0\n0 0\n1 1\n"):
+        (tmp_path / "outline.txt").write_text(text)
+        assert targets.read_polylines(tmp_path / "outline.txt")[0].tolist() == [[1, 0], [1, 1], [0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has no points"),
+        ("# nothing\n", "has no points"),
+        ("0 0\n1 0 0\n1 1\n", "3 values in place of two, x and y, at line 2"),
+        ("0 0\n1\n1 1\n", "1 values in place of two"),
+        ("0 0\n1 a\n1 1\n", "'a' is not a finite number at line 2"),
+        ("0 0\n1 nan\n1 1\n", "'nan' is not a finite number"),
+        ("a b\nc d\n", "'c' is not a finite number at line 2"),
+        ("0 0\n1 0\n\n1 1\n", "2 different points that encloses no area begins at line 1; blank lines separate"),
+        ("0 0\n1 0\n1 1\n\n\n5 5\n6 6\n7 7\n", "encloses no area begins at line 6"),
+        ("0 0\n0 0\n0 0\n", "a contour of 1 different points"),
+    ],
+)
+def test_broken_files_of_points(tmp_path, text, message):
+    (tmp_path / "outline.txt").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        targets.read_polylines(tmp_path / "outline.txt")
+
+
+def test_too_many_points(tmp_path, monkeypatch):
+    monkeypatch.setattr("quasiharmonic.targets.polylines.MOST_POINTS", 3)
+    (tmp_path / "outline.txt").write_text("0 0\n1 0\n1 1\n0 1\n")
+    with pytest.raises(ValueError, match="more than 3 points at line 4; thin them out"):
+        targets.read_polylines(tmp_path / "outline.txt")
+
+
+# --- in a word
+
+
+@pytest.mark.parametrize(
+    ("text", "areas", "points"),
+    [
+        ("disk", [np.pi], None),
+        ("ellipse:2x0.5", [np.pi], None),
+        ("rect:2x1", [2], 4),
+        ("rect:3X.5", [1.5], 4),
+        ("polygon:6", [1.5 * np.sqrt(3)], 6),
+        ("star:5", [2.5 * np.sin(np.pi / 5)], 10),
+        ("ring:0.5", [np.pi, -np.pi / 4], None),
+        ("letter:H", [0.3135], 12),
+        ("letter:8", [0.3587, -0.0399, -0.0275], None),
+        ("letter::", [0.0333, 0.0333], 4),
+    ],
+)
+def test_outlines_in_a_word(text, areas, points):
+    contours = targets.outline(text)
+    assert [AREA(c) for c in contours] == pytest.approx(areas, rel=2e-3)
+    if points:
+        assert len(contours[0]) == points
+
+
+def test_tolerance_of_round_outlines():
+    for text, size in (("disk", 2), ("ellipse:3x3", 6), ("ring:0.5", 2)):
+        contour = targets.outline(text, tolerance=1e-4)[0]
+        middle = np.linalg.norm(contour + np.roll(contour, -1, axis=0), axis=1) / 2
+        assert 0.5e-4 < (size / 2 - middle.min()) / size <= 1.0001e-4
+    assert len(targets.outline("letter:S", tolerance=1e-6)[0]) > 10 * len(targets.letter("S")[0])
+
+
+def test_outline_files(tmp_path):
+    (tmp_path / "a.SVG").write_text(drawing('<rect width="2" height="1"/>'))
+    (tmp_path / "b.txt").write_text("0 0\n1 0\n1 1\n")
+    assert AREA(targets.outline(tmp_path / "a.SVG")[0]) == 2
+    assert AREA(targets.outline(str(tmp_path / "b.txt"))[0]) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lettr:G", "'lettr:G' is no outline that is known; there are disk, "),
+        ("disk:3", "is no outline that is known"),
+        ("rect", "is no outline that is known"),
+        ("drawing.pdf", "is no outline that is known"),
+        ("", "'' is no outline"),
+        ("rect:2", "'rect:2': two numbers with an x between them are needed, as in 2x1"),
+        ("rect:2xa", "'a' is not a number"),
+        ("rect:0x1", "width must be positive"),
+        ("ellipse:1xinf", "b must be positive and finite"),
+        ("polygon:2", "at least 3 points"),
+        ("polygon:six", "'six' is not a whole number"),
+        ("polygon:-3", "'-3' is not a whole number"),
+        ("star:9999999", "9999999 is far too many"),
+        ("ring:1", "between 0 and 1, not 1.0"),
+        ("letter:", "one character, not of ''"),
+        ("letter:GG", "one character, not of 'GG'"),
+        ("none.svg", "there is no such file"),
+        ("none.txt", "there is no such file"),
+    ],
+)
+def test_words_that_name_no_outline(text, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        targets.outline(text)
+
+
+def test_options_of_outlines():
+    with pytest.raises(ValueError, match="a font has no meaning for 'disk'"):
+        targets.outline("disk", font="DejaVu Sans")
+    with pytest.raises(ValueError, match="the tolerance is between 0 and 1"):
+        targets.outline("disk", tolerance=0)
+
+
+def test_the_command_lists_what_the_library_knows():
+    from quasiharmonic.cli.targets import FORMS
+    from quasiharmonic.targets import specification
+
+    assert FORMS == specification.FORMS

@@ -1,0 +1,617 @@
+"""Boundaries laid along outlines, and ``qhm map --to``."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from meshes import lift
+from quasiharmonic import Problem, cut_open, diagnose, injective_map, io, refine, surfaces, targets
+from quasiharmonic.cli import main
+from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.targets import boundary_to, flattened_edges, outline
+from quasiharmonic.targets.correspondence import arc, spread
+from quasiharmonic.targets.holes import least_stretch
+from quasiharmonic.targets.room import _choose, _reach, _Room, make_room
+from test_cli import CASES
+
+
+def holed(n, *holes, seed=0):
+    """A disk, curved, without the triangles whose middles lie in some circles (x, y, radius)."""
+    V, F = surfaces.random_delaunay(n, seed)
+    middle = V[F].mean(axis=1)
+    solid = np.ones(len(F), dtype=bool)
+    for x, y, radius in holes:
+        solid &= np.hypot(*(middle - (x, y)).T) > radius
+    used, F = np.unique(F[solid], return_inverse=True)
+    V, F = surfaces.refine(V[used], F.reshape(-1, 3))
+    return lift(V), F
+
+
+def plain_grid(nx, ny):
+    """A grid whose diagonals all rise to the right, with ears at two of its corners."""
+    x, y = np.meshgrid(np.arange(nx + 1.0), np.arange(ny + 1.0))
+    j, i = np.divmod(np.arange(nx * ny), nx)
+    low = i + j * (nx + 1)
+    corners = np.stack([low, low + 1, low + nx + 2, low, low + nx + 2, low + nx + 1], axis=1)
+    return np.stack([x.ravel(), y.ravel()], axis=1), corners.reshape(-1, 3)
+
+
+def placed(V, F, *arguments, **options):
+    fixed, target = boundary_to(V, F, *arguments, **options)
+    where = np.full((len(V), 2), np.nan)
+    where[fixed] = target
+    return where
+
+
+def torus(n=24, m=12):
+    a, b = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
+    u, v = a.ravel() * 2 * np.pi / n, b.ravel() * 2 * np.pi / m
+    V = np.stack([(2 + np.cos(v)) * np.cos(u), (2 + np.cos(v)) * np.sin(u), np.sin(v)], axis=1)
+    at = lambda i, j: (i % n) * m + j % m  # noqa: E731
+    a, b = a.ravel(), b.ravel()
+    F = [
+        np.stack([at(a, b), at(a + 1, b), at(a + 1, b + 1)], 1),
+        np.stack([at(a, b), at(a + 1, b + 1), at(a, b + 1)], 1),
+    ]
+    return V, np.concatenate(F)
+
+
+def octahedron():
+    V = np.concatenate([np.eye(3), -np.eye(3)])
+    F = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    V, F = surfaces.refine(V, F)
+    return V / np.linalg.norm(V, axis=1)[:, None], F
+
+
+# --- one loop
+
+
+@pytest.mark.parametrize("text", ["disk", "rect:2x1", "star:5", "letter:G", "letter:H"])
+def test_corners_are_met_and_the_rest_lies_on_the_outline(text):
+    V, F = surfaces.cat(16)
+    (contour,) = outline(text)
+    fixed, target = boundary_to(V, F, [contour])
+    assert sorted(fixed.tolist()) == sorted(boundary_loops(F, len(V))[0].tolist())
+    sharp = targets.contours.corners(contour, 20)
+    assert all((target == contour[k]).all(axis=1).sum() == 1 for k in sharp)
+    side = np.roll(contour, -1, axis=0) - contour
+    for point in target:
+        share = np.clip(((point - contour) * side).sum(axis=1) / (side**2).sum(axis=1), 0, 1)
+        assert np.linalg.norm(contour + share[:, None] * side - point, axis=1).min() < 1e-12
+    assert targets.signed_area(target) > 0
+    assert injective_map(V, F, fixed, target).certificate.bijective
+
+
+def test_same_places_as_arc_length_where_nothing_is_in_the_way():
+    V, F = surfaces.cat(16)
+    (loop,) = boundary_loops(F, len(V))
+    for contour in (targets.rectangle(2, 1), targets.letter("G")[0]):
+        # From a corner on, as the outline may begin in the middle of a side.
+        first = targets.contours.from_corner(contour, 20)
+        np.testing.assert_allclose(boundary_to(V, F, contour)[1], targets.arc_length(V[loop], first), atol=1e-12)
+
+
+def test_wound_either_way_and_single_or_listed():
+    V, F = surfaces.cat(10)
+    square = targets.rectangle(1, 1)
+    wanted = boundary_to(V, F, square)
+    for other in ([square], (square.tolist(),), square[[0, 3, 2, 1]], square.astype(np.float32)):
+        fixed, target = boundary_to(V, F, other)
+        assert np.array_equal(fixed, wanted[0])
+        assert np.array_equal(target, wanted[1])
+
+
+def test_scale_and_place_of_the_surface_do_not_matter():
+    V, F = holed(150, (0.1, 0.2, 0.3))
+    wanted = boundary_to(V, F, outline("letter:R"))[1]
+    for other in (V * 1e-200, V * 1e150, V + np.array([1e3, -1e3, 0])):
+        np.testing.assert_allclose(boundary_to(other, F, outline("letter:R"))[1], wanted, atol=1e-6)
+
+
+def test_clockwise_planar_mesh_is_mirrored():
+    V, F = surfaces.grid(6, 4)
+    where = placed(V, F[:, ::-1], targets.rectangle(1, 1))
+    np.testing.assert_allclose(where[[0, 6, 34, 28]], [(1, 0), (0, 0), (0, 1), (1, 1)], atol=1e-12)
+
+
+# --- chosen corners
+
+
+@pytest.fixture
+def cat():
+    V, F = surfaces.cat(12)
+    return V, F, boundary_loops(F, len(V))[0]
+
+
+def test_corners_in_order(cat):
+    V, F, loop = cat
+    chosen = loop[[5, 20, 41, 66]]
+    where = placed(V, F, targets.rectangle(2, 1), corners=chosen)
+    assert where[chosen].tolist() == [[0, 0], [2, 0], [2, 1], [0, 1]]
+    # Every run of the boundary is spread over its own side, by length.
+    for (i, j), (axis, side) in zip([(5, 20), (20, 41), (41, 66)], [(1, 0), (0, 2), (1, 1)], strict=True):
+        run = loop[i : j + 1]
+        assert (where[run, axis] == side).all()
+        lengths = np.linalg.norm(np.diff(V[run], axis=0), axis=1)
+        steps = np.linalg.norm(np.diff(where[run], axis=0), axis=1)
+        np.testing.assert_allclose(steps / steps.sum(), lengths / lengths.sum(), rtol=1e-9)
+    assert injective_map(V, F, *boundary_to(V, F, targets.rectangle(2, 1), corners=chosen)).injective
+
+
+def test_corners_by_number_and_by_point(cat):
+    V, F, loop = cat
+    a, b, c = loop[[5, 20, 41]].tolist()
+    where = placed(V, F, targets.rectangle(2, 1), corners={a: 2, b: (0.25, 1), c: np.array([0, 1 + 1e-9])})
+    assert where[[a, c]].tolist() == [[2, 1], [0, 1]]
+    assert where[b] == pytest.approx((0.25, 1), abs=1e-14)
+    assert sum((where == corner).all(axis=1).any() for corner in targets.rectangle(2, 1)) == 4
+    # One vertex on an outline without corners: its first point.
+    assert placed(V, F, targets.disk(), corners=[a])[a].tolist() == [1, 0]
+
+
+def test_few_vertices_between_chosen_corners(cat):
+    V, F, loop = cat
+    star = targets.star(4)
+    where = placed(V, F, star, corners={int(loop[0]): 0, int(loop[4]): 4})
+    assert where[loop[:5]].tolist() == star[:5].tolist()
+    with pytest.raises(ValueError, match=f"2 boundary vertices between {loop[0]} and {loop[3]}, too few to keep the 3"):
+        boundary_to(V, F, star, corners={int(loop[0]): 0, int(loop[3]): 4})
+
+
+@pytest.mark.parametrize(
+    ("corners", "message"),
+    [
+        ([5, 20, 66, 41], "vertices 405, 420, 466, 441 follow each other .* but in the order 405, 420, 441, 466"),
+        ([5, 20, 41], "3 corner vertices for a contour with 4 corners: name one for each"),
+        ([5, 20, 41, -3], "vertex 394 in corners, but not on the boundary"),
+        ([5, 20, 41, 5], "corners name vertex 405 more than once"),
+        ([], "corners must name boundary vertices"),
+        ({5: 4}, "vertex 405 goes to corner 4, but the contour has corners 0 to 3"),
+        ({5: (0.5, 0.5)}, r"vertex 405 goes to \(0.5, 0.5\), 0.5 off the outline at \(0.5, 0\)"),
+        ({5: (0.5, np.nan)}, "vertex 405 goes to a corner's number or a point"),
+        ({5: "x"}, "could not convert string"),
+        ({5: 0, 9: (0, 0)}, "vertices 405 and 409 go to the same place"),
+    ],
+)
+def test_corners_that_cannot_be(cat, corners, message):
+    V, F, loop = cat
+    number = lambda k: int(loop[k]) if k >= 0 else int(loop.min()) + k  # noqa: E731
+    assert loop[0] == 397
+    message = message.replace("394", str(number(-3)))
+    for k in (5, 9, 20, 41, 66):
+        message = message.replace(f"4{k:02}", str(number(k)))
+    named = {number(k): v for k, v in corners.items()} if isinstance(corners, dict) else [number(k) for k in corners]
+    with pytest.raises(ValueError, match=message):
+        boundary_to(V, F, targets.rectangle(2, 1), corners=named)
+
+
+# --- room for chords
+
+
+def test_corners_go_to_ears():
+    """The two triangles at corners of the grid fit only where the rectangle has corners, however it is turned."""
+    V, F = plain_grid(7, 5)
+    for turn in (0.0, 0.3, 2.0, 4.0):
+        turned = V @ np.array([(np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))])
+        for text in ("rect:2x1", "polygon:3", "letter:H"):
+            fixed, target = boundary_to(turned, F, outline(text))
+            assert len(flattened_edges(F, fixed, target)) == 0
+            assert injective_map(turned, F, fixed, target).injective
+
+
+def brute_force(along, wanted, room):
+    count = len(along) - 1
+    best = np.inf, None
+    for chosen in itertools.combinations(range(1, count), len(wanted)):
+        ends = [0, *chosen, count]
+        sides = list(zip(itertools.pairwise(ends), room.straight, room.spare, strict=True))
+        if any(b - a <= spare or (straight and room.reach[a] <= b) for (a, b), straight, spare in sides):
+            continue
+        best = min(best, (float(((along[list(chosen)] - wanted) ** 2).sum()), chosen))
+    return best
+
+
+def test_room_is_made_at_the_least_cost(rng):
+    solved = 0
+    for _ in range(300):
+        count, k = int(rng.integers(3, 12)), int(rng.integers(0, 4))
+        along = np.concatenate([[0], np.sort(rng.random(count - 1)), [1]])
+        wanted = np.sort(rng.random(k))
+        reach = np.minimum.accumulate(rng.integers(2, 8, count + 1)[::-1] + np.arange(count, -1, -1))[::-1]
+        room = _Room(np.minimum(reach, count + 1), rng.random(k + 1) < 0.7, rng.integers(0, 3, k + 1))
+        cost, chosen = brute_force(along, wanted, room)
+        found = _choose(along, wanted, room)
+        assert (found is None) == (chosen is None)
+        if found is not None:
+            solved += 1
+            assert ((along[found] - wanted) ** 2).sum() == pytest.approx(cost)
+    assert 50 < solved < 250
+
+
+def test_chords_across_a_pin_are_left_alone():
+    s = np.arange(12) / 12
+    square = targets.rectangle(1, 1)
+    chords = np.array([[11, 1], [4, 6]])
+    pins = make_room(s, square, [(0, 0.0)], corner_angle=20, chords=chords)
+    assert pins is not None
+    assert dict(pins)[5] in (0.25, 0.5)
+    assert make_room(s, square, [(5, 0.6)], corner_angle=20, chords=np.array([[4, 6], [7, 9]])) is not None
+    # More ears than corners.
+    ears = np.stack([np.arange(1, 11, 2) - 1, np.arange(1, 11, 2) + 1], axis=1)
+    assert make_room(s, square, [(0, 0.0)], corner_angle=20, chords=ears) is None
+    stretch = next(targets.correspondence.stretches(s, [(2, 0.0)]))
+    assert _reach(stretch, np.array([[3, 6], [1, 11]]), 12).tolist() == [
+        4,
+        4,
+        11,
+        11,
+        11,
+        11,
+        11,
+        11,
+        11,
+        11,
+        13,
+        13,
+        13,
+    ]
+
+
+def test_flattened_edges_are_named_and_splitting_them_helps():
+    V, F = plain_grid(4, 4)
+    fixed = boundary_loops(F, len(V))[0]
+    start = int(np.flatnonzero(fixed == 2)[0])
+    target = targets.arc_length(V[fixed], targets.rectangle(1, 1), start=start)
+    flat = flattened_edges(F, fixed, target)
+    # The square's corners come to the middles of the grid's sides, and both ears lie on a side.
+    assert flat.tolist() == [[3, 9], [15, 21]]
+    assert not injective_map(V, F, fixed, target).injective
+    refined = refine(V, F, flat)
+    assert len(flattened_edges(refined.F, fixed, target)) == 0
+    assert injective_map(refined.V, refined.F, fixed, target).injective
+
+
+def test_flattened_edges_agree_with_the_exact_diagnosis():
+    """On coordinates that round nothing, an edge is flat where the diagnosis finds no room beside it."""
+    V, F = plain_grid(4, 4)
+    (loop,) = boundary_loops(F, len(V))
+    found = []
+    for contour in (targets.rectangle(4, 4), np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 4), (0, 4)])):
+        for start in range(16):
+            target = targets.arc_length(V[loop], contour, start=start)
+            assert (target % 1 == 0).all()
+            flat = flattened_edges(F, loop, target).tolist()
+            assert flat == diagnose(Problem(V, F, loop, target)).split.tolist()
+            found.append(len(flat))
+    assert set(found) == {0, 1, 2}
+
+
+# --- several loops
+
+
+@pytest.mark.parametrize(
+    ("text", "holes"),
+    [
+        ("ring:0.4", [(0.4, 0, 0.25)]),
+        ("letter:R", [(0.1, 0.3, 0.2)]),
+        ("letter:A", [(0, -0.4, 0.2)]),
+        ("letter:B", [(0, 0.5, 0.15), (0.1, -0.4, 0.2)]),
+        ("letter:8", [(-0.5, 0, 0.15), (0.5, 0, 0.15)]),
+    ],
+)
+def test_holes(text, holes):
+    V, F = holed(250, *holes)
+    contours = outline(text)
+    fixed, target = boundary_to(V, F, contours)
+    assert len(fixed) == len(np.unique(edges(F, len(V)).boundary))
+    split = flattened_edges(F, fixed, target)
+    refined = refine(V, F, split)
+    result = injective_map(refined.V, refined.F, fixed, target)
+    assert result.injective
+    assert result.certificate.bijective
+
+
+def test_holes_go_to_the_nearest():
+    centres = np.array([(-0.5, -0.4), (0.5, -0.4), (0.0, 0.55)])
+    V, F = holed(600, *((x, y, 0.12) for x, y in centres))
+    square = targets.rectangle(0.2, 0.2) - 0.1
+    contours = [targets.disk(), *(square + 0.9 * c for c in np.roll(centres, 1, axis=0))]
+    where = placed(V, F, contours)
+    for loop in boundary_loops(F, len(V)):
+        middle = V[loop, :2].mean(axis=0)
+        if len(loop) < 60:
+            near = np.argmin(np.linalg.norm(centres - middle, axis=1))
+            assert where[loop].mean(axis=0) == pytest.approx(0.9 * centres[near], abs=0.05)
+
+
+def test_holes_are_turned_for_the_least_energy():
+    """Against the Dirichlet energy of Tutte's embedding itself, over all combinations of a few turns."""
+    from quasiharmonic import quasi_harmonic_map
+
+    V, F = holed(150, (-0.45, 0.1, 0.2), (0.4, 0.2, 0.2), seed=1)
+    fixed = np.concatenate(boundary_loops(F, len(V)))
+    problem = Problem(V, F, fixed, V[fixed, :2])
+    outer = int(np.argmax([len(loop) for loop in problem.loops]))
+    inner = [i for i in range(3) if i != outer]
+    square = targets.rectangle(0.4, 0.4)[::-1] - 0.2
+    given = {outer: targets.arc_length(V[problem.loops[outer]], targets.disk())}
+    choices = {}
+    for i, x in zip(inner, (0.5, -0.4), strict=True):
+        s = arc(V[problem.loops[i]])
+        starts = range(0, len(s), max(1, len(s) // 8))
+        choices[i] = [spread(s, square + np.array([x, 0.1]), [(k, 0.0)], corner_angle=20) for k in starts]
+
+    def energy(places):
+        uv = quasi_harmonic_map(problem.moved(np.concatenate([places[i] for i in range(3)])))
+        sides = uv[F] - uv[np.roll(F, -1, axis=1)]
+        return float((sides**2).sum())
+
+    every = {
+        ks: energy(given | {i: choices[i][k] for i, k in zip(inner, ks, strict=True)})
+        for ks in itertools.product(*(range(len(choices[i])) for i in inner))
+    }
+    chosen = energy(given | least_stretch(problem, given, choices))
+    low, high = min(every.values()), max(every.values())
+    assert chosen <= low + 0.01 * (high - low)
+
+
+def test_a_point_says_which_loop_goes_where():
+    """Turned inside out: the vertex of the hole goes to the outer circle."""
+    V, F = surfaces.annulus(8)
+    outer, inner = (int(loop[0]) for loop in boundary_loops(F, len(V)))
+    circles = targets.ring(0.5)
+    assert np.linalg.norm(placed(V, F, circles)[outer]) == pytest.approx(1)
+    where = placed(V, F, circles, corners={inner: (1, 0)})
+    assert where[inner].tolist() == [1, 0]
+    assert np.linalg.norm(where[outer]) == pytest.approx(0.5, rel=1e-3)
+    with pytest.raises(ValueError, match="two boundary loops have vertices that go to the same contour"):
+        boundary_to(V, F, circles, corners={inner: (1, 0), outer: (0, 1)})
+    with pytest.raises(ValueError, match="goes to another contour than others of its boundary loop"):
+        boundary_to(V, F, circles, corners={inner: (1, 0), inner + 1: (0.5, 0)})
+    with pytest.raises(ValueError, match="those of one boundary loop, but 2 loops have some"):
+        boundary_to(V, F, circles, corners=[inner, outer])
+
+
+# --- what does not fit
+
+
+@pytest.mark.parametrize(
+    ("mesh", "text", "message"),
+    [
+        (
+            surfaces.disk(4),
+            "letter:B",
+            "1 boundary loop, and the outline 3 contours .2 holes.: fill the outline's holes",
+        ),
+        (
+            surfaces.annulus(4),
+            "letter:B",
+            r"2 boundary loops, and the outline 3 contours \(2 holes\): choose .* 1 hole",
+        ),
+        (
+            surfaces.annulus(4),
+            "disk",
+            "2 boundary loops, and the outline 1 contour .no hole.: choose .* 1 hole, or close",
+        ),
+        (
+            surfaces.disk(4),
+            "letter:i",
+            "the outline is in 2 separate pieces, and a connected surface can fill",
+        ),
+        (torus(), "disk", r"the surface is closed: .* cut it open first \(cut_open; qhm map --cut\)"),
+        (octahedron(), "disk", "the surface is closed"),
+        ((torus()[0], torus()[1][1:]), "disk", "the surface has a handle and fits into no outline: cut it open"),
+        (surfaces.disk(1), "letter:H", "the loop has 6 vertices, too few to keep the 12 corners"),
+    ],
+)
+def test_surfaces_that_do_not_fit(mesh, text, message):
+    with pytest.raises(ValueError, match=message):
+        boundary_to(*mesh, outline(text))
+
+
+def test_malformed_meshes_are_the_problems_business():
+    V, F = surfaces.disk(3)
+    with pytest.raises(ValueError, match=r"more than two triangles|repeated"):
+        boundary_to(V, np.vstack([F, F[3]]), outline("disk"))
+    with pytest.raises(ValueError, match="2 components"):
+        boundary_to(np.vstack([V, V]), np.vstack([F, F + len(V)]), outline("disk"))
+    with pytest.raises(ValueError, match="refers to vertex 99"):
+        boundary_to(V, np.vstack([F, [0, 1, 99]]), outline("disk"))
+
+
+# --- cut open
+
+
+@pytest.mark.parametrize("mesh", [torus(), (torus()[0], torus()[1][1:]), octahedron(), surfaces.annulus(6)])
+def test_cut_open(mesh):
+    pytest.importorskip("igl")
+    V, F = mesh
+    opened = cut_open(V, F)
+    assert len(boundary_loops(opened.F, len(opened.V))) == 1
+    assert np.array_equal(opened.origin[: len(V)], np.arange(len(V)))
+    assert np.array_equal(opened.origin[opened.F], F)
+    assert np.array_equal(opened.V, V[opened.origin])
+    assert injective_map(opened.V, opened.F, *boundary_to(opened.V, opened.F, outline("disk"))).injective
+
+
+def test_cut_open_tetrahedron():
+    """No two of its vertices are further apart than one edge, and cutting one edge opens nothing."""
+    pytest.importorskip("igl")
+    V, F = np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    opened = cut_open(V, F)
+    assert len(boundary_loops(opened.F, len(opened.V))[0]) == 4
+
+
+def test_what_cannot_be_cut_open(monkeypatch):
+    pytest.importorskip("igl")
+    V, F = surfaces.disk(3)
+    with pytest.raises(ValueError, match="a disk already"):
+        cut_open(V, F)
+    with pytest.raises(ValueError, match="refers to vertex 99"):
+        cut_open(V, np.vstack([F, [0, 1, 99]]))
+    V, F = octahedron()
+    with pytest.raises(ValueError, match="2 components"):
+        cut_open(np.vstack([V, V]), np.vstack([F, F + len(V)]))
+    with pytest.raises(ValueError, match=r"repeated|more than two"):
+        cut_open(V, np.vstack([F, F[:1]]))
+    monkeypatch.setitem(__import__("sys").modules, "igl", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs libigl: pip install 'quasiharmonic\[cut\]'"):
+        cut_open(V, F)
+
+
+# --- the command
+
+
+@pytest.fixture
+def qhm(tmp_path, capsys):
+    """Write a mesh without vt, map it, and hand back status, report and what was said."""
+
+    def run(mesh, *options):
+        io.write_obj(tmp_path / "in.obj", io.MeshData(*mesh))
+        report = tmp_path / "report.json"
+        report.unlink(missing_ok=True)
+        status = main(
+            ["map", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj"), "--json", str(report), *options]
+        )
+        said = capsys.readouterr()
+        return status, json.loads(report.read_text()) if report.exists() else None, said.out + said.err
+
+    run.out = tmp_path / "out.obj"
+    return run
+
+
+@pytest.mark.parametrize("text", ["disk", "letter:G", "rect:2x1", "star:5"])
+def test_to(qhm, text):
+    V, F = surfaces.cat(12)
+    status, facts, _ = qhm((V, F), "--to", text)
+    assert status == 0
+    assert facts["injective"]
+    assert facts["to"] == text
+    written = io.read_mesh(qhm.out)
+    assert np.array_equal(written.F, F)
+    fixed, target = boundary_to(V, F, outline(text))
+    assert np.array_equal(io.map_of(written)[fixed], target)
+
+
+def test_to_files(qhm, tmp_path):
+    (tmp_path / "o.svg").write_text('<svg><path d="M0 0h4v3h-4zm1 1h1v1h-1z" fill-rule="evenodd"/></svg>')
+    (tmp_path / "o.txt").write_text("0 0\n4 0\n4 3\n0 3\n\n1 1\n2 1\n2 2\n1 2\n")
+    for name in ("o.svg", "o.txt"):
+        status, facts, _ = qhm(surfaces.annulus(8), "--to", str(tmp_path / name))
+        assert status == 0
+        assert facts["bijective"]
+
+
+def test_to_with_corners(qhm):
+    V, F = surfaces.cat(12)
+    loop = boundary_loops(F, len(V))[0].tolist()
+    a, b, c, d = (loop[k] for k in (5, 20, 41, 66))
+    assert qhm((V, F), "--to", "rect:2x1", "--corners", f"{a},{b},{c},{d}")[0] == 0
+    assert io.map_of(io.read_mesh(qhm.out))[[a, b, c, d]].tolist() == [[0, 0], [2, 0], [2, 1], [0, 1]]
+    assert qhm((V, F), "--to", "rect:2x1", "--corners", f"{a}:1,{b}:1.5:1")[0] == 0
+    assert io.map_of(io.read_mesh(qhm.out))[[a, b]].tolist() == [[2, 0], [1.5, 1]]
+
+
+def test_holes_that_the_surface_does_not_have_are_filled(qhm):
+    status, facts, said = qhm(surfaces.cat(12), "--to", "letter:B", "--font", "DejaVu Sans")
+    assert status == 0
+    assert facts["filled_holes"] == 2
+    assert "the surface has no hole, so the 2 holes of letter:B are filled" in said
+
+
+def test_to_a_word(qhm):
+    pytest.importorskip("shapely")
+    assert qhm(surfaces.cat(20), "--to", "word:QH")[0] == 0
+
+
+def test_refusal_and_refinement(qhm):
+    V, F = surfaces.disk(2)
+    ring = np.arange(len(V) - 12, len(V))
+    # A triangle on every boundary edge.
+    tips = 1.2 * (V[ring] + V[np.roll(ring, -1)]) / 2
+    ears = np.stack([np.roll(ring, -1), ring, len(V) + np.arange(12)], axis=1)
+    V, F = np.vstack([V, tips]), np.vstack([F, ears])
+    status, _, said = qhm((V, F), "--to", "rect:2x1")
+    assert status == 2
+    assert "boundary vertices between which rect:2x1 does not bend outwards" in said
+    assert "--refine" in said
+    assert not qhm.out.exists()
+    status, facts, said = qhm((V, F), "--to", "rect:2x1", "--refine")
+    assert status == 0
+    assert facts["added_vertices"] >= 8
+    assert f"split {facts['added_vertices']} edges" in said
+    written = io.read_mesh(qhm.out)
+    assert np.array_equal(written.V[: len(V), :2], V)
+    assert len(written.V) == len(V) + facts["added_vertices"] == facts["vertices"]
+
+
+def test_refine_without_to(tmp_path, capsys):
+    """It does for positions in the file what it does for an outline."""
+    V, F = plain_grid(4, 4)
+    fixed = boundary_loops(F, len(V))[0]
+    uv = np.full((len(V), 2), 0.5)
+    uv[fixed] = targets.arc_length(V[fixed], targets.rectangle(1, 1), start=int(np.flatnonzero(fixed == 2)[0]))
+    io.write_obj(tmp_path / "in.obj", io.MeshData(V, F).with_map(uv))
+    arguments = ["map", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]
+    assert main(arguments) == 1
+    assert main([*arguments, "--refine"]) == 0
+    np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], uv[fixed])
+
+
+def test_closed_surfaces(qhm):
+    status, _, said = qhm(torus(), "--to", "disk")
+    assert status == 2
+    assert "the surface is closed" in said
+    assert "--cut" in said
+    pytest.importorskip("igl")
+    V, F = torus()
+    status, facts, said = qhm((V, F), "--to", "letter:G", "--cut")
+    assert status == 0
+    assert f"{facts['copied_vertices']} vertices along the cut have a copy" in said
+    assert np.allclose(io.read_mesh(qhm.out).V[: len(V)], V)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--corners", "3"], "--corners says how the boundary goes to an outline: name one by --to"),
+        (["--font", "x"], "--font says how"),
+        (["--cut"], "--cut says how"),
+        (["--to", "lettr:G"], "'lettr:G' is no outline that is known"),
+        (["--to", "none.svg"], "none.svg: there is no such file"),
+        (["--to", "disk", "--font", "x"], "a font has no meaning for 'disk'"),
+        (["--to", "rect:1x1", "--corners", "0"], "in.obj: vertex 0 in corners, but not on the boundary"),
+    ],
+)
+def test_wrong_calls(qhm, options, message):
+    status, _, said = qhm(surfaces.disk(3), *options)
+    assert status == 2
+    assert message in said
+    assert not qhm.out.exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--to", "disk", "--fixed", "f"], *(["--corners", c] for c in ("a", "1,,2", "1:2:3:4", "1,2:3", "1:2,1:3"))],
+)
+def test_calls_that_cannot_be_read(qhm, options):
+    with pytest.raises(SystemExit) as stop:
+        qhm(surfaces.disk(3), *options)
+    assert stop.value.code == 2
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the development cases are not beside this checkout")
+@pytest.mark.parametrize("case", [p.name for p in sorted((CASES / "letters").glob("*"))])
+def test_seven_letters(case, tmp_path):
+    """Each real surface onto its letter by this option alone."""
+    out, report = tmp_path / "out.obj", tmp_path / "report.json"
+    command = ["map", str(CASES / "letters" / case / "input.obj"), "--to", f"letter:{case[-1]}"]
+    assert main([*command, "-o", str(out), "--json", str(report)]) == 0
+    facts = json.loads(report.read_text())
+    assert facts["bijective"]
+    assert facts["iterations"] < 100
+    assert main(["check", str(out)]) == 0
