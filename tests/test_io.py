@@ -276,28 +276,38 @@ def test_the_error_survives_pickling_and_odd_names():
 
 
 @posix
-def test_memory_stays_bounded_on_long_lines(tmp_path):
-    # 20 MB lines; taken apart by the token they would need a gigabyte.
+def test_memory_stays_bounded_on_hostile_files(tmp_path):
+    # Lines of 100 MB and of 20 MB; taken apart by the token they would need gigabytes. And indices and counts that
+    # an array of their size would be made for.
     script = f"""
 import resource
-from quasiharmonic.io import MeshFileError, read_mesh
+from quasiharmonic.io import MeshFileError, read_handles, read_mesh
 with open("/proc/self/statm") as file:
     now = int(file.read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (now + 300 * 2**20, now + 300 * 2**20))
-for head in (b"v ", b"v 0 0 0\\nf ", b"v 0 0 0\\nvt ", b"OFF "):
-    path = {str(tmp_path / "long")!r} + (".off" if head == b"OFF " else ".obj")
+def read(text, name, megabytes):
+    resource.setrlimit(resource.RLIMIT_AS, (now + megabytes * 2**20, resource.RLIM_INFINITY))
+    path = {str(tmp_path / "hostile")!r} + name
     with open(path, "wb") as file:
-        file.write(head + b"1 " * 10_000_000 + b"\\n")
+        file.write(text)
+    del text
     try:
-        read_mesh(path)
+        read_handles(path, 5) if name == ".txt" else read_mesh(path)
     except MeshFileError as error:
         print(error)
+read(b"v 0 0 0\\nf " + b"1 " * 50_000_000 + b"\\n", ".obj", 700)
+for head, name in ((b"v ", ".obj"), (b"v 0 0 0\\nvt ", ".obj"), (b"OFF ", ".off"), (b"", ".txt")):
+    read(head + b"1 " * 10_000_000 + b"\\n", name, 300)
+for index in (b"2147483648", b"-2147483648", b"999999999999999999"):
+    read(b"v 0 0 0\\nf 1 1 " + index + b"\\n", ".obj", 100)
+    read(b"OFF\\n1 1 0\\n0 0 0\\n3 0 0 " + index + b"\\n", ".off", 100)
+    read(b"OFF\\n" + index + b" 1 0\\n0 0 0\\n", ".off", 100)
+    read(index, ".txt", 100)
 """
     if not Path("/proc/self/statm").exists():
         pytest.skip("needs /proc")
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True)
     assert done.stderr == ""
-    assert len(done.stdout.splitlines()) == 4
+    assert len(done.stdout.splitlines()) == 5 + 12
 
 
 # What is kept

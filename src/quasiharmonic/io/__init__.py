@@ -14,8 +14,12 @@ from .handles import ProblemArrays, problem_arrays, problem_files, read_handles,
 from .meshdata import MeshData, map_of, vertex_places
 from .obj import read_obj, write_obj
 from .off import read_off, write_off
+from .per_triangle import FORMATS as PER_TRIANGLE_FORMATS
+from .per_triangle import write_per_triangle
+from .refined import refined_mesh
 
 __all__ = [
+    "PER_TRIANGLE_FORMATS",
     "MeshData",
     "MeshFileError",
     "OutputError",
@@ -30,10 +34,12 @@ __all__ = [
     "read_obj",
     "read_off",
     "read_problem",
+    "refined_mesh",
     "vertex_places",
     "write_map",
     "write_obj",
     "write_off",
+    "write_per_triangle",
     "write_whole",
 ]
 

@@ -52,7 +52,9 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def write_whole(path: str | os.PathLike[str], data: bytes | Callable[[BinaryIO], object]) -> None:
+def write_whole(
+    path: str | os.PathLike[str], data: bytes | Callable[[BinaryIO], object], *, durable: bool = True
+) -> None:
     """Write a file such that readers see the old one or the new one, never a part.
 
     The bytes go to a temporary file in the same directory, which takes the place of ``path`` when
@@ -66,6 +68,9 @@ def write_whole(path: str | os.PathLike[str], data: bytes | Callable[[BinaryIO],
         Where the file is to be.
     data : bytes or callable
         The contents, or a function that writes them to the binary file it is given.
+    durable : bool
+        Wait until the file is on the disk. Without it the file may be lost, or empty, when the power fails; what
+        becomes of the process makes no difference.
 
     Raises
     ------
@@ -81,7 +86,8 @@ def write_whole(path: str | os.PathLike[str], data: bytes | Callable[[BinaryIO],
             else:
                 file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                os.fsync(file.fileno())
         mode = _mode(target)
         if mode is not None:
             os.chmod(part, stat.S_IMODE(mode))

@@ -62,7 +62,7 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
     return _read_regular(path, data) or read_obj_lines(path, data)
 
 
-def write_obj(path: str | os.PathLike[str], mesh: MeshData) -> None:
+def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
     """Write a mesh as an OBJ file, whole or not at all.
 
     Numbers are written such that reading them gives the same double.
@@ -74,13 +74,15 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData) -> None:
     mesh : MeshData
         What to write: statements before the first vertex, then vertices, texture coordinates,
         normals, and the faces with the other statements in between where they were.
+    durable : bool
+        As for `write_whole`.
 
     Raises
     ------
     OutputError
         When it cannot be written; the old file is then untouched.
     """
-    write_whole(path, lambda file: file.writelines(_pieces(mesh)))
+    write_whole(path, lambda file: file.writelines(_pieces(mesh)), durable=durable)
 
 
 def _read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:

@@ -1,0 +1,144 @@
+"""``qhm morph``: a planar mesh whose boundary has moved → a mesh with a valid interior."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.morphing import Morphed
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "morph",
+        help="move the boundary of a planar mesh (Gmsh, VTK, …) and keep its interior valid",
+        description="Move some vertices of a planar triangle mesh and place the others such that no triangle is "
+        "inverted. Boundary vertices that are not moved stay. Data and physical groups come through unchanged. "
+        "Needs the extra 'fem'.",
+        epilog="Exit status: 0 every triangle of the written mesh is positive, decided exactly; 1 not so; 2 wrong "
+        "input or call, nothing written.",
+    )
+    parser.add_argument("input", type=Path, metavar="MESH", help=".msh, .vtu, .vtk or another format of meshlane's")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="MESH", help="mesh to write")
+    given = parser.add_mutually_exclusive_group(required=True)
+    given.add_argument(
+        "--positions", type=Path, metavar="CSV", help="where vertices go: lines 'vertex,x,y', counting from 0"
+    )
+    given.add_argument(
+        "--field", metavar="NAME", help="point data of the mesh that say how far the boundary's vertices go"
+    )
+    parser.add_argument(
+        "--energy",
+        choices=(*arguments.ENERGIES, "none"),
+        default="symmetric-dirichlet",
+        help="what the placement minimises; none: the first valid mesh (default: symmetric-dirichlet)",
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, morph, write, read again, judge, report."""
+    import numpy as np
+
+    from quasiharmonic.io.fem import read_fem, write_fem
+    from quasiharmonic.measures import mean_ratio
+    from quasiharmonic.mesh.topology import boundary_edges
+    from quasiharmonic.morphing import morph
+
+    from . import progress, report
+
+    report.check_moved(options.output, options.json, inputs=(options.input, options.positions))
+    mesh = read_fem(options.input)
+    if options.field is not None:
+        field = mesh.point_field(options.field)
+        clockwise = mean_ratio(mesh.points, mesh.F) < 0
+        F = np.where(clockwise[:, None], mesh.F[:, ::-1], mesh.F)
+        with report.about(options.input):
+            moved = np.unique(boundary_edges(F, len(mesh.points)))
+        positions = mesh.points[moved] + field[moved]
+    else:
+        moved, positions = _positions(options.positions, len(mesh.points))
+    with report.about(options.input), progress.line() as show:
+        morphed = morph(
+            mesh.points,
+            mesh.F,
+            moved,
+            positions,
+            energy=None if options.energy == "none" else options.energy,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+    write_fem(options.output, mesh, morphed.points)
+    with report.after_writing(options.output):
+        # What a reader gets is judged: a format may hold fewer digits.
+        written = read_fem(options.output)
+        inverted = np.flatnonzero(mean_ratio(written.points, written.F) * mean_ratio(mesh.points, mesh.F) <= 0)
+        facts = {
+            **morphed.to_dict(),
+            "injective": not inverted.size,
+            "flipped": inverted.tolist(),
+            "input": str(options.input),
+            "output": str(options.output),
+            "moved": len(moved),
+        }
+        report.emit(facts, options.json, _sentences(morphed, len(inverted), options.output))
+    return 0 if not inverted.size else 1
+
+
+def _sentences(morphed: Morphed, inverted: int, output: Path) -> str:
+    before, after = morphed.quality_before, morphed.quality_after
+    verdict = f"{inverted} of {len(after)} triangles are not positive" if inverted else "every triangle is positive"
+    lines = [f"wrote {output}: {verdict}"]
+    if inverted:
+        lines.append(morphed.result.status.value)
+        if morphed.result.diagnosis is not None and morphed.result.diagnosis.obstructions:
+            lines.append(morphed.result.diagnosis.summary())
+    elif not morphed.result.certificate.bijective:
+        lines.append(f"but the mesh overlaps itself. {morphed.result.certificate.summary()}")
+    for name, quality in (("before", before), ("after", after)):
+        worst = f"worst {quality.min():.3g} (triangle {int(quality.argmin())})"
+        lines.append(f"mean-ratio quality {name}: {worst}, mean {quality.mean():.3g}")
+    return "\n".join(lines)
+
+
+def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Read lines of a vertex and its place."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+
+    vertices, places = [], []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise MeshFileError(path, "is not a text file") from error
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words or (number == 1 and words[0].lower() == "vertex"):
+            continue
+        try:
+            vertex, place = int(words[0]), (float(words[1]), float(words[2]))
+        except (ValueError, IndexError):
+            vertex, place, words = -1, (0.0, 0.0), []
+        if len(words) != 3 or not 0 <= vertex < n or not np.isfinite(place).all():
+            raise MeshFileError(
+                path, f"line {number} is not 'vertex,x,y' with a vertex from 0 to {n - 1}: {line[:60]!r}"
+            )
+        vertices.append(vertex)
+        places.append(place)
+    if not vertices:
+        raise MeshFileError(path, "moves no vertex")
+    return np.array(vertices, dtype=np.int64), np.array(places)

@@ -1,0 +1,88 @@
+"""``qhm repair``: a UV file with inverted triangles → the same file without, its boundary kept."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "repair",
+        help="right the inverted triangles of a UV map, its boundary kept",
+        description="Right the inverted triangles of the map that the input's texture coordinates (vt) give. The map "
+        "may have seams; each of its islands is repaired on its own. Boundaries stay, and so does every vertex that "
+        "need not move.",
+        epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
+        "or call, nothing written.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with texture coordinates")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")
+    parser.add_argument(
+        "--all",
+        dest="whole",
+        action="store_true",
+        help="map islands that have inverted triangles anew as a whole (default: only patches around them)",
+    )
+    parser.add_argument(
+        "--max-iterations",
+        type=arguments.count,
+        default=2000,
+        metavar="N",
+        help="on an island as a whole (default: 2000)",
+    )
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, repair, write, judge, report."""
+    from dataclasses import replace
+
+    from quasiharmonic import io
+    from quasiharmonic.certificate import is_injective
+    from quasiharmonic.repairing import repair
+    from quasiharmonic.seams import islands
+
+    from . import progress, report
+
+    if options.output.suffix.lower() != ".obj":
+        raise ValueError(f"{options.output}: a map with seams is written as .obj")
+    report.check_outputs(options.output, None, options.json, inputs=(options.input,))
+    mesh = io.read_mesh(options.input)
+    if mesh.vt is None or mesh.FT is None:
+        raise ValueError(f"{options.input}: there is no map to repair: no face has texture coordinates (vt)")
+    with report.about(options.input), progress.line() as show:
+        result = repair(
+            mesh.V,
+            mesh.F,
+            mesh.vt,
+            FT=mesh.FT,
+            whole=options.whole,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+    io.write_obj(options.output, replace(mesh, vt=result.uv, FT=result.FT))
+    written = io.read_obj(options.output)
+    with report.after_writing(options.output):
+        parts = [] if written.vt is None else islands(written.F, written.vt, written.FT)
+        injective = bool(parts) and all(is_injective(part.F, part.uv) for part in parts)
+        facts = {
+            **result.to_dict(),
+            "injective": injective,
+            "input": str(options.input),
+            "output": str(options.output),
+            "vertices": len(mesh.V),
+            "triangles": len(mesh.F),
+        }
+        report.emit(facts, options.json, f"wrote {options.output}: {result.summary()}")
+    return 0 if injective else 1

@@ -1,0 +1,218 @@
+"""Lists of the triangles near every place of the unit box: a grid whose crowded cells are divided again.
+
+The first grid has about as many cells as there are triangles, and each cell lists the triangles that meet it. A
+cell with a long list is divided into 4 × 4, and those again, so that where triangles span many orders of magnitude
+the lists are as short as in an even mesh::
+
+    +-------+-------+-------+
+    |       |+-+-+-+|       |      point ──▶ cell ──▶ its 4 × 4 parts, if it has any ──▶ … ──▶ list of triangles
+    |   ·   |+-+-+-+|       |
+    |       |+-+-+-+|       |
+    +-------+-------+-------+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# The finest cells have integer coordinates below 2 to this power; a cell ``s`` levels of halving up has them
+# shifted by ``s`` bits.
+_BITS = 40
+# A cell with a longer list is divided, if its parts' lists are no more than so often as long in all, or those that are
+# not empty a fraction of it in the mean; and as long as all lists have no more entries than so many a triangle, those
+# of the first grid alone no more than some.
+_LONG, _MORE, _GAIN, _ENTRIES, _AT_FIRST = 12, 1.5, 0.75, 64, 16
+# What is this far outside of an edge, in the unit box, is so whatever was rounded; nor does underflow matter.
+_MARGIN, _TINY = 2.0**-48, 2.0**-1000
+# Entries spread over cells at a time: what is in work stays in the cache.
+_ROWS = 1 << 14
+
+
+@dataclass(frozen=True)
+class _Level:
+    """The cells that one division made, and their lists one after another."""
+
+    place: IntArray
+    """(k, 2) Coordinates of the cells."""
+    length: IntArray
+    """(k,) Length of each list."""
+    triangle: IntArray
+    """(sum of lengths,) The lists, each ascending."""
+
+    def without(self, cells: IntArray) -> _Level:
+        """The same cells with empty lists for some."""
+        kept = np.ones(self.length.size, dtype=np.bool_)
+        kept[cells] = False
+        return _Level(self.place, np.where(kept, self.length, 0), self.triangle[np.repeat(kept, self.length)])
+
+
+class NestedGrid:
+    """Lists of triangles by place.
+
+    Parameters
+    ----------
+    corners : (f, 3, 2) float64
+        Counterclockwise triangles in the box [0, 1]².
+
+    Attributes
+    ----------
+    listed : (m,) int32
+        Triangles, list after list, each list ascending.
+    """
+
+    def __init__(self, corners: FloatArray) -> None:
+        finest = _coordinates(corners)
+        self._low, self._high = finest.min(axis=1), finest.max(axis=1)
+        self._edges = _Edges(corners)
+        self._shift = shift = self._first_shift()
+        columns, lines = (int(m) + 1 for m in self._high.max(axis=0) >> shift)
+        self._columns = columns
+        everything = np.arange(len(corners))
+        level = self._divided(everything, np.zeros_like(everything), np.zeros((1, 2), np.int64), columns, lines, shift)
+        levels, parts, made = [level], [np.full(level.length.size, -1, dtype=np.int64)], level.length.size
+        room = _ENTRIES * len(corners) + 1000 - level.triangle.size
+        while shift >= 2:
+            shift -= 2
+            split, finer = self._refined(level, shift, room)
+            if not split.size:
+                break
+            parts[-1][split] = made + 16 * np.arange(split.size)
+            levels[-1] = level.without(split)
+            levels.append(finer)
+            parts.append(np.full(finer.length.size, -1, dtype=np.int64))
+            made += finer.length.size
+            room -= finer.triangle.size + levels[-2].triangle.size - level.triangle.size
+            level = finer
+        del self._low, self._high, self._edges
+        # Cells are numbered level after level. Those of ``_begin`` are where their lists begin; ``_parts`` is the
+        # first of 16 parts, row by row, or -1.
+        self.listed = np.concatenate([level.triangle for level in levels]).astype(np.int32)
+        self._begin = np.concatenate([[0], np.cumsum(np.concatenate([level.length for level in levels]))])
+        self._parts = np.concatenate(parts)
+
+    def lists(self, points: FloatArray) -> tuple[IntArray, IntArray]:
+        """Where in ``listed`` the triangles are that may contain points of the unit box.
+
+        The coordinates of points and corners must have been made by the same monotonic arithmetic: then no
+        rounding parts a point from its triangle.
+
+        Parameters
+        ----------
+        points : (k, 2) float64
+
+        Returns
+        -------
+        begin, end : (k,) int64
+        """
+        x, y = _coordinates(points).T
+        shift = self._shift
+        cell = (y >> shift) * self._columns + (x >> shift)
+        deeper = np.flatnonzero(self._parts[cell] >= 0)
+        while deeper.size:
+            shift -= 2
+            part = (((y[deeper] >> shift) & 3) << 2) | ((x[deeper] >> shift) & 3)
+            cell[deeper] = self._parts[cell[deeper]] + part
+            deeper = deeper[self._parts[cell[deeper]] >= 0]
+        return self._begin[cell], self._begin[cell + 1]
+
+    def _first_shift(self) -> int:
+        """The size of the first grid's cells."""
+        f = len(self._low)
+        shift = max(_BITS - (f.bit_length() + 1) // 2, 0)
+        while True:
+            reach = (self._high >> shift) - (self._low >> shift) + 1
+            # Long triangles across the grain of the grid meet many cells: then fewer must do at first.
+            if int((reach[:, 0] * reach[:, 1]).sum()) <= _AT_FIRST * f or shift >= _BITS:
+                return shift
+            shift += 1
+
+    def _refined(self, level: _Level, shift: int, room: int) -> tuple[IntArray, _Level]:
+        """The cells of a level that should be divided, and their parts, ``room`` entries more at most."""
+        split = np.flatnonzero(level.length > _LONG)
+        number = np.full(level.length.size, -1, dtype=np.int64)
+        number[split] = np.arange(split.size)
+        parent = np.repeat(number, level.length)
+        concerned = np.flatnonzero(parent >= 0)
+        finer = self._divided(level.triangle[concerned], parent[concerned], 4 * level.place[split], 4, 4, shift)
+        parts = finer.length.reshape(-1, 16)
+        before, after = level.length[split], parts.sum(axis=1)
+        # Where triangles crowd in a corner of the cell, a few divisions bring nothing and cost nothing.
+        chosen = (after <= _MORE * before) | (after <= _GAIN * before * (parts > 0).sum(axis=1))
+        # The longest lists first.
+        order = np.argsort(-before, kind="stable")
+        more = np.cumsum(np.where(chosen, after - before, 0)[order])
+        chosen[order[more > room]] = False
+        part = np.repeat(chosen, 16)
+        entry = np.repeat(part, finer.length)
+        return split[chosen], _Level(finer.place[part], finer.length[part], finer.triangle[entry])
+
+    def _divided(
+        self, triangle: IntArray, parent: IntArray, corner: IntArray, columns: int, lines: int, shift: int
+    ) -> _Level:
+        """Divide cells into grids of ``columns`` × ``lines``.
+
+        Parameters
+        ----------
+        triangle, parent : (e,) int64
+            Entries of the cells' lists, and which of the cells they are of; by cell, then by triangle.
+        corner : (k, 2) int64
+            Coordinates of each cell's first part.
+        columns, lines, shift : int
+        """
+        from scipy.sparse import csr_array
+
+        cells, counts = [np.empty(0, dtype=np.int64)], [np.zeros(1, dtype=np.int64)]
+        for start in range(0, triangle.size, _ROWS):
+            t, p = triangle[start : start + _ROWS], parent[start : start + _ROWS]
+            first = np.maximum(self._low[t] >> shift, corner[p])
+            last = np.minimum(self._high[t] >> shift, corner[p] + [columns - 1, lines - 1])
+            wide, high = (last - first + 1).T
+            row = np.repeat(np.arange(t.size), wide * high)
+            step = np.arange(row.size) - np.repeat(np.cumsum(wide * high) - wide * high, wide * high)
+            across = wide[row]
+            down = step // across
+            x, y = first[row, 0] + step - down * across, first[row, 1] + down
+            meets = self._edges.meet(t, row, x, y, shift)
+            row, x, y = row[meets], x[meets], y[meets]
+            owner = p[row]
+            cells.append((owner * lines + y - corner[owner, 1]) * columns + x - corner[owner, 0])
+            counts.append(np.bincount(row, minlength=t.size))
+        # Turning the table of entries and cells on its side sorts by cell and keeps the order of the entries.
+        where, size = np.concatenate(cells), len(corner) * columns * lines
+        table = (np.ones(where.size, dtype=np.int8), where, np.cumsum(np.concatenate(counts)))
+        turned = csr_array(table, shape=(triangle.size, size)).tocsc()
+        inner = np.indices((lines, columns))[::-1].reshape(2, -1).T
+        place = (corner[:, None, :] + inner).reshape(-1, 2)
+        return _Level(place, np.diff(turned.indptr).astype(np.int64), triangle[turned.indices])
+
+
+class _Edges:
+    """Lines through the edges of triangles, for telling which cells lie outside of them."""
+
+    def __init__(self, corners: FloatArray) -> None:
+        tail, head = corners, np.roll(corners, -1, axis=1)
+        # A point is to the left of the edge where x nx + y ny exceeds the offset.
+        self._nx, self._ny = tail[..., 1] - head[..., 1], head[..., 0] - tail[..., 0]
+        self._offset = self._nx * tail[..., 0] + self._ny * tail[..., 1]
+
+    def meet(self, triangle: IntArray, row: IntArray, x: IntArray, y: IntArray, shift: int) -> NDArray[np.bool_]:
+        """Whether the triangles of some rows meet cells that their boxes meet; if in doubt, they do."""
+        size = 2.0 ** (shift - _BITS)
+        middle_x, middle_y = (x + 0.5) * size, (y + 0.5) * size
+        meets = np.ones(row.size, dtype=np.bool_)
+        for i in range(3):
+            nx, ny = self._nx[triangle, i], self._ny[triangle, i]
+            reach = self._offset[triangle, i] - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _TINY
+            meets &= middle_x * nx[row] + middle_y * ny[row] >= reach[row]
+        return meets
+
+
+def _coordinates(points: FloatArray) -> IntArray:
+    """Coordinates of the finest cells that points of the unit box lie in."""
+    return np.minimum((points * 2.0**_BITS).astype(np.int64), 2**_BITS - 1)

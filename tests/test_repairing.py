@@ -1,0 +1,475 @@
+"""Repair of maps with flips: what changes, what does not, and what is said about it."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from meshes import bend, boundary_of, lift, signed_areas
+from quasiharmonic import certify, flipped_triangles, io, repair
+from quasiharmonic.cli import main
+from quasiharmonic.seams import fans, islands
+from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+
+
+def atlas(cells=12):
+    """A curved square, its map cut into three strips that lie apart and differ in shape.
+
+    Returns V, F, places, their indices by corner, and the strip of each triangle.
+    """
+    plane, F = grid(3 * cells, cells)
+    strip = np.minimum((plane[F, 0].mean(axis=1) * 3).astype(int), 2)
+    places, FT = [], np.empty_like(F)
+    for k in range(3):
+        used, local = np.unique(F[strip == k], return_inverse=True)
+        FT[strip == k] = local.reshape(-1, 3) + sum(map(len, places))
+        own = (plane[used] - [k / 3, 0]) * [3, 1]
+        places.append((own, bend(own), own @ [[0.0, 1.5], [-1.5, 0.0]])[k] + [3 * k, 0])
+    return lift(plane), F, np.concatenate(places), FT, strip
+
+
+def damaged(uv, inner, count, scale, seed=0):
+    """A map some of whose inner places are pushed about; and which."""
+    rng = np.random.default_rng(seed)
+    pushed = rng.choice(inner, count, replace=False)
+    uv = uv.copy()
+    uv[pushed] += rng.normal(0, scale, (count, 2))
+    return uv, pushed
+
+
+def inner_rows(FT, rows=slice(None)):
+    """Rows of places that are not on the boundary of the triangles' islands."""
+    return np.setdiff1d(FT[rows], boundary_of(FT[rows]))
+
+
+def exact_signs(uv, FT):
+    """Orientation of every triangle in rational arithmetic."""
+    signs = []
+    for (ax, ay), (bx, by), (cx, cy) in uv[FT].tolist():
+        area = (Fraction(bx) - Fraction(ax)) * (Fraction(cy) - Fraction(ay)) - (Fraction(by) - Fraction(ay)) * (
+            Fraction(cx) - Fraction(ax)
+        )
+        signs.append((area > 0) - (area < 0))
+    return np.array(signs)
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+class TestIslands:
+    def test_one_piece_keeps_its_numbers(self):
+        V, F = random_delaunay(60, seed=1)
+        (one,) = islands(F, V)
+        assert np.array_equal(one.F, F)
+        assert np.array_equal(one.triangles, np.arange(len(F)))
+        assert np.array_equal(one.vertices, np.arange(len(V)))
+        assert np.array_equal(one.uv, V)
+
+    def test_strips(self):
+        _, F, uv, FT, strip = atlas(4)
+        found = islands(F, uv, FT)
+        assert len(found) == 3
+        for k, island in enumerate(found):
+            assert np.array_equal(island.triangles, np.flatnonzero(strip == k))
+            assert np.array_equal(island.vertices[island.F], F[strip == k])
+            assert np.array_equal(island.uv[island.F], uv[FT[strip == k]])
+            assert np.all(np.diff(island.vertices) > 0)
+            assert certify(island.F, island.uv).bijective
+
+    def test_a_place_for_every_corner_is_no_seam(self):
+        V, F = random_delaunay(60, seed=1)
+        (one,) = islands(F, V[F.ravel()], np.arange(F.size).reshape(-1, 3))
+        assert np.array_equal(one.F, F)
+        assert np.array_equal(one.uv, V)
+
+    def test_equal_numbers_are_one_place_whatever_the_sign_of_zero(self):
+        F = np.array([[0, 1, 2], [1, 0, 3]])
+        uv = np.array([[0.0, 0.0], [1, 0], [0.5, 1], [-0.0, -0.0], [1, -0.0], [0.5, -1]])
+        assert len(islands(F, uv, [[0, 1, 2], [4, 3, 5]])) == 1
+        uv[4, 0] = np.nextafter(1, 2)
+        assert len(islands(F, uv, [[0, 1, 2], [4, 3, 5]])) == 2
+
+    def test_triangles_that_touch_at_a_vertex_are_apart(self):
+        F = np.array([[0, 1, 2], [0, 3, 4]])
+        found = islands(F, [[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+        assert [island.vertices.tolist() for island in found] == [[0, 1, 2], [0, 3, 4]]
+
+    def test_a_seam_can_run_to_a_vertex_from_both_sides(self):
+        """An open ring of triangles around a vertex, and a pinched one."""
+        _, F = disk(1)
+        split, component = fans(F[:-1])
+        assert len(np.unique(split)) == 7
+        assert not component.any()
+        _, ring = disk(2)
+        pinched = ring[(ring != 0).all(axis=1)].copy()
+        pinched[pinched == 4] = 1
+        split, component = fans(pinched)
+        assert not component.any()
+        assert len(np.unique(split)) == len(np.unique(pinched)) + 1
+
+    def test_what_is_no_surface_comes_apart(self):
+        three_at_an_edge = [[0, 1, 2], [1, 0, 3], [0, 1, 4]]
+        assert len(islands(three_at_an_edge, np.random.default_rng(0).random((5, 2)))) == 3
+        wound_differently = [[0, 1, 2], [0, 1, 3]]
+        assert len(islands(wound_differently, np.random.default_rng(0).random((4, 2)))) == 2
+
+    def test_triangles_without_places(self):
+        V, F = grid(4, 4)
+        FT = F.copy()
+        FT[3] = -1
+        FT[13, 1] = -1
+        found = islands(F, V, FT)
+        assert np.array_equal(
+            np.sort(np.concatenate([island.triangles for island in found])), np.setdiff1d(np.arange(len(F)), [3, 13])
+        )
+        assert islands(F, V, np.full_like(F, -1)) == []
+
+    def test_bad_input_is_named(self):
+        V, F = grid(2, 2)
+        with pytest.raises(ValueError, match=r"FT must have shape \(f, 3\)"):
+            islands(F, V, F[:-1])
+        with pytest.raises(ValueError, match="triangle 2 refer to vertices below 0 or to rows outside 0 … 8"):
+            islands(F, V, np.where(np.arange(8)[:, None] == 2, 9, F))
+        with pytest.raises(ValueError, match="must hold integer"):
+            islands(F, V, F.astype(float))
+        with pytest.raises(ValueError, match="uv must have shape"):
+            islands(F, V[:, :1])
+
+
+class TestRepair:
+    @pytest.mark.parametrize(("count", "scale"), [(1, 0.4), (12, 0.05), (12, 0.4), (120, 0.05)])
+    def test_only_what_was_pushed_moves(self, count, scale):
+        V, F = random_delaunay(400, seed=2)
+        uv = bend(V)
+        start, pushed = damaged(uv, inner_rows(F), count, scale)
+        flips = flipped_triangles(F, start)
+        assert flips.size
+        result = repair(lift(V), F, start)
+        (island,) = result.islands
+        assert result.injective
+        assert island.bijective
+        assert exact_signs(result.uv, F).min() == 1
+        assert np.array_equal(island.inverted_before, flips)
+        assert np.array_equal(result.moved, np.flatnonzero((result.uv != start).any(axis=1)))
+        # Hardly any vertex that was left alone has to make room.
+        assert len(np.setdiff1d(result.moved, pushed)) <= count // 20
+        assert np.array_equal(result.FT, F)
+
+    def test_no_vertex_has_moved_in_vain(self):
+        V, F = random_delaunay(400, seed=2)
+        start, _ = damaged(V, inner_rows(F), 30, 0.1)
+        result = repair(V, F, start)
+        assert result.injective
+        distances = np.linalg.norm(result.uv - start, axis=1)
+        assert distances[result.moved].min() > 0
+        # Patches are polished: no triangle around what moved is left all but flat.
+        around = np.isin(F, result.moved).any(axis=1)
+        assert signed_areas(F, result.uv)[around].min() > 1e-3 * np.median(signed_areas(F, V))
+
+    def test_inputs_are_left_alone_and_results_repeat(self):
+        V, F = random_delaunay(100, seed=2)
+        start, _ = damaged(V, inner_rows(F), 8, 0.2)
+        arrays = V.astype(np.float32), F.astype(np.uint16), start
+        before = [a.copy() for a in arrays]
+        one, other = repair(*arrays), repair(*arrays)
+        assert all(np.array_equal(a, b) for a, b in zip(arrays, before, strict=True))
+        assert np.array_equal(one.uv, other.uv)
+        assert one.injective
+
+    def test_nothing_to_repair(self):
+        V, F, uv, FT, _ = atlas(3)
+        result = repair(V, F, uv, FT=FT)
+        assert np.array_equal(result.uv, uv)
+        assert np.array_equal(result.FT, FT)
+        assert result.injective
+        assert result.moved.size == 0
+        assert result.summary() == "3 islands: 0 triangles inverted before, 0 now; 0 vertices moved"
+
+    def test_islands_one_by_one(self):
+        V, F, uv, FT, strip = atlas()
+        start, pushed = damaged(uv, inner_rows(FT, strip == 1), 10, 0.1)
+        result = repair(V, F, start, FT=FT)
+        assert result.injective
+        assert [len(island.moved) > 0 for island in result.islands] == [False, True, False]
+        assert exact_signs(result.uv, result.FT).min() == 1
+        changed = np.flatnonzero((result.uv != start).any(axis=1))
+        assert len(result.uv) == len(start)
+        assert len(np.setdiff1d(changed, pushed)) <= 1
+        assert np.array_equal(result.FT, FT)
+        # Rows of places and vertices of the mesh are counted apart.
+        assert np.array_equal(result.islands[1].moved, np.unique(F[np.isin(FT, changed)]))
+
+    def test_whole_islands_when_asked(self):
+        V, F, uv, FT, strip = atlas()
+        start, _ = damaged(uv, inner_rows(FT, strip == 1), 10, 0.1)
+        result = repair(V, F, start, FT=FT, whole=True)
+        assert result.injective
+        changed = np.flatnonzero((result.uv != start).any(axis=1))
+        assert np.array_equal(changed, inner_rows(FT, strip == 1))
+
+    def test_a_place_for_every_corner(self):
+        V, F = random_delaunay(100, seed=2)
+        start, _ = damaged(V, inner_rows(F), 5, 0.2)
+        result = repair(V, F, start[F.ravel()], FT=np.arange(F.size).reshape(-1, 3))
+        whole = repair(V, F, start)
+        assert result.injective
+        assert len(result.uv) == F.size
+        np.testing.assert_array_equal(result.uv, whole.uv[F.ravel()])
+
+    def test_stacked_islands(self):
+        """Sheets that share their rows of places stay on each other where both move alike, and part where not."""
+        plane, F = grid(6, 6)
+        uv = plane.copy()
+        uv[24] += 0.3
+        stacked = np.concatenate([F, F + len(plane)])
+        FT = np.concatenate([F, F])
+        alike = np.concatenate([np.column_stack([plane, np.full(len(plane), height)]) for height in (0.0, 5.0)])
+        result = repair(alike, stacked, uv, FT=FT)
+        assert result.injective
+        assert np.array_equal(result.FT, FT)
+        assert np.flatnonzero((result.uv != uv).any(axis=1)).tolist() == [24]
+        unlike = alike + (np.arange(len(alike)) >= len(plane))[:, None] * np.array([[1.0, 2.0, 0.0]]) * alike**2
+        result = repair(unlike, stacked, uv, FT=FT)
+        assert result.injective
+        assert np.array_equal(result.uv[:49], uv)
+        assert len(result.uv) == 51
+        assert np.array_equal(result.FT, np.where(FT == 24, [[49]] * len(F) + [[50]] * len(F), FT))
+        assert len(islands(stacked, result.uv, result.FT)) == 2
+
+    def test_rows_that_others_use_are_not_touched(self):
+        """A vertex that moves, and a single triangle elsewhere that uses its row too."""
+        plane, F = grid(6, 6)
+        uv = plane.copy()
+        uv[24] += 0.3
+        V = np.concatenate([lift(plane), [[5, 0, 0], [6, 0, 0], [5, 1, 0]]])
+        far = np.array([[49, 50, 51]])
+        lonely = np.array([[0, 6, 24]])
+        assert exact_signs(uv, lonely)[0] == 1
+        result = repair(V, np.concatenate([F, far]), uv, FT=np.concatenate([F, lonely]))
+        assert result.injective
+        assert np.array_equal(result.uv[24], uv[24])
+        assert np.array_equal(result.FT[-1], lonely[0])
+        assert len(result.uv) == 50
+        assert np.array_equal(result.FT[:-1], np.where(F == 24, 49, F))
+        assert len(islands(np.concatenate([F, far]), result.uv, result.FT)) == 2
+        assert exact_signs(result.uv, result.FT).min() == 1
+
+    def test_interior_vertices_may_be_nowhere(self):
+        V, F = random_delaunay(200, seed=2)
+        start = V.copy()
+        lost = inner_rows(F)[[3, 40, 41]]
+        start[lost] = [[np.nan, 0], [1e67, -1e67], [np.inf, np.nan]]
+        result = repair(V, F, start)
+        assert result.injective
+        assert np.array_equal(result.moved, lost)
+
+    def test_holes(self):
+        V, F = annulus(12)
+        start, _ = damaged(V, inner_rows(F), 30, 0.2)
+        result = repair(V, F, start)
+        assert result.injective
+        assert result.islands[0].bijective
+        assert np.array_equal(result.uv[boundary_of(F)], V[boundary_of(F)])
+
+    def test_boundary_that_crosses_itself(self):
+        """A map without inverted triangles exists and is found; that it overlaps is said."""
+        V, F = grid(60, 4)
+        angle, radius = -2.4 * np.pi * V[:, 0], 2 + V[:, 1]
+        wound = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        start, _ = damaged(wound, inner_rows(F), 6, 0.4)
+        assert flipped_triangles(F, start).size
+        result = repair(V, F, start)
+        assert result.injective
+        assert not result.islands[0].bijective
+        assert "it overlaps itself" in result.summary()
+
+    def test_flat_rest_triangles_do_no_harm(self):
+        V, F = grid(8, 8)
+        start, _ = damaged(V, inner_rows(F), 4, 0.3)
+        assert repair(np.zeros_like(V), F, start).injective
+
+    def test_interrupt(self):
+        V, F = random_delaunay(100, seed=2)
+        start, _ = damaged(V, inner_rows(F), 5, 0.3)
+
+        def interrupt(step):
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            repair(V, F, start, callback=interrupt)
+
+    def test_bad_input_is_named(self):
+        V, F = grid(3, 3)
+        with pytest.raises(ValueError, match="V must be a finite array"):
+            repair(V[:, :1], F, V)
+        with pytest.raises(ValueError, match=r"triangles .* refer to vertices outside 0 … 14"):
+            repair(V[:-1], F, V)
+        with pytest.raises(ValueError, match="max_iterations"):
+            repair(V, F, V, max_iterations=0)
+
+
+class TestBeyondRepair:
+    def test_the_boundary_alone_inverts_a_triangle(self):
+        """The rest is repaired all the same, and the reason names elements by the mesh's numbers."""
+        V, F, uv, FT, strip = atlas()
+        # An ear of the last strip: a triangle with two boundary edges, folded inwards.
+        ear = np.array([[0, 1, 2]]) + len(V)
+        V = np.concatenate([V, V[:3] + 9, V[:1] + 8])
+        corner = len(uv)
+        uv = np.concatenate([uv, [[20, 0], [21, 0], [20, 1], [20.4, 0.2]]])
+        F = np.concatenate([F, ear, ear[:, (2, 1, 0)] * [1, 1, 0] + [0, 0, len(V) - 1]])
+        FT = np.concatenate([FT, [[corner, corner + 1, corner + 2], [corner + 2, corner + 1, corner + 3]]])
+        start, _ = damaged(uv, inner_rows(FT, np.append(strip == 0, [False, False])), 5, 0.1)
+        result = repair(V, F, start, FT=FT)
+        assert not result.injective
+        assert [island.injective for island in result.islands] == [True, True, True, False]
+        last = result.islands[-1]
+        assert last.inverted.tolist() == [len(F) - 1]
+        assert last.moved.size == 0
+        assert last.diagnosis.forbids_injective
+        (obstruction,) = (o for o in last.diagnosis.obstructions if o.triangles.size)
+        assert obstruction.triangles.tolist() == [len(F) - 1]
+        assert set(obstruction.vertices.tolist()) <= set(F[-1].tolist())
+        assert f"triangle {len(F) - 1}" in last.reason
+        assert f"triangle {len(F) - 1} left" in result.summary()
+
+    def test_an_ear_does_not_keep_the_rest_from_being_repaired(self):
+        V, F = grid(8, 8)
+        ear = np.array([[4, 3, len(V)]])  # below the bottom side, folded up
+        F = np.concatenate([F, ear])
+        uv = np.concatenate([V, [[0.44, 0.05]]])
+        start, _ = damaged(uv, inner_rows(F), 6, 0.2)
+        result = repair(np.concatenate([V, [[0.44, -0.1]]]), F, start)
+        assert result.islands[0].inverted.tolist() == [len(F) - 1]
+        assert "edge" in result.islands[0].reason or "triangle" in result.islands[0].reason
+
+    def test_mirrored(self):
+        V, F, uv, FT, strip = atlas(4)
+        rows = np.unique(FT[strip == 2])
+        uv[rows] *= [-1, 1]
+        result = repair(V, F, uv, FT=FT)
+        assert [island.injective for island in result.islands] == [True, True, False]
+        assert [o.kind.name for o in result.islands[2].diagnosis.obstructions] == ["REVERSED"]
+        assert np.array_equal(result.uv, uv)
+
+    def test_closed_surface(self):
+        F = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+        result = repair(np.eye(4)[:, :3], F, [[0, 0], [1, 0], [0, 1], [0.2, 0.2]])
+        assert not result.injective
+        assert "closed" in result.islands[0].reason
+
+    def test_boundary_without_places(self):
+        V, F = grid(3, 3)
+        uv = V.copy()
+        uv[2] = np.nan
+        result = repair(V, F, uv)
+        assert not result.injective
+        assert result.islands[0].reason == "No finite place for the boundary vertex 2."
+
+    def test_vertex_used_twice(self):
+        V, F = grid(3, 3)
+        F = np.concatenate([F, [[0, 0, 1]]])
+        result = repair(V, F, V)
+        assert result.islands[-1].reason == f"A vertex is used twice in triangle {len(F) - 1}."
+
+    def test_json(self):
+        V, F = grid(3, 3)
+        uv = V.copy()
+        uv[2] = np.nan
+        assert json.loads(json.dumps(repair(V, F, uv).to_dict(), allow_nan=False))["injective"] is False
+
+
+@pytest.fixture
+def uv_file(tmp_path):
+    """An atlas with flips in two islands, as another program might have written it."""
+    V, F, uv, FT, strip = atlas(8)
+    start, _ = damaged(uv, inner_rows(FT, strip == 0), 6, 0.1)
+    start, _ = damaged(start, inner_rows(FT, strip == 2), 3, 0.2, seed=1)
+    lines = ["# an atlas", "mtllib some.mtl", "o curved"]
+    lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in V.tolist()]
+    lines += [f"vt {u!r} {v!r}" for u, v in start.tolist()]
+    lines += ["vn 0 0 1", "s off"]
+    for k in range(3):
+        lines += [f"g strip_{k}", "usemtl cloth"]
+        for corners in np.stack([F, FT], axis=2)[strip == k] + 1:
+            lines.append("f " + " ".join(f"{v}/{t}/1" for v, t in corners.tolist()))
+    path = tmp_path / "atlas.obj"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+class TestCommand:
+    def test_file_with_seams(self, uv_file, tmp_path, capsys):
+        out, report = tmp_path / "repaired.obj", tmp_path / "report.json"
+        assert run("repair", uv_file, "-o", out, "--json", report) == 0
+        before, after = uv_file.read_text().splitlines(), out.read_text().splitlines()
+        changed = [(a, b) for a, b in zip(before, after, strict=True) if a != b]
+        facts = json.loads(report.read_text())
+        assert 0 < len(changed) == facts["moved"]
+        assert all(a.startswith("vt ") and b.startswith("vt ") for a, b in changed)
+        mesh, written = io.read_obj(uv_file), io.read_obj(out)
+        assert exact_signs(mesh.vt, mesh.FT).min() == -1
+        assert exact_signs(written.vt, written.FT).min() == 1
+        assert facts["injective"] is True
+        assert facts["inverted"] == 0
+        assert [len(island["moved"]) > 0 for island in facts["islands"]] == [True, False, True]
+        said = capsys.readouterr()
+        assert f"wrote {out}: 3 islands: {facts['inverted_before']} triangles inverted before, 0 now" in said.out
+        assert said.err == ""
+
+    def test_in_place(self, uv_file):
+        assert run("repair", uv_file, "-o", uv_file) == 0
+        repaired = uv_file.read_bytes()
+        assert run("repair", uv_file, "-o", uv_file) == 0
+        assert uv_file.read_bytes() == repaired
+
+    def test_check_agrees_where_there_are_no_seams(self, tmp_path, capsys):
+        V, F = random_delaunay(200, seed=2)
+        start, _ = damaged(V, inner_rows(F), 10, 0.2)
+        path, out = tmp_path / "map.obj", tmp_path / "out.obj"
+        io.write_obj(path, io.MeshData(lift(V), F).with_map(start))
+        assert run("check", path) == 1
+        assert run("repair", path, "-o", out) == 0
+        assert run("check", out) == 0
+        assert run("repair", path, "-o", out, "--all") == 0
+        assert run("check", out) == 0
+        assert (io.map_of(io.read_obj(out)) != start).any(axis=1).sum() == len(inner_rows(F))
+        capsys.readouterr()
+
+    def test_status_1_where_something_is_left(self, tmp_path, capsys):
+        V, F = grid(4, 4)
+        path, out = tmp_path / "map.obj", tmp_path / "out.obj"
+        io.write_obj(path, io.MeshData(V, F).with_map(V[:, ::-1]))
+        assert run("repair", path, "-o", out) == 1
+        said = capsys.readouterr().out
+        assert "32 inverted before, 32 now; 0 vertices moved" in said
+        assert "wound against the mesh" in said
+        assert np.array_equal(io.map_of(io.read_obj(out)), V[:, ::-1])
+
+    @pytest.mark.parametrize(
+        ("text", "output", "message"),
+        [
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.obj", "no face has texture coordinates"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 3\n", "out.obj", "face with 4 corners"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "written as .obj"),
+            (None, "out.obj", "there is no such file"),
+        ],
+    )
+    def test_status_2_and_nothing_written(self, text, output, message, tmp_path, capsys):
+        path = tmp_path / "in.obj"
+        if text is not None:
+            path.write_text(text)
+        assert run("repair", path, "-o", tmp_path / output) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / output).exists()
+
+    def test_faces_without_a_map_are_left_alone(self, uv_file, tmp_path, capsys):
+        uv_file.write_text(uv_file.read_text() + "f 1 2 3\n")
+        out = tmp_path / "out.obj"
+        assert run("repair", uv_file, "-o", out) == 0
+        assert out.read_text().endswith("f 1 2 3\n")
+        capsys.readouterr()
