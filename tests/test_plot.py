@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 import io
+import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from quasiharmonic import surfaces
-from quasiharmonic.plot import plot_before_after, plot_map, plot_surface, save_map_figure
-from quasiharmonic.plot.maps import _figure
+from quasiharmonic.measures import MEASURES
+from quasiharmonic.plot import (
+    interactive,
+    plot_before_after,
+    plot_distortion,
+    plot_map,
+    plot_surface,
+    plot_texture,
+    save_animation,
+    save_map_figure,
+    save_texture_figure,
+)
+from quasiharmonic.plot.canvas import new_figure
+from quasiharmonic.plot.distortion import LABELS
 from quasiharmonic.plot.shading import view
 from quasiharmonic.targets.correspondence import upright
 
@@ -146,7 +160,7 @@ def test_surfaces_stand_on_their_hole(hole):
 
 def test_inner_side_is_grey():
     V, F = sphere((1, 1, 1))
-    figure = _figure((3, 3))
+    figure = new_figure((3, 3))
     ax = figure.add_axes((0, 0, 1, 1))
     plot_surface(V, F, ax)
     image = pixels(figure)
@@ -187,3 +201,124 @@ def test_no_display_and_no_pyplot():
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_distortion_is_drawn_for_every_measure(planar):
+    V, F, folded = planar
+    stretched = V * (3, 1)
+    for measure in LABELS:
+        figure = plot_distortion(V, F, stretched, measure)
+        image = pixels(figure)
+        assert image.shape == (450, 1350, 3)
+        assert not red(image).any(), measure
+    assert red(pixels(plot_distortion(V, F, folded, "isometric"))).any()
+    assert tuple(LABELS) == MEASURES
+
+
+def test_distortion_histogram_has_all_the_area(planar):
+    V, F, _ = planar
+    bars = plot_distortion(V, F, V * (3, 1), "conformal").axes[2]
+    heights = [bar.get_height() for bar in bars.patches]
+    assert sum(heights) == pytest.approx(100)
+    # One value everywhere, 3, in one bar.
+    assert max(heights) == pytest.approx(100)
+
+
+def test_distortion_of_flat_triangles_and_of_no_value():
+    V, F = np.array([[0, 0], [1, 0], [2, 0], [0, 1.0]]), np.array([[0, 1, 2], [0, 1, 3]])
+    uv = np.array([[0, 0], [1, 0], [2, 0.5], [0, 1.0]])
+    assert plot_distortion(V, F, uv, "area_ratio") is not None
+    with pytest.raises(ValueError, match="no finite value"):
+        plot_distortion(V, F, uv * (1, -1), "mips")
+    with pytest.raises(ValueError, match="measure must be one of"):
+        plot_distortion(V, F, uv, "beauty")
+
+
+def test_texture_shows_the_board_and_what_is_inverted(planar, tmp_path):
+    V, F, folded = planar
+    figure = plot_texture(V, F, V, squares=4)
+    assert not red(pixels(figure)).any()
+    board = np.asarray(figure.axes[1].images[0].get_array())
+    # A round domain of diameter 2 at 600 pixels for 1/0.96 of it: as many light as dark pixels.
+    inside = board[..., 3] == 1
+    assert inside.mean() == pytest.approx(np.pi / 4 / 1.04**2, abs=0.02)
+    blue = inside & (board[..., 0] < 0.4)
+    assert blue.sum() / inside.sum() == pytest.approx(0.5, abs=0.03)
+    # Neighbouring squares have other colours, across both sides.
+    column = [blue[300 + round(600 / 1.04 / 4 * (k + 0.5) * s), 330] for k in (0, 1) for s in (-1, 1)]
+    assert column[0] != column[1]
+    assert column[0] != column[2]
+    save_texture_figure(tmp_path / "folded.png", V, F, folded)
+    assert red(imread(tmp_path / "folded.png")[..., :3]).any()
+    with pytest.raises(ValueError, match="squares must be at least 1"):
+        plot_texture(V, F, V, squares=0)
+
+
+def test_texture_shows_the_nearer_of_two_sheets():
+    # Two squares over each other; only the upper one, mapped far to the right, is seen.
+    V = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+    F = np.array([[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6]])
+    uv = V[:, :2] + np.where(V[:, 2:] > 0, (0.0, 0.0), (10.0, 0.0))
+    both = plot_texture(V, F, uv, squares=1).axes[0].images[0].get_array()
+    upper = plot_texture(V, F[[2, 3]], uv, squares=1).axes[0].images[0].get_array()
+    assert both.shape == upper.shape
+    middle = np.s_[250:350, 250:350, :3]
+    assert np.abs(both[middle] - both[300, 300, :3]).max() < 0.02
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_animation(planar, tmp_path, suffix):
+    V, F, folded = planar
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "mp4" and shutil.which("ffmpeg") is None:
+        with pytest.raises(ImportError, match="ffmpeg"):
+            save_animation(path, V, F, [("one", V)])
+        return
+    save_animation(path, V, F, ((f"frame {k}", uv) for k, uv in enumerate([folded, V, V])), frames_per_second=10)
+    if suffix == "gif":
+        with Image.open(path) as image:
+            assert (image.n_frames, image.size) == (2, (600, 600)) or image.n_frames == 3
+            assert image.info["loop"] == 0
+            assert red(np.asarray(image.convert("RGB")) / 255).sum() > 100
+            image.seek(image.n_frames - 1)
+            assert not red(np.asarray(image.convert("RGB")) / 255).any()
+    else:
+        assert path.read_bytes()[4:8] == b"ftyp"
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_animation_says_what_is_wrong(planar, tmp_path):
+    V, F, _ = planar
+    with pytest.raises(ValueError, match=r"as \.gif or \.mp4"):
+        save_animation(tmp_path / "a.avi", V, F, [("one", V)])
+    with pytest.raises(ValueError, match="no frames"):
+        save_animation(tmp_path / "a.gif", V, F, [])
+    with pytest.raises(ValueError, match="frames_per_second"):
+        save_animation(tmp_path / "a.gif", V, F, [("one", V)], frames_per_second=0)
+    lost = V.copy()
+    lost[3] = np.nan
+    with pytest.raises(ValueError, match="second has no finite place for vertex 3"):
+        save_animation(
+            tmp_path / "a.gif", V, F, [("first", V), ("second", np.where(np.arange(len(V))[:, None] == 3, np.nan, V))]
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_window(planar, tmp_path, monkeypatch):
+    polyscope = pytest.importorskip("polyscope")
+    V, F, folded = planar
+    monkeypatch.chdir(tmp_path)
+    polyscope.set_verbosity(0)
+    polyscope.set_use_prefs_file(False)
+    polyscope.init("openGL_mock")
+    interactive.add(V, F, folded)
+    assert polyscope.has_surface_mesh("surface")
+    assert polyscope.get_surface_mesh("map").n_faces() == len(F)
+    polyscope.remove_all_structures()
+    assert not list(tmp_path.iterdir())
+
+
+def test_window_without_polyscope(planar, monkeypatch):
+    monkeypatch.setitem(sys.modules, "polyscope", None)
+    with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[view\]'"):
+        interactive.show(*planar)

@@ -1,5 +1,19 @@
 """Pictures of surfaces and maps, drawn with matplotlib but without its global state or a display."""
 
+from quasiharmonic.plot.animation import save_animation, save_figures
+from quasiharmonic.plot.distortion import plot_distortion, save_distortion_figure
 from quasiharmonic.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
+from quasiharmonic.plot.texture import plot_texture, save_texture_figure
 
-__all__ = ["plot_before_after", "plot_map", "plot_surface", "save_map_figure"]
+__all__ = [
+    "plot_before_after",
+    "plot_distortion",
+    "plot_map",
+    "plot_surface",
+    "plot_texture",
+    "save_animation",
+    "save_distortion_figure",
+    "save_figures",
+    "save_map_figure",
+    "save_texture_figure",
+]

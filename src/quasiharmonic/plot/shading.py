@@ -32,6 +32,8 @@ class View:
         Of the vertices, growing towards the viewer.
     inside : (f,) bool
         Triangles that show their inner side.
+    light : (f,) float64
+        How the light falls on every triangle, -1 from behind to 1 straight.
     color : (f, 3) float64
         Red, green and blue of every triangle's outer side, 0 to 1.
     """
@@ -39,6 +41,7 @@ class View:
     points: FloatArray
     depth: FloatArray
     inside: NDArray[np.bool_]
+    light: FloatArray
     color: FloatArray
 
 
@@ -75,7 +78,8 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
         points=np.ascontiguousarray(seen[:, :2]),
         depth=seen[:, 2],
         inside=facing[:, 2] < 0,
-        color=_lit(hue, light),
+        light=light,
+        color=lit(hue, light),
     )
 
 
@@ -122,8 +126,8 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
     return np.asarray(from_above @ from_side @ frame)
 
 
-def _lit(hue: FloatArray, light: FloatArray) -> FloatArray:
-    """Darken what is turned away from the light and whiten what faces it; light is −1 to 1."""
+def lit(hue: FloatArray, light: FloatArray) -> FloatArray:
+    """Darken colours (k, 3) turned away from the light and whiten those that face it; light (k,) is −1 to 1."""
     strength = ((1 + light) / 2)[:, None]  # nothing is black: a map shows what no light fell on
     shade = 0.15 + 0.95 * np.minimum(strength / 0.8, 1)
     gleam = 0.42 * np.maximum(strength - 0.8, 0) / 0.2

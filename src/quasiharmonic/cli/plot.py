@@ -1,0 +1,61 @@
+"""``qhm plot``: a picture of the map in a file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from . import arguments
+
+    parser = commands.add_parser(
+        "plot",
+        help="draw a map: inverted triangles, distortion, or a checkerboard on the surface",
+        description="Draw the map that the input's texture coordinates (vt) give, injective or not.",
+        epilog="Exit status: 0 the picture is written; 2 wrong input or call, nothing written.",
+    )
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ file with a map")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="picture to write")
+    parser.add_argument(
+        "--kind",
+        choices=("map", "distortion", "texture"),
+        default="map",
+        help="map: the surface and the map, inverted triangles in red (default); distortion: both coloured by a "
+        "measure, and its histogram; texture: a checkerboard of the plane on the surface",
+    )
+    parser.add_argument(
+        "--measure",
+        choices=arguments.MEASURES,
+        default="isometric",
+        metavar="NAME",
+        help="what --kind distortion shows: %(choices)s (default: %(default)s)",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, draw."""
+    from quasiharmonic import io
+    from quasiharmonic.certificate import flipped_triangles
+    from quasiharmonic.plot import save_distortion_figure, save_map_figure, save_texture_figure
+
+    from . import report
+
+    report.check_picture("-o", options.output, inputs=(options.input,))
+    mesh = io.read_mesh(options.input)
+    uv = io.map_of(mesh)
+    with report.about(options.input):
+        if options.kind == "distortion":
+            save_distortion_figure(options.output, mesh.V, mesh.F, uv, options.measure)
+        elif options.kind == "texture":
+            save_texture_figure(options.output, mesh.V, mesh.F, uv)
+        else:
+            save_map_figure(options.output, mesh.V, mesh.F, uv, flipped=flipped_triangles(mesh.F, uv))
+    print(f"wrote {options.output}")
+    return 0

@@ -1,0 +1,41 @@
+"""``qhm view``: a window on a surface and its map."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "view",
+        help="look at a surface and its map in a window",
+        description="Open a window on a surface and the map that its texture coordinates (vt) give, with a "
+        "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
+        epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
+    )
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ file with a map")
+    parser.add_argument(
+        "--screenshot", type=Path, metavar="PNG", help="write what the window would show instead; needs no display"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, show."""
+    from quasiharmonic import io
+    from quasiharmonic.plot.interactive import show
+
+    from . import report
+
+    if options.screenshot is not None:
+        report.check_picture("--screenshot", options.screenshot, inputs=(options.input,))
+    mesh = io.read_mesh(options.input)
+    with report.about(options.input):
+        show(mesh.V, mesh.F, io.map_of(mesh), screenshot=options.screenshot)
+    return 0

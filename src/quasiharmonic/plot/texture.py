@@ -1,0 +1,170 @@
+"""A checkerboard of the plane seen on the surface: what a map does, as an artist looks at it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.plot.canvas import RED, as_mesh, caption, finite, new_figure, not_positive, outline, panels, verdict
+from quasiharmonic.plot.shading import lit, view
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_LIGHT, _DARK = np.array((0.93, 0.93, 0.90)), np.array((0.16, 0.38, 0.75))
+_SIDE = 600  # pixels of a panel
+_SAMPLES = 2  # per pixel and direction
+_CHUNK = 1 << 22  # samples looked at together
+
+
+def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24) -> Figure:
+    """Draw a surface with a checkerboard that a map puts on it, beside the same board in the plane.
+
+    Squares stay squares where the map keeps angles and are of one size where it keeps areas. Inverted
+    triangles are red.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float
+        The rest surface.
+    F : (f, 3) int
+    uv : (n, 2) float
+        The map.
+    squares : int
+        Of the board along the longer side of the map's bounding box.
+
+    Returns
+    -------
+    matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        When there are no triangles, a vertex is not finite, or ``squares`` is less than 1.
+    """
+    rest, F = as_mesh(V, F)
+    uv = finite(uv, "uv")
+    if not F.size:
+        raise ValueError("the mesh has no triangles")
+    if squares < 1:
+        raise ValueError(f"squares must be at least 1, not {squares}")
+    low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
+    board = (uv - low) / size * squares
+    inverted = not_positive(F, uv)
+    seen = view(rest, F)
+    figure = new_figure((9.6, 4.8))
+    surface, plane = panels(figure, 2)
+    _show(surface, seen.points, _painted(seen.points, seen.depth, F, board, inverted, seen.light))
+    caption(surface, f"surface: {len(F):,} triangles")
+    _show(plane, board, _painted(board, np.zeros(len(uv)), F, board, inverted, np.full(len(F), 0.6)))
+    outline(plane, F, board)
+    verdict(plane, "map", len(inverted))
+    return figure
+
+
+def save_texture_figure(
+    path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
+) -> None:
+    """Write `plot_texture`'s figure as a PNG of 960 × 480 pixels.
+
+    Parameters
+    ----------
+    path : path
+        Replaced as a whole once the picture is complete.
+    V, F, uv, squares
+        As for `plot_texture`.
+
+    Raises
+    ------
+    ValueError
+        What `plot_texture` raises.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    from quasiharmonic.io.atomic import write_whole
+
+    figure = plot_texture(V, F, uv, squares=squares)
+    write_whole(path, lambda file: figure.savefig(file, format="png"))
+
+
+def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
+    """Lay a painted image under axes in the units of its points."""
+    low, high = _window(points)
+    ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
+    ax.set_axis_off()
+
+
+def _window(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of the square that a panel shows."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    reach = 0.52 * (float((high - low).max()) or 1.0)
+    return (low + high) / 2 - reach, (low + high) / 2 + reach
+
+
+def _painted(
+    points: FloatArray, depth: FloatArray, F: IntArray, board: FloatArray, inverted: IntArray, light: FloatArray
+) -> FloatArray:
+    """An image (side, side, 4) of triangles seen in the plane, the nearest of them at each pixel.
+
+    ``points`` (n, 2) and ``depth`` (n,) are where vertices are seen, ``board`` (n, 2) their places on the
+    checkerboard, whose squares have side 1, and ``light`` (f,) falls on the triangles.
+    """
+    side = _SIDE * _SAMPLES
+    low, high = _window(points)
+    place = (points - low) / (high - low) * side
+    bad = np.zeros(len(F), dtype=bool)
+    bad[inverted] = True
+
+    image = np.zeros((side * side, 4))
+    nearest = np.full(side * side, -np.inf)
+    for triangle, pixel, weights in _samples(place[F], side):
+        z = np.einsum("kc,kc->k", weights, depth[F[triangle]])
+        # The last of repeated indices stays: sorted by depth, the nearest one.
+        order = np.argsort(z, kind="stable")
+        order = order[z[order] >= nearest[pixel[order]]]
+        triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
+        nearest[pixel] = z
+        square = np.floor(np.einsum("kc,kcd->kd", weights, board[F[triangle]])).sum(axis=1) % 2
+        color = np.where(square[:, None] == 0, _LIGHT, _DARK)
+        color[bad[triangle]] = RED
+        image[pixel, :3] = lit(color, light[triangle])
+        image[pixel, 3] = 1
+    grid = image.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 4)[::-1]
+    cover = grid[..., 3].sum(axis=(1, 3))
+    shown = grid[..., :3].sum(axis=(1, 3)) / np.maximum(cover, 1)[..., None]
+    return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
+
+
+def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
+    """Yield, in chunks, triangles (k,), the samples (k,) that lie in them, and their barycentric coordinates (k, 3)."""
+    first = np.maximum(np.ceil(corners.min(axis=1) - 0.5), 0).astype(np.int64)
+    last = np.minimum(np.floor(corners.max(axis=1) - 0.5), side - 1).astype(np.int64)
+    extent = np.maximum(last - first + 1, 0)
+    count = extent.prod(axis=1)
+    cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
+    for part in np.split(np.arange(len(corners)), np.unique(cuts)):
+        many = count[part]
+        triangle = np.repeat(part, many)
+        within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+        column = first[triangle, 0] + within % np.maximum(extent[triangle, 0], 1)
+        row = first[triangle, 1] + within // np.maximum(extent[triangle, 0], 1)
+        at = np.stack([column, row], axis=1) + 0.5
+        a, b, c = corners[triangle].transpose(1, 0, 2)
+        whole = _cross(b - a, c - a)
+        whole = np.where(whole == 0, np.nan, whole)
+        weights = np.stack([_cross(b - at, c - at), _cross(c - at, a - at), _cross(a - at, b - at)], axis=1)
+        weights /= whole[:, None]
+        inside = (weights >= 0).all(axis=1)
+        yield triangle[inside], (row * side + column)[inside], weights[inside]
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
