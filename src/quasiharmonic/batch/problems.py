@@ -1,0 +1,115 @@
+"""The problems of a data set: which there are, what they are called, which files they are made of."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from quasiharmonic.io import problem_files
+
+#: A file that marks a folder as the output of a run; nothing in there is a problem.
+MARKER = "qhm-batch.json"
+
+# Files that are a mesh by their names; whatever else is named as a source is a list.
+_MESH = re.compile(r"\.(obj|off)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class ProblemFiles:
+    """One problem, as files.
+
+    Attributes
+    ----------
+    name : str
+        Its place in the data set, parts separated by ``/``: unique, and stable from run to run.
+    mesh : Path
+        Absolute path of the mesh.
+    fixed : Path or None
+        Absolute path of the list of vertices to hold, where there is one.
+    """
+
+    name: str
+    mesh: Path
+    fixed: Path | None
+
+
+def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Iterator[ProblemFiles]:
+    """Find every problem of a data set, one after another in the order of their names.
+
+    Parameters
+    ----------
+    source : path
+        A folder, searched at any depth, links followed; a mesh; or a text file that lists folders and meshes,
+        one a line, relative to its own folder, with blank lines and ``#`` comments.
+    plain : bool
+        Take every mesh for a problem. Otherwise a problem is a folder with ``input.obj`` and, usually,
+        ``handles.txt``, or an OBJ file that is named itself.
+
+    Yields
+    ------
+    ProblemFiles
+        Folders that hold the output of a run are passed over.
+
+    Raises
+    ------
+    ValueError
+        When nothing is there, or a line of a list names nothing.
+    OSError
+        When a folder or the list cannot be read.
+    """
+    path = Path(os.path.abspath(source))
+    if path.is_dir():
+        yield from _below(path, "", plain, frozenset())
+    elif not path.exists():
+        raise ValueError(f"there is no folder, list or mesh {source}")
+    elif _MESH.fullmatch(path.suffix):
+        yield ProblemFiles(path.name, path, None)
+    else:
+        yield from _listed(path, plain)
+
+
+def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int]]) -> Iterator[ProblemFiles]:
+    """Problems in a folder and below; ``above`` are the folders it lies in, for links that lead back."""
+    status = folder.stat()
+    here = (status.st_dev, status.st_ino)
+    if here in above:
+        return
+    with os.scandir(folder) as entries:
+        kinds = sorted((entry.name, entry.is_dir()) for entry in entries)
+    files = {entry for entry, is_folder in kinds if not is_folder}
+    if MARKER in files:
+        return
+    if not plain and "input.obj" in files:
+        name = name or folder.name
+        yield ProblemFiles(name, *problem_files(folder))
+    for entry, is_folder in kinds:
+        inner = f"{name}/{entry}" if name else entry
+        if is_folder:
+            yield from _below(folder / entry, inner, plain, above | {here})
+        elif plain and _MESH.fullmatch(os.path.splitext(entry)[1]):
+            yield ProblemFiles(inner, folder / entry, None)
+
+
+def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
+    seen = set()
+    with open(path, encoding="utf-8", errors="surrogateescape") as lines:
+        for number, line in enumerate(lines, 1):
+            text = line.split("#", 1)[0].strip()
+            if not text:
+                continue
+            place = Path(os.path.abspath(path.parent / text))
+            if not (place.is_dir() or (_MESH.fullmatch(place.suffix) and place.is_file())):
+                raise ValueError(f"{path}: line {number}: there is no folder and no mesh {text}")
+            base = path.parent if place.is_relative_to(path.parent) else Path(place.anchor)
+            name = place.relative_to(base).as_posix()
+            if place.is_dir():
+                found = _below(place, "" if name == "." else name, plain, frozenset())
+            else:
+                found = iter([ProblemFiles(name, place, None)])
+            for problem in found:
+                if problem.name not in seen:
+                    seen.add(problem.name)
+                    yield problem

@@ -1,0 +1,272 @@
+"""Records: what became of every problem, one JSON file each, and all of them as a table.
+
+A record's file is written when its problem is finished and is the sign that it is. Tables are made of
+these files, a batch of rows at a time.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError, OutputError
+
+Record = dict[str, Any]
+
+#: What can become of a problem.
+OUTCOMES: dict[str, str] = {
+    "injective": "certified injective",
+    "not injective": "no injective map found",
+    "invalid": "input cannot be used",
+    "error": "unexpected error",
+    "timeout": "over the time limit",
+    "memory": "over the memory limit",
+    "crash": "process died",
+}
+
+#: Columns of a table, in order, and the types of what is in them; every one may be empty.
+COLUMNS: dict[str, type] = {
+    "problem": str,
+    "source": str,
+    # One of `OUTCOMES`.
+    "outcome": str,
+    # Whether every triangle of the written map is positive, and whether it is bijective besides; decided exactly.
+    "certified": bool,
+    "bijective": bool,
+    # Why it ended: the name of a `quasiharmonic.Status`.
+    "status": str,
+    "vertices": int,
+    "triangles": int,
+    "fixed": int,
+    "pins": int,
+    "loops": int,
+    # Triangles not positive: in the first map of the search, and in the one written.
+    "flips_before": int,
+    "flips_after": int,
+    "iterations": int,
+    # Of the stages that ran, as JSON: see `quasiharmonic.Stage`.
+    "stages": str,
+    # Wall time from the file to the record, and of its parts.
+    "seconds": float,
+    "seconds_read": float,
+    "seconds_setup": float,
+    "seconds_map": float,
+    "seconds_polish": float,
+    "seconds_write": float,
+    "seconds_measure": float,
+    # Mean of σ₁/σ₂ + σ₂/σ₁ − 2 (§10), and the largest max(σ₁, 1/σ₂) after scaling to the surface's area.
+    "mips": float,
+    "isometric": float,
+    # Resident memory of the process at its most, bytes.
+    "peak_memory": int,
+    "linear_solver": str,
+    "threads": int,
+    "time_limit": float,
+    "memory_limit": int,
+    # Of Python and packages, as JSON.
+    "versions": str,
+    "error": str,
+    # Digest of the input and the settings.
+    "key": str,
+    "map_bytes": int,
+}
+
+#: What tables of a run are called.
+TABLES = "records.csv", "records.parquet"
+#: What the record of a problem is called in the folder of its results.
+FILE = "record.json"
+_MAP = "map.obj"
+_ROWS = 1000
+
+
+def map_path(folder: Path) -> Path:
+    """Where the map of a problem is written, given the problem's results."""
+    return folder / _MAP
+
+
+def write_record(folder: Path, record: Record) -> None:
+    """Write the record of a problem into the folder of its results.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written.
+    """
+    write_whole(folder / FILE, json.dumps(record, allow_nan=False).encode() + b"\n", durable=False)
+
+
+def read_record(folder: Path) -> Record | None:
+    """Read the record of a problem; None where there is none, or not a whole one."""
+    try:
+        record = json.loads((folder / FILE).read_bytes())
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def clear(folder: Path) -> None:
+    """Make room for a problem's results: what an earlier try left goes, its record first.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be made or emptied.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in (folder / FILE, folder / _MAP, *folder.glob(".qhm-*.tmp")):
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
+
+
+def is_complete(folder: Path, record: Record) -> bool:
+    """Whether the map that a record tells of is there with its whole length."""
+    if record.get("map_bytes") is None:
+        return True
+    try:
+        return (folder / _MAP).stat().st_size == record["map_bytes"]
+    except OSError:
+        return False
+
+
+def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None:
+    """Write records as one table, whole or not at all; memory does not grow with their number.
+
+    Parameters
+    ----------
+    path : path
+        ``.csv`` or ``.parquet``.
+    records : iterable of dict
+        Values by the names of `COLUMNS`; what is missing is left empty.
+
+    Raises
+    ------
+    ValueError
+        When the suffix is another.
+    ImportError
+        When Parquet is asked for and pyarrow is not installed.
+    OutputError
+        When it cannot be written.
+    """
+    if _suffix(path) == ".csv":
+        write_whole(path, lambda file: _write_csv(file, records))
+    else:
+        parquet = _pyarrow()
+        write_whole(path, lambda file: _write_parquet(parquet, file, records))
+
+
+def check_table(path: str | os.PathLike[str]) -> None:
+    """Say early whether a table of this name can be made; raises what `write_table` would."""
+    if _suffix(path) == ".parquet":
+        _pyarrow()
+
+
+def read_table(path: str | os.PathLike[str]) -> Iterator[Record]:
+    """Read a table, a record at a time.
+
+    Parameters
+    ----------
+    path : path
+        ``.csv`` or ``.parquet``, from `write_table` or of one's own making.
+
+    Yields
+    ------
+    dict
+        Values by column, None where empty. Columns not known here stay as they are.
+
+    Raises
+    ------
+    MeshFileError
+        When the file cannot be read as a table, has no column ``problem``, or a value is not of its column's type.
+    ValueError
+        When the suffix is another.
+    ImportError
+        When Parquet is to be read and pyarrow is not installed.
+    """
+    rows = _csv_rows(path) if _suffix(path) == ".csv" else _parquet_rows(path)
+    for number, row in enumerate(rows, 1):
+        if not row.get("problem"):
+            raise MeshFileError(path, f"record {number} names no problem", remedy="a column `problem` is needed")
+        yield {column: _typed(path, number, column, value) for column, value in row.items()}
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        raise ValueError(f"{os.fspath(path)!r}: tables of records are .csv or .parquet")
+    return suffix
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ImportError("Parquet needs pyarrow: pip install 'quasiharmonic[batch]', or choose .csv") from error
+    return pyarrow.parquet
+
+
+def _plain(value: Any) -> Any:
+    """A value as tables have it: names that are no valid Unicode are made so."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+
+
+def _write_csv(file: BinaryIO, records: Iterable[Record]) -> None:
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
+    table = csv.writer(text)
+    table.writerow(COLUMNS)
+    table.writerows([_plain(record.get(column)) for column in COLUMNS] for record in records)
+    text.detach()
+
+
+def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> None:
+    import pyarrow
+
+    names = {str: pyarrow.string(), bool: pyarrow.bool_(), int: pyarrow.int64(), float: pyarrow.float64()}
+    schema = pyarrow.schema([(column, names[kind]) for column, kind in COLUMNS.items()])
+    rest = iter(records)
+    with parquet.ParquetWriter(file, schema) as writer:
+        while rows := [{c: _plain(record.get(c)) for c in COLUMNS} for record in islice(rest, _ROWS)]:
+            writer.write_table(pyarrow.Table.from_pylist(rows, schema=schema))
+
+
+def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            for row in csv.DictReader(file):
+                row.pop(None, None)  # what stands behind the last column
+                yield row
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+
+
+def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
+    parquet = _pyarrow()
+    import pyarrow
+
+    try:
+        with parquet.ParquetFile(path) as file:
+            for batch in file.iter_batches(_ROWS):
+                yield from batch.to_pylist()
+    except (OSError, pyarrow.ArrowException) as error:
+        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+
+
+def _typed(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:
+    """A value of a table in the type of its column; CSV knows text only."""
+    if value == "":
+        return None
+    kind = COLUMNS.get(column)
+    if not isinstance(value, str) or kind is None or kind is str:
+        return value
+    try:
+        return {"true": True, "false": False}[value.lower()] if kind is bool else kind(value)
+    except (ValueError, KeyError):
+        raise MeshFileError(path, f"record {number}: {value!r} is no {kind.__name__} for {column}") from None

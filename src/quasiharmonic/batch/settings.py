@@ -1,0 +1,97 @@
+"""How the problems of a data set are solved, and the key by which a finished one is known again."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from quasiharmonic import __version__
+from quasiharmonic.batch.problems import ProblemFiles
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the result of a problem, beside its files.
+
+    Attributes
+    ----------
+    to : str or None
+        Problems are plain meshes, and their boundaries go to this outline, as `quasiharmonic.targets.outline` reads
+        it; its holes are filled for a surface that has none. None where problems say themselves where fixed vertices
+        go.
+    strategy : {"speed", "quality"}
+    polish : str or None
+        Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
+    reference : {"equilateral", "rest", "corrected"} or None
+    max_iterations : int
+    linear_solver : str
+        All as `quasiharmonic.injective_map` takes them.
+    """
+
+    to: str | None = None
+    strategy: str = "speed"
+    polish: str | None = None
+    reference: str | None = None
+    max_iterations: int = 2000
+    linear_solver: str = "auto"
+
+    @property
+    def plain(self) -> bool:
+        """Whether problems are plain meshes."""
+        return self.to is not None
+
+    def key(self, files: ProblemFiles) -> str:
+        """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.
+
+        Raises
+        ------
+        OSError
+            When a file cannot be read.
+        """
+        digest = blake2b(digest_size=16)
+        drawing = None if self.to is None or not os.path.isfile(self.to) else Path(self.to)
+        for path in (files.mesh, files.fixed, drawing):
+            contents = b"" if path is None else path.read_bytes()
+            digest.update(len(contents).to_bytes(8, "little"))
+            digest.update(contents)
+        digest.update(json.dumps([__version__, self.to_dict()], sort_keys=True).encode())
+        return digest.hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class Orders:
+    """What everyone who works on a run has to know.
+
+    Attributes
+    ----------
+    output : Path
+        Absolute path of the run's folder, the same wherever the work is done.
+    settings : Settings
+    threads : int
+        Threads of the linear solver.
+    time_limit : float or None
+        Seconds for one problem.
+    memory_limit : int or None
+        Bytes of resident memory for the process that solves a problem.
+    retry : bool
+        Whether to try again what failed for other reasons than the input.
+    """
+
+    output: Path
+    settings: Settings
+    threads: int = 1
+    time_limit: float | None = None
+    memory_limit: int | None = None
+    retry: bool = False
+
+    def folder(self, name: str) -> Path:
+        """Where the map and the record of a problem are."""
+        return self.output / "results" / name

@@ -1,0 +1,334 @@
+"""Data sets on one machine: which problems are found, that none is lost, and that troubles stay where they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets import record_of, star_of, write_problem, write_stars
+from quasiharmonic import batch, certify, io
+from quasiharmonic.batch import keeper, records
+from quasiharmonic.cli import main
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import annulus
+from quasiharmonic.targets import outline, signed_area
+
+TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
+linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
+
+
+def names(source, **options):
+    return [problem.name for problem in batch.find_problems(source, **options)]
+
+
+@pytest.fixture
+def stars(tmp_path):
+    """Four problems at several depths."""
+    return write_stars(tmp_path / "set", ["a", "b/c", "b/d/e", "z"])
+
+
+@pytest.fixture
+def troubled(monkeypatch):
+    monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
+
+
+class TestFinding:
+    def test_any_depth_in_order(self, stars):
+        (stars / "b" / "notes.txt").write_text("no problem")
+        (stars / "b" / "other.obj").write_text("no problem by itself")
+        found = list(batch.find_problems(stars))
+        assert [problem.name for problem in found] == ["a", "b/c", "b/d/e", "z"]
+        assert found[1].mesh == stars / "b/c/input.obj"
+        assert found[1].fixed == stars / "b/c/handles.txt"
+
+    def test_a_problem_may_have_others_below_and_be_alone(self, stars):
+        write_stars(stars, ["b"])
+        assert names(stars) == ["a", "b", "b/c", "b/d/e", "z"]
+        assert names(stars / "a") == ["a"]
+        assert names(stars / "b") == ["b", "b/c", "b/d/e"]
+        (stars / "a" / "handles.txt").unlink()
+        assert next(batch.find_problems(stars)).fixed is None
+
+    def test_plain_meshes(self, stars):
+        (stars / "b" / "other.OFF").write_text("")
+        assert names(stars, plain=True) == [
+            "a/input.obj", "b/c/input.obj", "b/d/e/input.obj", "b/other.OFF", "z/input.obj",
+        ]  # fmt: skip
+        assert names(stars / "a" / "input.obj") == ["input.obj"]
+
+    def test_lists(self, stars, tmp_path):
+        elsewhere = write_stars(tmp_path / "elsewhere", ["y"])
+        text = f"# a list\n\nz # the last\nb\n{elsewhere}/y\nb/c\na/input.obj\n"
+        (stars / "list.txt").write_text(text)
+        assert names(stars / "list.txt") == ["z", "b/c", "b/d/e", f"{elsewhere}/y".lstrip("/"), "a/input.obj"]
+        (stars / "list.txt").write_text("a\nnowhere\n")
+        with pytest.raises(ValueError, match=r"list.txt: line 2: .*nowhere"):
+            names(stars / "list.txt")
+        with pytest.raises(ValueError, match="there is no folder, list or mesh"):
+            names(stars / "none")
+
+    def test_output_is_no_input(self, stars):
+        batch.run(stars, stars / "out", jobs=1)
+        assert names(stars) == ["a", "b/c", "b/d/e", "z"]
+        assert len(names(stars, plain=True)) == 4
+
+    @pytest.mark.skipif(os.name != "posix", reason="makes links")
+    def test_links_are_followed_and_circles_are_not(self, stars):
+        (stars / "linked").symlink_to(stars / "b")
+        (stars / "b" / "back").symlink_to(stars)
+        assert names(stars) == ["a", "b/c", "b/d/e", "linked/c", "linked/d/e", "z"]
+
+
+class TestRun:
+    def test_maps_and_records(self, stars, tmp_path):
+        seen = []
+        progress = batch.run(stars, tmp_path / "out", jobs=2, callback=lambda p: seen.append((p.done, p.failed)))
+        assert (progress.total, progress.done, progress.solved, progress.failed) == (4, 4, 4, 0)
+        assert progress.outcomes == {"injective": 4}
+        assert seen[-1] == (4, 0)
+        for name in ("a", "b/c", "b/d/e", "z"):
+            mesh = io.read_mesh(stars / name / "input.obj")
+            written = io.read_mesh(tmp_path / "out" / "results" / name / "map.obj")
+            fixed = io.read_handles(stars / name / "handles.txt", len(mesh.V))
+            uv = io.map_of(written)
+            np.testing.assert_array_equal(written.V, mesh.V)
+            np.testing.assert_array_equal(written.F, mesh.F)
+            np.testing.assert_array_equal(uv[fixed], io.map_of(mesh)[fixed])
+            assert certify(mesh.F, uv).injective
+            record = record_of(tmp_path / "out", name)
+            assert record["certified"]
+            assert (record["vertices"], record["triangles"]) == (len(mesh.V), len(mesh.F))
+            assert record["flips_after"] == 0
+            assert record["iterations"] == sum(stage["iterations"] for stage in json.loads(record["stages"]))
+            parts = [v for k, v in record.items() if k.startswith("seconds_")]
+            assert 0 < sum(parts) <= record["seconds"]
+            assert record["mips"] > 0
+            assert record["isometric"] >= 1
+            assert set(json.loads(record["versions"])) == {"quasiharmonic", "python", "numpy", "scipy"}
+            assert set(record) <= set(batch.COLUMNS)
+        assert record["flips_before"] > 0  # of the last one; the first are easy
+        table = list(batch.read_table(tmp_path / "out" / "records.csv"))
+        assert [row["problem"] for row in table] == ["a", "b/c", "b/d/e", "z"]
+        for row in table:
+            expected = record_of(tmp_path / "out", row["problem"])
+            assert {k: v for k, v in row.items() if v is not None} == {
+                k: v for k, v in expected.items() if v is not None
+            }
+
+    def test_distortion_is_that_of_the_map(self, stars, tmp_path):
+        """Against singular values computed here."""
+        batch.run(stars / "a", tmp_path / "out", batch.Settings(polish="mips"))
+        mesh = io.read_mesh(tmp_path / "out" / "results" / "a" / "map.obj")
+        a, b, c = mesh.V[mesh.F, :2].transpose(1, 0, 2)
+        p, q, r = io.map_of(mesh)[mesh.F].transpose(1, 0, 2)
+        J = np.stack([q - p, r - p], axis=2) @ np.linalg.inv(np.stack([b - a, c - a], axis=2))
+        sigma = np.linalg.svd(J, compute_uv=False)
+        area = np.abs(np.cross(np.pad(b - a, [(0, 0), (0, 1)]), np.pad(c - a, [(0, 0), (0, 1)]))[:, 2])
+        ratio = sigma[:, 0] / sigma[:, 1]
+        record = record_of(tmp_path / "out", "a")
+        assert record["mips"] == pytest.approx(np.average(ratio + 1 / ratio - 2, weights=area), rel=1e-9)
+        sigma = sigma * np.sqrt(area.sum() / (area * sigma.prod(axis=1)).sum())
+        assert record["isometric"] == pytest.approx(max(sigma.max(), 1 / sigma.min()), rel=1e-9)
+        assert record["seconds_polish"] > 0
+        assert record["status"] == "polished"
+
+    def test_a_rerun_does_what_is_new_and_nothing_else(self, stars, tmp_path):
+        out = tmp_path / "out"
+        batch.run(stars, out, jobs=1)
+        stamps = {path: path.stat().st_mtime_ns for path in out.rglob("map.obj")}
+        write_problem(stars / "a", *star_of(4))  # other contents
+        (out / "results/b/c/record.json").write_text('{"key": "cut sho')
+        os.truncate(out / "results/b/d/e/map.obj", 100)  # as a power failure might
+        (out / "results/b/c/.qhm-0123.tmp").write_text("left by a kill")
+        progress = batch.run(stars, out, jobs=1)
+        assert (progress.solved, progress.resumed) == (4, 1)
+        again = {path for path, stamp in stamps.items() if path.stat().st_mtime_ns != stamp}
+        assert again == {out / "results" / name / "map.obj" for name in ("a", "b/c", "b/d/e")}
+        assert not list(out.rglob("*.tmp"))
+        assert batch.run(stars, out, jobs=1).resumed == 4
+        assert batch.run(stars, out, batch.Settings(strategy="quality"), jobs=1).resumed == 0
+
+    def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
+        batch.run(stars, tmp_path / "out", jobs=1)
+        monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
+        assert batch.run(stars, tmp_path / "out").resumed == 4
+
+    def test_plain_meshes_onto_an_outline(self, stars, tmp_path):
+        io.write_off(stars / "ring.off", io.MeshData(*annulus(6)))
+        settings = batch.Settings(to="letter:O")
+        progress = batch.run(stars, tmp_path / "out", settings, jobs=1)
+        assert progress.outcomes == {"injective": 5}
+        (outer, hole) = outline("letter:O")
+        for name, loops in (("a/input.obj", [outer]), ("ring.off", [outer, hole])):
+            written = io.read_mesh(tmp_path / "out" / "results" / name / "map.obj")
+            uv = io.map_of(written)
+            areas = [abs(signed_area(uv[loop])) for loop in boundary_loops(written.F, len(uv))]
+            np.testing.assert_allclose(sorted(areas), sorted(abs(signed_area(c)) for c in loops), rtol=0.2)
+
+    def test_a_drawing_is_part_of_the_input(self, stars, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        Path("outline.csv").write_text("0,0\n2,0\n2,1\n0,1\n")
+        settings = batch.Settings(to="outline.csv")
+        assert batch.run(stars / "a", "out", settings).solved == 1
+        assert batch.run(stars / "a", "out", settings).resumed == 1
+        Path("outline.csv").write_text("0,0\n3,0\n3,1\n0,1\n")
+        assert batch.run(stars / "a", "out", settings).resumed == 0
+        with pytest.raises(ValueError, match="blob"):
+            batch.run(stars, "other", batch.Settings(to="blob:3"))
+        assert not Path("other").exists()
+
+    def test_parquet(self, stars, tmp_path):
+        pytest.importorskip("pyarrow")
+        batch.run(stars, tmp_path / "out", jobs=1, table="parquet")
+        table = list(batch.read_table(tmp_path / "out" / "records.parquet"))
+        assert [row["problem"] for row in table] == ["a", "b/c", "b/d/e", "z"]
+        assert table[0]["certified"] is True
+        batch.run(stars, tmp_path / "out", jobs=1)
+        assert [*batch.read_table(tmp_path / "out" / "records.csv")] == table
+        assert not (tmp_path / "out" / "records.parquet").exists()
+
+    def test_refused_calls(self, stars, tmp_path):
+        (tmp_path / "empty").mkdir()
+        with pytest.raises(ValueError, match=r"no problems in .*empty"):
+            batch.run(tmp_path / "empty", tmp_path / "out")
+        for wrong in ({"jobs": 0}, {"threads": 0}, {"time_limit": -1.0}, {"memory_limit": 0}, {"table": "xls"}):
+            with pytest.raises(ValueError, match=next(iter(wrong)) if "table" not in wrong else "csv or .parquet"):
+                batch.run(stars, tmp_path / "out", **wrong)
+        for name, value in (
+            ("strategy", "hope"),
+            ("polish", "soap"),
+            ("reference", "x"),
+            ("linear_solver", "abacus"),
+            ("max_iterations", 0),
+        ):
+            with pytest.raises(ValueError, match=f"{name} must be .*, not {value!r}"):
+                batch.run(stars, tmp_path / "out", batch.Settings(**{name: value}))
+        with pytest.raises(ValueError, match="jobs"):
+            batch.run(stars, tmp_path / "out", jobs=2, scheduler="tcp://localhost:1")
+        assert not (tmp_path / "out").exists()
+        (tmp_path / "file").write_text("")
+        with pytest.raises(OSError, match="cannot write to"):
+            batch.run(stars, tmp_path / "file" / "out")
+
+    def test_worker_that_does_not_start(self, stars, tmp_path, monkeypatch, capsys):
+        monkeypatch.setattr(keeper, "COMMAND", [sys.executable, "-c", "raise SystemExit('no such luck')"])
+        with pytest.raises(batch.WorkerError, match="no such luck"):
+            batch.run(stars, tmp_path / "out")
+        monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
+        assert main(["batch", str(stars), "-o", str(tmp_path / "out")]) == 2
+        assert "cannot start /nonexistent" in capsys.readouterr().err
+
+    def test_an_interrupt_stops_at_once_and_keeps_what_is_done(self, stars, tmp_path, troubled):
+        write_stars(stars, ["y_sleep"])
+
+        def interrupt(progress):
+            if progress.done >= 3:
+                raise KeyboardInterrupt
+
+        began = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            batch.run(stars, tmp_path / "out", jobs=2, callback=interrupt)
+        assert time.monotonic() - began < 20
+        assert not (tmp_path / "out/results/y_sleep/record.json").exists()
+        assert record_of(tmp_path / "out", "a")["certified"]
+
+
+class TestTables:
+    @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+    def test_what_is_written_is_read(self, tmp_path, suffix):
+        if suffix == ".parquet":
+            pytest.importorskip("pyarrow")
+        row = {"problem": 'caf\u00e9, "x"\n', "certified": True, "mips": 0.1 + 0.2}
+        rows = [{**row, "vertices": k, "error": None} for k in range(2500)]
+        records.write_table(tmp_path / f"t{suffix}", iter(rows))
+        read = list(records.read_table(tmp_path / f"t{suffix}"))
+        assert len(read) == 2500
+        assert [row["vertices"] for row in read] == list(range(2500))
+        assert {k: v for k, v in read[0].items() if v is not None} == {**row, "vertices": 0}
+
+    def test_names_that_are_no_unicode(self, tmp_path):
+        records.write_table(tmp_path / "t.csv", [{"problem": "bad\udcff"}])
+        assert next(records.read_table(tmp_path / "t.csv"))["problem"] == r"bad\udcff"
+
+    def test_foreign_tables(self, tmp_path):
+        path = tmp_path / "tlc.csv"
+        path.write_text("problem,seconds,host\na,1.5,x\nb,,y\n")
+        assert list(records.read_table(path)) == [
+            {"problem": "a", "seconds": 1.5, "host": "x"},
+            {"problem": "b", "seconds": None, "host": "y"},
+        ]
+        for text, words in (
+            ("name,seconds\na,1\n", "record 1 names no problem"),
+            ("problem,seconds\na,fast\n", "record 1: 'fast' is no float for seconds"),
+            ("problem,certified\na,maybe\n", "'maybe' is no bool"),
+        ):
+            path.write_text(text)
+            with pytest.raises(io.MeshFileError, match=words):
+                list(records.read_table(path))
+        with pytest.raises(io.MeshFileError, match="cannot be read as a table"):
+            list(records.read_table(tmp_path / "none.csv"))
+        with pytest.raises(ValueError, match=r"csv or .parquet"):
+            list(records.read_table(tmp_path / "t.xls"))
+
+    def test_parquet_without_pyarrow(self, stars, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+        with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[batch\]'"):
+            batch.run(stars, tmp_path / "out", table="parquet")
+        assert not (tmp_path / "out").exists()
+
+
+class TestCommand:
+    def test_statuses(self, stars, tmp_path, capsys):
+        out = str(tmp_path / "out")
+        assert main(["batch", str(stars), "-o", out, "-j", "1", "--memory-limit", "2G"]) == 0
+        said = capsys.readouterr()
+        assert "4 of 4 problems have a certified injective map" in said.out
+        assert said.err == ""
+        (stars / "a" / "input.obj").write_text("nonsense")
+        assert main(["batch", str(stars), "-o", out]) == 1
+        assert "the others: 1 input cannot be used" in capsys.readouterr().out
+        assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
+        assert "there is no folder" in capsys.readouterr().err
+
+    def test_full_disk(self, tmp_path, capsys, troubled):
+        write_stars(tmp_path / "set", ["full"])
+        assert main(["batch", str(tmp_path / "set"), "-o", str(tmp_path / "out")]) == 2
+        assert "o space left" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("text", "value"), [("800M", 800 << 20), ("4G", 4 << 30), ("1.5 GiB", 3 << 29), ("7k", 7168)]
+    )
+    def test_sizes(self, text, value):
+        from quasiharmonic.cli.batch import _bytes
+
+        assert _bytes(text) == value
+        for wrong in ("", "4X", "-1G", "0", "1.2.3G", "."):
+            with pytest.raises(Exception, match="not a size"):
+                _bytes(wrong)
+
+    def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
+        pty = pytest.importorskip("pty")
+        leader, follower = pty.openpty()
+        command = [sys.executable, "-m", "quasiharmonic", "batch", str(stars), "-j", "1", "-o"]
+        assert subprocess.run([*command, str(tmp_path / "1")], stdout=subprocess.PIPE, stderr=follower).returncode == 0
+        os.close(follower)
+        shown = os.read(leader, 1 << 16).decode()
+        os.close(leader)
+        assert re.search(r"\d/4 done   0 failed   \S+/s", shown)
+        assert " left" in shown
+        assert shown.endswith("\r\x1b[K")
+        often = "import sys; from quasiharmonic.cli import batch, main; batch._LOG = 0; main(sys.argv[1:])"
+        done = subprocess.run(
+            [sys.executable, "-c", often, *command[3:], str(tmp_path / "2")], capture_output=True, text=True
+        )
+        lines = done.stderr.splitlines()
+        assert lines[-1].startswith("4/4 done")
+        assert "\r" not in done.stderr

@@ -1,0 +1,255 @@
+"""The page about a run: its numbers, its figures, and that nothing in it can do harm or reach outside."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from base64 import b64decode
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from datasets import write_stars
+from quasiharmonic import batch
+from quasiharmonic.batch import records
+from quasiharmonic.batch.report import figures, numbers, page
+from quasiharmonic.cli import main
+
+VILE = '<script>alert(1)</script>"><img src=x onerror=alert(2)>&amp;\u202egnp'
+
+
+class Reader(HTMLParser):
+    """Tags with attributes, and the text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(self.words)
+
+
+def made(tmp_path, count=200, seed=0, name="t.csv", **more):
+    """A table of records that never ran."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for k in range(count):
+        good = k % 20 != 3
+        rows.append(
+            {
+                "problem": f"{'simple' if k % 2 else 'letters'}/{k}",
+                "outcome": "injective" if good else "timeout",
+                "certified": good,
+                "triangles": int(10 ** rng.uniform(2, 5)),
+                "seconds": float(10 ** rng.uniform(-2, 1)),
+                "seconds_map": 0.01,
+                "mips": float(10 ** rng.uniform(-1, 2)) if good else None,
+                "error": None if good else "not done within 10 s",
+                **more,
+            }
+        )
+    records.write_table(tmp_path / name, rows)
+    return rows
+
+
+def written(tmp_path, *arguments):
+    batch.write_report(tmp_path / "report.html", *arguments)
+    return (tmp_path / "report.html").read_text()
+
+
+class TestPage:
+    def test_numbers(self, tmp_path):
+        rows = made(tmp_path)
+        text = Reader(written(tmp_path, tmp_path / "t.csv")).text
+        good = [row for row in rows if row["certified"]]
+        assert "95.0 %" in text
+        assert "190 of 200 certified injective" in text
+        assert f"median {page.number(float(np.median([row['mips'] for row in good])))}".capitalize() in text
+        assert page.number(float(np.median([row["seconds"] for row in good])), "s") in text
+        assert "190 certified injective, 10 over the time limit" in text
+        assert re.search(r"letters +100 +100 +100 %", text)
+        assert re.search(r"simple +100 +90 +90.0 %", text)
+        assert "Failed (10)" in text
+        assert text.count("over the time limit: not done within 10 s") == 10
+        slowest = sorted(good, key=lambda row: -row["seconds"])[:12]
+        listed = re.findall(r"(?:simple|letters)/\d+", text[text.index("Slowest") : text.index("Most distorted")])
+        assert listed == [row["problem"] for row in slowest]
+
+    def test_of_a_real_run_with_pictures(self, tmp_path):
+        source = write_stars(tmp_path / "set", ["easy/a", "easy/b", "hard/c"])
+        (source / "bad").mkdir()
+        (source / "bad" / "input.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+        batch.run(source, tmp_path / "out", jobs=1)
+        assert main(["report", str(tmp_path / "out")]) == 0
+        read = Reader((tmp_path / "out" / "report.html").read_text())
+        pictures = [attributes["src"] for tag, attributes in read.tags if tag == "img"]
+        # Three maps in two lists, and a surface that has no map.
+        assert len(pictures) == 7
+        for picture in pictures:
+            head, data = picture.split(",")
+            assert head == "data:image/png;base64"
+            assert b64decode(data).startswith(b"\x89PNG")
+        assert len(set(pictures)) == 4
+        assert "75.0 %" in read.text
+        assert "input cannot be used" in read.text
+        assert str(source) in read.text
+
+    def test_of_a_run_that_is_going_on(self, tmp_path):
+        source = write_stars(tmp_path / "set", ["a", "b", "c"])
+        batch.run(source, tmp_path / "out", jobs=1)
+        (tmp_path / "out" / "records.csv").unlink()
+        (tmp_path / "out" / "results" / "c" / "record.json").unlink()
+        assert "2 of 2 certified" in Reader(written(tmp_path, tmp_path / "out")).text
+
+    @pytest.mark.parametrize("column", ["problem", "error", "outcome", "source", "versions"])
+    def test_whatever_things_are_called(self, tmp_path, column):
+        made(tmp_path, 30, **{column: VILE, "certified": False})
+        made(tmp_path, 30, name="x.csv")
+        (tmp_path / "x.csv").rename(tmp_path / "<b>o&.csv")
+        read = Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "<b>o&.csv"))
+        assert not {"script", "iframe", "link", "object"} & {tag for tag, _ in read.tags}
+        assert all(attributes.get("src", "data:").startswith("data:") for _, attributes in read.tags)
+        assert not any(name.startswith("on") or name == "href" for _, attributes in read.tags for name in attributes)
+        assert "<b>o&.csv" in read.text
+        if column in ("problem", "error", "outcome"):
+            assert r"<script>alert(1)</script>" in read.text
+            assert r"\u202e" in read.text
+            assert "\u202e" not in read.text
+
+    def test_refers_to_nothing_outside(self, tmp_path):
+        made(tmp_path)
+        text = written(tmp_path, tmp_path / "t.csv")
+        assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
+        assert "default-src 'none'" in text
+
+    def test_sparse_records(self, tmp_path):
+        """What other programs leave behind."""
+        (tmp_path / "t.csv").write_text("problem,seconds\na,1\nb,0\nc,\nd,inf\n")
+        text = Reader(written(tmp_path, tmp_path / "t.csv")).text
+        assert "0 of 4 certified" in text
+        (tmp_path / "t.csv").write_text("problem,certified\na,True\n")
+        assert "1 of 1 certified" in Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "t.csv")).text
+
+    def test_many_failures_and_many_dots_stay_bounded(self, tmp_path):
+        made(tmp_path, 20_000, name="many.csv")
+        text = written(tmp_path, tmp_path / "many.csv", tmp_path / "many.csv")
+        assert len(text) < 2_000_000
+        assert "And 500 more" in text
+
+    def test_refused(self, tmp_path, capsys):
+        (tmp_path / "t.csv").write_text("problem,seconds\n")
+        assert main(["report", str(tmp_path / "t.csv")]) == 2
+        assert "no records" in capsys.readouterr().err
+        assert main(["report", str(tmp_path / "none.csv")]) == 2
+        assert main(["report", str(tmp_path)]) == 2
+        made(tmp_path)
+        assert main(["report", str(tmp_path / "t.csv"), "-o", str(tmp_path / "no" / "r.html")]) == 2
+        assert not (tmp_path / "report.html").exists()
+
+
+class TestAgainst:
+    def test_only_common_problems_are_compared(self, tmp_path):
+        ours = made(tmp_path, 100)
+        with open(tmp_path / "tlc.csv", "w") as file:
+            file.write("problem,seconds,mips\n")
+            file.writelines(f"{row['problem']},{row['seconds'] * 20},3\n" for row in ours[:60])
+            file.write("elsewhere/1,5,1\n")
+        text = Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "tlc.csv")).text
+        assert "60 problems that both have; median 20 times faster" in text
+        assert "against 3" in text
+
+    def test_nothing_in_common(self, tmp_path):
+        made(tmp_path, 10)
+        (tmp_path / "o.csv").write_text("problem,seconds\nz,1\n")
+        assert "No problem of o.csv" in Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "o.csv")).text
+
+
+class TestFigures:
+    def heights(self, svg):
+        """Shares of the bars, read off the drawing by its own labels."""
+        tree = ET.fromstring(svg)
+        labels = [(float(t.text[:-2]) / 100, float(t.get("y")) - 4) for t in tree.iter("text") if "%" in t.text]
+        (s0, y0), (s1, y1) = labels[0], labels[-1]
+        path = next(p.get("d") for p in tree.iter("path") if "fill" in p.get("class"))
+        bars = re.findall(r"M([\d.]+) \d+V([\d.]+)H([\d.]+)", path)
+        return [(float(a), s0 + (float(y) - y0) * (s1 - s0) / (y1 - y0)) for a, y, _ in bars]
+
+    def test_histogram_counts(self):
+        values = 10 ** np.random.default_rng(1).uniform(-2, 2, 5000)
+        bars = self.heights(figures.histogram([("ours", values)], "x"))
+        counts = np.histogram(np.log10(values), np.linspace(-2, 2, 25))[0] / 5000
+        assert len(bars) == 24
+        np.testing.assert_allclose([share for _, share in bars], counts, atol=2e-4)
+        assert sum(share for _, share in bars) == pytest.approx(1, abs=2e-3)
+
+    def test_what_has_no_logarithm(self):
+        bars = self.heights(figures.histogram([("ours", np.array([0.0, 0.0, 1.0, np.nan, np.inf]))], "x"))
+        assert [round(share, 2) for _, share in bars] == [0.67, 0.33]
+        for nothing in ([], [np.nan], [1.0]):
+            ET.fromstring(figures.histogram([("ours", np.array(nothing))], "x"))
+            ET.fromstring(figures.scatter([("ours", np.array(nothing), np.array(nothing))], "x", "y", same=True))
+
+    def test_dots_are_where_the_ticks_say(self):
+        svg = figures.scatter([("ours", np.array([10.0, 1000.0, -1.0]), np.array([1.0, 0.01, 1.0]))], "x", "y")
+        tree = ET.fromstring(svg)
+        ticks = {(t.text, t.get("text-anchor")): t for t in tree.iter("text")}
+        x = {word: float(ticks[word, "middle"].get("x")) for word in ("10", "1000")}
+        y = {word: float(ticks[word, "end"].get("y")) - 4 for word in ("1", "0.01")}
+        path = next(p.get("d") for p in tree.iter("path") if "dots" in p.get("class"))
+        dots = sorted((float(a), float(b)) for a, b in re.findall(r"M(\d+) (\d+)h0", path))
+        np.testing.assert_allclose(dots, [(x["10"], y["1"]), (x["1000"], y["0.01"])], atol=0.6)
+
+    @pytest.mark.parametrize(
+        ("value", "text"),
+        [(0, "0"), (0.0123, "0.0123"), (1234.5, "1,234"), (3.07e6, "3.07·10⁶"), (1e-7, "1·10⁻⁷"), (np.nan, "–")],
+    )
+    def test_numbers_as_people_write_them(self, value, text):
+        assert page.number(value) == text
+
+    def test_percent_is_not_rounded_to_all(self):
+        assert page.percent(99_999, 100_000) == "99.99 %"
+        assert page.percent(100, 100) == "100 %"
+
+    def test_quantile_ignores_what_is_not_there(self):
+        assert numbers.quantile(np.array([1.0, np.nan, 3.0, np.inf]), 0.5) == 2.0
+        assert np.isnan(numbers.quantile(np.array([np.nan]), 0.5))
+
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
+def test_in_a_browser_by_day_and_by_night(tmp_path):
+    from matplotlib.image import imread
+
+    made(tmp_path, 60)
+    written(tmp_path, tmp_path / "t.csv")
+    pictures = []
+    for scheme in (1, 0):
+        command = [
+            BROWSER,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--hide-scrollbars",
+            "--window-size=1000,900",
+        ]
+        command += [f"--blink-settings=preferredColorScheme={scheme}", f"--screenshot={tmp_path / 's.png'}"]
+        command += [f"--user-data-dir={tmp_path / 'profile'}", (tmp_path / "report.html").as_uri()]
+        subprocess.run(command, check=True, capture_output=True, timeout=60)
+        pictures.append(imread(tmp_path / "s.png")[..., :3])
+    for picture, brightness in zip(pictures, (0.96, 0.08), strict=True):
+        assert np.median(picture) == pytest.approx(brightness, abs=0.06)
+        # Ink in all of the upper part, and a figure's bars in the middle.
+        assert (np.abs(picture[:300] - picture[0, 0]).max(axis=2) > 0.3).any(axis=1).mean() > 0.3

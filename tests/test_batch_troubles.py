@@ -1,0 +1,187 @@
+"""Data sets in which things go wrong: every trouble is recorded, and stays where it is."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from datasets import lasting, record_of, star_of, write_problem, write_stars
+from quasiharmonic import batch
+from quasiharmonic.batch import keeper
+from quasiharmonic.batch.settings import Orders
+
+TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
+linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
+
+
+@pytest.fixture
+def troubled(monkeypatch):
+    monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
+
+
+def children_of(process):
+    """Process ids of a driver's processes."""
+    tasks = Path(f"/proc/{process.pid}/task").iterdir()
+    return [child for task in tasks for child in (task / "children").read_text().split()]
+
+
+def runs(child):
+    """Whether a process is there and not merely waiting for its parent to take notice of its end."""
+    try:
+        return Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+class TestTroubles:
+    def test_every_kind_is_recorded_and_takes_no_other_along(self, tmp_path, troubled):
+        kinds = ["bug", "exit", "killed", "late", "noise", "refused", "segfault", "sleep", "spin"]
+        source = write_stars(tmp_path / "set", [name for kind in kinds for name in (kind, f"{kind[:2]}~")])
+        (source / "broken").mkdir()
+        (source / "broken" / "input.obj").write_text("v 0 0 0\nf 1 2 3\n")
+        progress = batch.run(source, tmp_path / "out", jobs=2, time_limit=2.5)
+        found = {record["problem"]: record for record in batch.read_table(tmp_path / "out" / "records.csv")}
+        assert len(found) == progress.total == progress.done
+        expected = {
+            "sleep": ("timeout", "not done within 2.5 s"),
+            "spin": ("timeout", "not done within 2.5 s"),
+            "refused": ("memory", ""),
+            "late": ("memory", "out of memory"),
+            "segfault": ("crash", "ended by SIGSEGV.*Segmentation fault"),
+            "killed": ("crash", "ended by SIGKILL"),
+            "exit": ("crash", "exit code 3"),
+            "bug": ("error", "KeyError: 'lost'"),
+            "broken": ("invalid", "input.obj"),
+        }
+        for name, record in found.items():
+            outcome, words = expected.get(name, ("injective", ""))
+            assert record["outcome"] == outcome, name
+            assert record["certified"] == (outcome == "injective")
+            assert re.search(words, record["error"] or "")
+            if outcome == "timeout":
+                assert record["seconds"] == pytest.approx(2.5, abs=2)
+        assert progress.failed == len(expected)
+
+    @linux
+    def test_memory_hog(self, tmp_path, troubled):
+        source = write_stars(tmp_path / "set", ["a", "hog", "z"])
+        progress = batch.run(source, tmp_path / "out", jobs=1, time_limit=60, memory_limit=400 << 20)
+        assert progress.outcomes == {"injective": 2, "memory": 1}
+        record = record_of(tmp_path / "out", "hog")
+        assert record["error"] == "took more than 400 MiB of memory"
+        assert 400 << 20 < record["peak_memory"] < 800 << 20
+
+    def test_real_limits(self, tmp_path):
+        """No trouble made up: a mesh that takes longer, and then more memory, than it may."""
+        source = tmp_path / "set"
+        write_problem(source / "large", *star_of(100))
+        write_problem(source / "small", *star_of(4))
+        out = tmp_path / "out"
+        assert batch.run(source, out, jobs=1, time_limit=0.4).outcomes == {"timeout": 1, "injective": 1}
+        # The same limit or less: nothing to be gained.
+        assert batch.run(source, out, jobs=1, time_limit=0.2).resumed == 2
+        if Path("/proc/self/statm").exists():
+            limited = batch.run(source, out, jobs=1, memory_limit=60 << 20)
+            assert (limited.outcomes, limited.resumed) == ({"memory": 1, "injective": 1}, 1)
+        assert batch.run(source, out, jobs=1).outcomes == {"injective": 2}
+
+    def test_retry(self, tmp_path, monkeypatch):
+        source = write_stars(tmp_path / "set", ["a", "killed", "bug"])
+        (source / "a" / "handles.txt").write_text("not a number")
+        monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
+        assert batch.run(source, tmp_path / "out", jobs=1).outcomes == {"invalid": 1, "crash": 1, "error": 1}
+        monkeypatch.undo()
+        assert batch.run(source, tmp_path / "out", jobs=1).resumed == 3
+        progress = batch.run(source, tmp_path / "out", jobs=1, retry=True)
+        assert (progress.outcomes, progress.resumed) == ({"invalid": 1, "injective": 2}, 1)
+        assert "error" not in record_of(tmp_path / "out", "bug")
+
+    def test_a_full_disk_is_a_clear_stop(self, tmp_path, troubled, monkeypatch):
+        source = write_stars(tmp_path / "set", ["a", "b_full", "c_sleep", "d"])
+        assert batch.run(source / "a", tmp_path / "out").solved == 1
+        began = time.monotonic()
+        with pytest.raises(OSError, match=r"cannot write .*b_full.*[Nn]o space left"):
+            batch.run(source, tmp_path / "out", jobs=2)
+        assert time.monotonic() - began < 20
+        assert record_of(tmp_path / "out", "a")["certified"]
+        assert not (tmp_path / "out/results/b_full/record.json").exists()
+        assert not list((tmp_path / "out").rglob("*.tmp"))
+        monkeypatch.undo()
+        assert batch.run(source, tmp_path / "out", jobs=2).solved == 4
+
+    def test_a_process_that_dies_idle_is_replaced(self, tmp_path):
+        stars = write_stars(tmp_path / "set", ["a", "b"])
+        (tmp_path / "out").mkdir()
+        orders = Orders(tmp_path / "out", batch.Settings())
+        one = keeper.Keeper(orders)
+        try:
+            first, second = batch.find_problems(stars)
+            assert one.attend(first).outcome == "injective"
+            one._process._process.kill()
+            one._process._process.wait()
+            assert one.attend(second).outcome == "injective"
+        finally:
+            one.close()
+
+
+@linux
+def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
+    source = write_stars(tmp_path / "set", [f"{i:02d}" for i in range(24)], rings=12)
+    command = [sys.executable, "-m", "quasiharmonic", "batch", str(source), "-j", "2", "-o"]
+    out, straight = tmp_path / "killed", tmp_path / "straight"
+    driver = subprocess.Popen([*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while len(list(out.rglob("record.json"))) < 5:
+        assert driver.poll() is None
+        time.sleep(0.005)
+    children = children_of(driver)
+    driver.kill()
+    driver.wait()
+    deadline = time.monotonic() + 20
+    while any(runs(child) for child in children):
+        assert time.monotonic() < deadline, "processes were left behind"
+        time.sleep(0.02)
+    assert children
+    done = {path.parent.name: json.loads(path.read_bytes()) for path in out.rglob("record.json")}
+    assert 5 <= len(done) < 24
+    stamps = {name: (out / "results" / name / "map.obj").stat().st_mtime_ns for name in done}
+    assert subprocess.run([*command, str(out)], stdout=subprocess.DEVNULL).returncode == 0
+    assert subprocess.run([*command, str(straight)], stdout=subprocess.DEVNULL).returncode == 0
+    for name, stamp in stamps.items():
+        assert (out / "results" / name / "map.obj").stat().st_mtime_ns == stamp
+    for path in straight.rglob("map.obj"):
+        name = path.parent.name
+        assert (out / "results" / name / "map.obj").read_bytes() == path.read_bytes()
+        assert lasting(record_of(out, name)) == lasting(record_of(straight, name))
+    tables = [[lasting(row) for row in batch.read_table(folder / "records.csv")] for folder in (out, straight)]
+    assert tables[0] == tables[1]
+    assert len(tables[0]) == 24
+
+
+@linux
+def test_an_orphan_that_hangs_ends_by_itself(tmp_path, monkeypatch):
+    """With the interpreter's lock held no thread sees that the driver is gone; the system ends the process."""
+    write_stars(tmp_path / "set", ["spin"])
+    script = f"import sys, quasiharmonic.batch.worker as w; w._GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
+    run = (
+        "import sys; from quasiharmonic import batch; from quasiharmonic.batch import keeper; "
+        f"keeper.COMMAND = [sys.executable, '-c', {script!r}]; "
+        f"batch.run({str(tmp_path / 'set')!r}, {str(tmp_path / 'out')!r}, jobs=1, time_limit=1.5)"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", run])
+    while not (tmp_path / "out/results/spin").exists():
+        assert driver.poll() is None
+        time.sleep(0.02)
+    children = children_of(driver)
+    driver.kill()
+    driver.wait()
+    assert len(children) == 1
+    deadline = time.monotonic() + 20
+    while runs(children[0]):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)

@@ -1,0 +1,64 @@
+"""The process that `quasiharmonic.batch` solves problems in, with troubles: what a problem's name says befalls it."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import re
+import signal
+import sys
+import time
+
+from quasiharmonic.batch import worker
+from quasiharmonic.io import atomic
+
+_solve = worker._solve
+
+
+def hog():
+    kept = []
+    while True:
+        kept.append(b"\1" * (1 << 22))
+        time.sleep(0.001)
+
+
+def full(*arguments):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def unmeasurable(problem, result):
+    raise MemoryError
+
+
+def noise():
+    print("a library says hello")
+    os.system("echo and so does another")
+    sys.stdout.flush()
+
+
+TROUBLES = {
+    "sleep": lambda: time.sleep(600),
+    # In C, and with the interpreter's lock held: no thread of the process runs until the end of days.
+    "spin": lambda: re.match(r"(a+)+$", "a" * 60 + "b"),
+    "hog": hog,
+    "refused": lambda: bytearray(1 << 62),
+    "segfault": lambda: ctypes.string_at(0),
+    "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "exit": lambda: sys.exit(3),
+    "bug": lambda: {}["lost"],
+    "noise": noise,
+    "late": lambda: setattr(worker, "_measured", unmeasurable),
+    "full": lambda: setattr(atomic.os, "replace", full),
+}
+
+
+def troubled(job, folder, record, tell):
+    for word, trouble in TROUBLES.items():
+        if word in record["problem"]:
+            trouble()
+    _solve(job, folder, record, tell)
+
+
+worker._solve = troubled
+worker.serve()
