@@ -229,10 +229,9 @@ def summary(records: Sequence[Record]) -> str:
         "?: nobody knows which of these have a solution.",
         "",
     ]
+    lines += [*_by_stage(feasible), ""]
     last = Counter(r["stages"][-1][0] if r.get("stages") else "-" for r in records if r["outcome"] == "injective")
-    which = Counter(f"{len(r['stages'])}" for r in records if r["outcome"] == "injective")
-    lines += ["found by stage: " + ", ".join(f"{k}: {n}" for k, n in sorted(which.items()))]
-    lines += ["which was: " + "; ".join(f"{k}: {n}" for k, n in last.most_common())]
+    lines += ["found by: " + "; ".join(f"{k}: {n}" for k, n in last.most_common())]
     lines += [
         "outcomes: " + ", ".join(f"{k}: {n}" for k, n in Counter(r["outcome"] for r in records).most_common()),
         "",
@@ -244,6 +243,25 @@ def summary(records: Sequence[Record]) -> str:
     for r in failures:
         lines.append(f"  python benchmarks/campaign.py --case {r['name']} --strategy {r['strategy']}  # {_story(r)}")
     return "\n".join(lines)
+
+
+def _by_stage(records: Sequence[Record]) -> list[str]:
+    """How many problems were solved before each fallback: after the first stage, the second and so on, by family."""
+    if not records:
+        return []
+    solved = [r for r in records if r["outcome"] == "injective"]
+    most = max((len(r["stages"]) for r in solved), default=1)
+    names = [Counter(r["stages"][k][0].split(",")[0] for r in solved if len(r["stages"]) > k) for k in range(most)]
+    words = [count.most_common(1)[0][0] for count in names]
+    lines = ["feasible problems solved up to each stage: the first, and after each fallback"]
+    lines.append(f"{'family':10}{'of':>6}" + "".join(f"{word:>16}" for word in words))
+    families = [family for family in FAMILIES if any(r["family"] == family for r in records)]
+    for family in [*families, "all"]:
+        some = [r for r in records if family in (r["family"], "all")]
+        depth = [len(r["stages"]) if r["outcome"] == "injective" else most + 1 for r in some]
+        counts = [sum(d <= k + 1 for d in depth) for k in range(most)]
+        lines.append(f"{family:10}{len(some):>6}" + "".join(f"{count:>16}" for count in counts))
+    return lines
 
 
 def _row(title: str, records: Sequence[Record]) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -204,6 +205,30 @@ def _swirl(rng: Generator, d: float, size: int) -> Draft:
     return Draft(z, F, roughen(rng, image, F, int(4 * d)), np.setdiff1d(pins, np.concatenate(loops)))
 
 
+def _adrift(rng: Generator, d: float, size: int) -> Draft:
+    """Up to three inner loops, turned and carried about as rigid bodies, as far as the mesh around them bears."""
+    z, F = blank(rng, max(size, 150), 3)
+    loops = boundary_loops(F, len(z))
+    outer = max(loops, key=lambda loop: planar.span(z[loop]))
+    held, rest = np.concatenate(loops), z
+    for loop in [loop for _ in range(1 + int(5 * d)) for loop in loops if loop is not outer]:
+        centre = z[loop].mean()
+        r, first = abs(z - centre), abs(z[loop] - centre).max()
+        last = r[np.setdiff1d(held, loop)].min()
+        if last <= first:
+            continue
+        near = np.clip((last - r) / (last - first), 0, 1)
+        shift = rng.uniform(0, 1) * last * np.exp(2j * np.pi * rng.random())
+        moved = partial(_carried, z, near, centre, rng.choice([-1, 1]) * rng.uniform(0.3, 1), shift)
+        z = strongest(moved, F, 10.0, 0.2 + 0.79 * d)
+    return Draft(rest, F, roughen(rng, z, F, 1 + int(4 * d), held=held))
+
+
+def _carried(z: ComplexArray, near: FloatArray, centre: complex, turn: float, shift: complex, t: float) -> ComplexArray:
+    """Points turned around a centre and shifted, as far as they are ``near`` it."""
+    return centre + (z - centre) * np.exp(1j * turn * t * near) + 0.1 * t * near * shift
+
+
 def _pins(rng: Generator, d: float, size: int) -> Draft:
     """Interior vertices held, from one of them to a third of all; with or without the boundary moved."""
     z, F = blank(rng, size, int(rng.integers(3)))
@@ -302,6 +327,7 @@ FAMILIES: dict[str, Callable[[Generator, float, int], Draft]] = {
     "jam": _jam,
     "flow": _flow,
     "swirl": _swirl,
+    "adrift": _adrift,
     "pins": _pins,
     "spiral": _spiral,
     "comb": _comb,

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, certify, solve
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.strategy import stages_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import campaign
 import problems
 
-FEASIBLE = ["noise", "jam", "flow", "swirl", "pins", "spiral", "comb", "maze", "limbs", "carved"]
+FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"]
 
 
 @pytest.mark.parametrize("family", problems.FAMILIES)
@@ -148,11 +150,49 @@ def test_without_a_known_solution_no_map_is_no_failure():
     assert campaign.failed({"outcome": "not injective", "feasible": True})
 
 
-@pytest.mark.parametrize("name", ["jam:2:0.736", "noise:4:0.972"])
-def test_local_repair_solves_what_newton_leaves(name):
-    """Problems whose last triangle has next to no room: solved by the patches of the default strategy."""
+@pytest.mark.parametrize("name", ["jam:2:0.736", "noise:4:0.972", "spiral:83:0.797", "jam:84:0.415"])
+def test_fallbacks_solve_what_the_search_over_tensors_leaves(name):
+    """Problems whose last triangles have next to no room, or whose target overlaps itself."""
     case = problems.make(*problems.parse(name))
-    result = solve(Problem(case.V, case.F, case.fixed, case.target))
+    problem = Problem(case.V, case.F, case.fixed, case.target)
+    assert not solve(problem, strategy=stages_of("speed", problem)[:1]).injective
+    result = solve(problem)
     assert result.injective
-    assert result.stages[-1].name.startswith("patches")
+    assert len(result.stages) > 1
     assert result.stages[-1].flipped[0] > 0
+
+
+def test_loops_drift_as_rigid_bodies():
+    draft = problems.FAMILIES["adrift"](np.random.default_rng(2), 1.0, 400)
+    loops = boundary_loops(draft.F, len(draft.z))
+    outer, *inner = sorted(loops, key=lambda loop: np.ptp(draft.z[loop].real), reverse=True)
+    np.testing.assert_allclose(draft.image[outer], draft.z[outer], atol=1e-14)
+    turned, carried = [], []
+    for loop in inner:
+        before, after = draft.z[loop], draft.image[loop]
+        turn = (after - after[0])[1:] / (before - before[0])[1:]
+        np.testing.assert_allclose(turn, turn[0], rtol=1e-9)
+        assert abs(turn[0]) == pytest.approx(1)
+        turned.append(abs(turn[0] - 1))
+        carried.append(abs(after.mean() - before.mean()))
+    assert max(turned) > 0.01
+    assert max(carried) > 1e-3
+
+
+def test_summary_counts_what_each_fallback_adds():
+    def record(name, outcome, *stages):
+        listed = [(stage, 1, 5, 0, 0.1) for stage in stages]
+        return {"name": name, "strategy": "speed", "family": "jam", "difficulty": 0.5, "feasible": True, "simple": True,
+                "outcome": outcome, "stages": listed, "iterations": 3, "seconds": 0.1, "triangles": 9,
+                "energy": 0.1}  # fmt: skip
+
+    records = [
+        record("jam:0:0.5", "injective", "vector-adam, tanh"),
+        record("jam:1:0.5", "injective", "vector-adam, tanh", "patches"),
+        record("jam:2:0.5", "injective", "vector-adam, tanh", "patches"),
+        record("jam:3:0.5", "not injective", "vector-adam, tanh", "patches"),
+    ]
+    table = campaign.summary(records).split("solved up to each stage")[1].splitlines()
+    assert table[1].split() == ["family", "of", "vector-adam", "patches"]
+    assert table[2].split() == ["jam", "4", "1", "3"]
+    assert table[3].split() == ["all", "4", "1", "3"]

@@ -1,0 +1,152 @@
+"""Distortion against seconds: first maps, quasi-harmonised, polished.
+
+    python benchmarks/distortion.py [FOLDER …] [--unasked]
+
+A folder is a problem (``input.obj`` + ``handles.txt``) or holds problems at any depth; without one, surfaces of the
+package's own go onto letters. The first table has the MIPS energy as §10 defines it, the second the worst stretch
+max(σ₁, 1/σ₂) of any triangle after scaling the map to the surface's area, and beside it what the lengths of the
+boundary's edges alone force it to be. In parentheses: seconds from arrays to that certified map, everything included.
+
+``--unasked`` asks instead what a few polishing steps are worth, which is what ``qhm map`` takes without being asked:
+geometric means over the problems, relative to the first map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic import Problem, distortion, io, solve, surfaces, targets
+from quasiharmonic.harmonising import harmonise_map
+from quasiharmonic.mesh.shapes import rest_shapes
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.polishing import ENERGIES, polish_map
+
+FloatArray = NDArray[np.float64]
+Found = tuple[FloatArray, float]
+
+LETTERS = "GSRAPH"
+METHODS: dict[str, Callable[[Problem, FloatArray], FloatArray]] = {
+    "harmonised, MIPS": lambda problem, uv: harmonise_map(problem, uv, energy="mips").uv,
+    "polished, MIPS": lambda problem, uv: polish_map(problem, uv, energy="mips").uv,
+    "polished, blend": lambda problem, uv: polish_map(problem, uv, energy="blend").uv,
+    "polished, sym. Dirichlet": lambda problem, uv: polish_map(problem, uv, energy="symmetric-dirichlet").uv,
+}
+STEPS = 5, 10, 20, 40
+
+
+def cases(folders: list[Path]) -> Iterator[tuple[str, Problem]]:
+    """Every problem below some folders, or those of our own."""
+    for folder in folders:
+        for path in sorted(folder.rglob("input.obj")):
+            yield f"{path.parent.parent.name}/{path.parent.name}", Problem(*io.read_problem(path.parent))
+    if not folders:
+        V, F = surfaces.cat()
+        (loop,) = boundary_loops(F, len(V))
+        for letter in LETTERS:
+            outline = targets.letter(letter)[0]
+            yield f"cat onto {letter}", Problem(V, F, loop, targets.arc_length(V[loop], outline))
+
+
+def first_map(problem: Problem, strategy: str) -> Found | None:
+    """The first injective map of a strategy, and the seconds from arrays on; None where there is none."""
+    began = time.perf_counter()
+    result = solve(Problem(problem.V, problem.F, problem.fixed, problem.target), strategy=strategy)
+    return (result.uv, time.perf_counter() - began) if result.injective else None
+
+
+def forced(problem: Problem) -> float:
+    """What max(σ₁, 1/σ₂) cannot fall below: the ratio of lengths of an edge between two fixed vertices.
+
+    A map stretches an edge by a factor between its triangles' σ₂ and σ₁. The target is scaled to the surface's area.
+    """
+    tails, heads = problem.F.T.ravel(), problem.F.T[(1, 2, 0), :].ravel()
+    place = np.full(problem.n, -1)
+    place[problem.fixed] = np.arange(problem.fixed.size)
+    held = (place[tails] >= 0) & (place[heads] >= 0)
+    tails, heads = tails[held], heads[held]
+    ratio = np.linalg.norm(problem.target[place[heads]] - problem.target[place[tails]], axis=1)
+    ratio /= np.linalg.norm(problem.V[heads] - problem.V[tails], axis=1)
+    shapes = rest_shapes(problem.V, problem.F)
+    rest = float(shapes.m.sum()) * shapes.unit**2
+    w = np.zeros(problem.n, dtype=np.complex128)
+    w[problem.fixed] = problem.target @ (1, 1j)
+    area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in problem.loops)
+    ratio *= np.sqrt(rest / area)
+    return float(max(ratio.max(), 1 / ratio.min()))
+
+
+def measured(problem: Problem, uv: FloatArray) -> tuple[float, float]:
+    """MIPS and the worst stretch."""
+    found = distortion(problem.V, problem.F, uv)
+    return found.summary("mips").mean, found.summary("isometric").maximum
+
+
+def compare(folders: list[Path]) -> None:
+    """Print both tables."""
+    columns = ["first, tanh", "first, si-log", *METHODS]
+    mips = [f"| MIPS | triangles | {' | '.join(columns)} |", "|---" * (len(columns) + 2) + "|"]
+    stretch = [f"| max(σ₁, 1/σ₂) | forced | {' | '.join(columns)} |", mips[1]]
+    for name, problem in cases(folders):
+        print(name, file=sys.stderr, flush=True)
+        first = first_map(problem, "speed")
+        if first is None:
+            mips.append(f"| {name} | {len(problem.F)} |" + " – |" * len(columns))
+            stretch.append(f"| {name} | {forced(problem):.3g} |" + " – |" * len(columns))
+            continue
+        found = {columns[0]: first, columns[1]: first_map(problem, "quality") or first}
+        for method, lower in METHODS.items():
+            began = time.perf_counter()
+            uv = lower(problem, first[0])
+            found[method] = uv, first[1] + time.perf_counter() - began
+        values = {method: (measured(problem, uv), seconds) for method, (uv, seconds) in found.items()}
+        cells = [f"{m:.3g} ({s:.2g})" for (m, _), s in values.values()]
+        mips.append(f"| {name} | {len(problem.F)} | {' | '.join(cells)} |")
+        cells = [f"{worst:.3g}" for (_, worst), _ in values.values()]
+        stretch.append(f"| {name} | {forced(problem):.3g} | {' | '.join(cells)} |")
+    print("\n".join([*mips, "", *stretch]))
+
+
+def unasked(folders: list[Path]) -> None:
+    """Print what some steps of each energy bring, relative to the first map."""
+    gains: dict[tuple[str, int], list[tuple[float, float, float]]] = {}
+    for name, problem in cases(folders):
+        print(name, file=sys.stderr, flush=True)
+        first = first_map(problem, "speed")
+        if first is None:
+            continue
+        before = np.array([first[1], *measured(problem, first[0])])
+        for energy in ENERGIES:
+            for steps in STEPS:
+                began = time.perf_counter()
+                uv = polish_map(problem, first[0], energy=energy, max_iterations=steps).uv
+                after = np.array([time.perf_counter() - began, *measured(problem, uv)])
+                gains.setdefault((energy, steps), []).append(tuple(after / before))
+    print("| energy | steps | seconds | MIPS | worst in | max(σ₁, 1/σ₂) | worst in |\n" + "|---" * 7 + "|")
+    for (energy, steps), rows in gains.items():
+        seconds, mips, stretch = np.array(rows).T
+        print(
+            f"| {energy} | {steps} | × {np.exp(np.log(seconds).mean()):.2g} | × {np.exp(np.log(mips).mean()):.2g} "
+            f"| × {mips.max():.2g} | × {np.exp(np.log(stretch).mean()):.2g} | × {stretch.max():.2g} |"
+        )
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", type=Path)
+    parser.add_argument("--unasked", action="store_true")
+    options = parser.parse_args()
+    print(f"{platform.processor() or platform.machine()}\n")
+    (unasked if options.unasked else compare)(options.folders)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""Rate and accuracy of `InverseMap`: surface → plane → surface on a million points.
+
+    python benchmarks/inverse.py [-n POINTS] [--folder FOLDER …]
+
+For every map: time to build, points per second of `locate`, and how far points that come back are from where they set
+out, as a part of the surface's size, or the map's. Points are drawn from every triangle with the same probability,
+however small it is, or from the plane. Where a map shrinks triangles to 10⁻⁹, doubles tell points within them apart to
+seven digits and no more: the error on the surface is that of the coordinates in the plane.
+
+A folder is a problem (``input.obj`` + ``handles.txt``), solved first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic import InverseMap, SurfacePoints, injective_map, io
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import cat, grid, random_delaunay
+from quasiharmonic.targets import arc_length, letter
+
+FloatArray = NDArray[np.float64]
+Map = tuple[str, FloatArray, NDArray[np.int64], FloatArray]
+
+
+def maps(folders: list[Path]) -> Iterator[Map]:
+    """Name, surface, triangles, map."""
+    V, F = cat()
+    (loop,) = boundary_loops(F, len(V))
+    target = arc_length(V[loop], letter("R")[0])
+    yield "cat onto R", V, F, injective_map(V, F, loop, target).uv
+    yield "the same, polished", V, F, injective_map(V, F, loop, target, polish="symmetric-dirichlet").uv
+    V, F = random_delaunay(100_000)
+    yield "disk", V, F, V
+    yield "areas of 1 : 10¹²", V, F, V * np.hypot(*V.T)[:, None] ** 2.4
+    yield "angles of 10⁻⁵", V, F, V * [1.0, 1e-5]
+    V, F = grid(1000, 500)
+    yield "square", V, F, V
+    for folder in folders:
+        V, F, fixed, target = io.read_problem(folder)
+        yield folder.name, V, F, injective_map(V, F, fixed, target).uv
+
+
+def seconds(since: float) -> float:
+    """Processor time: comparable on a machine that does other things too."""
+    return time.process_time() - since
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-n", "--points", type=int, default=1_000_000)
+    parser.add_argument("--folder", nargs="*", type=Path, default=[])
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    print("| map | triangles | area ratio | build s | Mpoints/s by triangle | from the plane | error | in the plane |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, V, F, uv in maps(options.folder):
+        a, b, c = uv[F].swapaxes(0, 1)
+        areas = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+        began = time.process_time()
+        inverse = InverseMap(V, F, uv)
+        build = seconds(began)
+        start = SurfacePoints(rng.integers(len(F), size=options.points), rng.dirichlet((1, 1, 1), options.points))
+        surface, places = inverse.surface(start), inverse.plane(start)
+        began = time.process_time()
+        at = inverse.locate(places)
+        by_triangle = options.points / seconds(began) / 1e6
+        # Rounding may put a point of a triangle at the boundary beyond it.
+        lost = np.count_nonzero(~at.found)
+        error = np.nanmax(np.abs(inverse.surface(at) - surface)) / np.ptp(V, axis=0).max()
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        in_plane = np.nanmax(np.abs(inverse.plane(at) - places)) / (high - low).max()
+        anywhere = rng.uniform(low, high, (options.points, 2))
+        began = time.process_time()
+        inverse.locate(anywhere)
+        from_plane = options.points / seconds(began) / 1e6
+        print(
+            f"| {name} | {len(F)} | {areas.max() / areas.min():.0e} | {build:.2f} | {by_triangle:.2f} "
+            f"| {from_plane:.2f} | {error:.0e}{f', {lost} lost' if lost else ''} | {in_plane:.0e} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Where the time of a call goes: functions of the library clocked from outside, each charged to a phase."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+from quasiharmonic import coarse_problem, inject, laplacian, problem
+from quasiharmonic.linsolve import base
+from quasiharmonic.mesh import reference
+from quasiharmonic.objective import Iterate, Objective
+
+NAMES = (
+    "set-up",
+    "coarsening",
+    "analysis",
+    "assembly",
+    "factor",
+    "solve",
+    "gradient",
+    "optimiser",
+    "polish",
+    "prolongation",
+    "certificate",
+)
+
+# What is not named here is charged to the named function that calls it.
+_CLOCKED: tuple[tuple[Any, str, str], ...] = (
+    (inject, "injective_map", "set-up"),
+    (inject, "solve", "set-up"),
+    (problem.Problem, "__init__", "set-up"),
+    (reference.ReferenceMesh, "__init__", "set-up"),
+    (laplacian.Laplacian, "__init__", "set-up"),
+    (coarse_problem, "coarsen", "coarsening"),
+    (coarse_problem, "prolong", "prolongation"),
+    (inject, "polish_map", "polish"),
+    (base.LinearSolver, "__init__", "analysis"),
+    (Objective, "evaluate", "assembly"),
+    (laplacian.Laplacian, "factor", "assembly"),
+    (laplacian.Laplacian, "extend", "assembly"),
+    (base.LinearSolver, "factor", "factor"),
+    (base.LinearSolver, "solve", "solve"),
+    (Iterate, "_sweep", "gradient"),
+    (inject._Search, "run", "optimiser"),
+    (inject, "certify", "certificate"),
+    (inject, "flipped_triangles", "certificate"),
+)
+
+
+class Phases:
+    """Seconds by phase, and calls by phase, while it is `clocking`.
+
+    A function's time is its own: what it calls and is clocked too is charged there and not twice.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(NAMES, 0.0)
+        self.calls: dict[str, int] = defaultdict(int)
+        self._running: list[str] = []
+        self._since = 0.0
+
+    @contextmanager
+    def clocking(self) -> Iterator[Phases]:
+        """Clock every call of the library's functions within the block."""
+        saved = []
+        try:
+            for owner, name, phase in _CLOCKED:
+                function = vars(owner)[name]
+                saved.append((owner, name, function))
+                if isinstance(function, cached_property):
+                    clocked: Any = cached_property(self._clocked(function.func, phase))
+                    clocked.__set_name__(owner, name)
+                else:
+                    clocked = self._clocked(function, phase)
+                setattr(owner, name, clocked)
+            yield self
+        finally:
+            for owner, name, function in saved:
+                setattr(owner, name, function)
+
+    def _clocked(self, function: Callable[..., Any], phase: str) -> Callable[..., Any]:
+        def clocked(*arguments: Any, **named: Any) -> Any:
+            self._turn(phase)
+            self.calls[phase] += 1
+            try:
+                return function(*arguments, **named)
+            finally:
+                self._turn(None)
+
+        return clocked
+
+    def _turn(self, phase: str | None) -> None:
+        """Charge the time since the last turn to who was running; start a phase, or end the one that runs."""
+        now = time.perf_counter()
+        if self._running:
+            self.seconds[self._running[-1]] += now - self._since
+        if phase is None:
+            self._running.pop()
+        else:
+            self._running.append(phase)
+        self._since = time.perf_counter()

@@ -1,0 +1,317 @@
+"""Time and memory from arrays to the certified map, beside other tools in the same process.
+
+    pip install '.[bench]'
+    python benchmarks/speed.py                                  # made problems, 1 000 to 130 000 triangles
+    python benchmarks/speed.py --triangles 500000 1000000 3500000 --peers igl.harmonic --memory
+    python benchmarks/speed.py FOLDER … --triangles             # problem folders only
+    python benchmarks/speed.py --animation                      # 100 frames of a moving boundary besides
+
+A made problem maps the head of a cat onto the letters C, R and S. A folder is a problem (``input.obj`` +
+``handles.txt``) or holds problems at any depth. Tools take turns, and medians over the turns are taken; a tool that
+exceeds ``--limit`` seconds gets no larger problem. Peak memory is that of a process of its own, over what it holds
+before the call. Written to ``--output``: ``speed.csv``, ``speed.md`` with machine and versions, ``speed.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import phases
+from peers import PEERS
+from quasiharmonic import Problem, inject, io, is_injective, solve, surfaces
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.targets import arc_length, letter, rectangle
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Arrays = tuple[Floats, Ints, Ints, Floats]
+
+OURS = "quasiharmonic"
+YARDSTICK = "igl.harmonic"
+LETTERS = "CRS"
+SIZES = (1_000, 4_000, 16_000, 64_000, 130_000)
+FRAMES = 100
+
+
+@dataclass
+class Record:
+    """What one tool did with one problem."""
+
+    problem: str
+    triangles: int
+    tool: str
+    seconds: list[float] = field(default_factory=list)
+    injective: bool | None = None
+    iterations: int | None = None
+    phases: list[dict[str, float]] = field(default_factory=list)
+    megabytes: float | None = None
+
+    @property
+    def median(self) -> float:
+        """Seconds; NaN where the tool failed."""
+        return float(np.median(self.seconds)) if self.seconds else np.nan
+
+    def phase(self, name: str) -> float:
+        """Median seconds in a phase."""
+        return float(np.median([seconds[name] for seconds in self.phases])) if self.phases else np.nan
+
+
+def cat(triangles: int, character: str) -> Arrays:
+    """The head of a cat, of about so many triangles, and a letter to lay its boundary along."""
+    halvings = max(0, int(np.ceil(np.log(triangles / 40_000) / np.log(4))))
+    V, F = surfaces.cat(max(4, round(np.sqrt(triangles / 6) / 2**halvings)))
+    for _ in range(halvings):
+        V, F = surfaces.refine(V, F)
+    (loop,) = boundary_loops(F, len(V))
+    return V, F, loop, arc_length(V[loop], letter(character)[0])
+
+
+def problems(sizes: list[int], folders: list[Path]) -> Iterator[tuple[str, Arrays]]:
+    """Names and arrays, one problem at a time, the small ones first."""
+    for size in sizes:
+        for character in LETTERS:
+            yield f"cat on {character}", cat(size, character)
+    for folder in folders:
+        for path in sorted(folder.rglob("input.obj")):
+            problem = io.read_problem(path.parent)
+            yield path.parent.name, (problem.V, problem.F, problem.fixed, problem.target)
+
+
+def measure(name: str, arrays: Arrays, tools: list[str], runs: int, strategy: str) -> list[Record]:
+    """Let the tools take turns at a problem."""
+    records = [Record(name, len(arrays[1]), tool) for tool in tools]
+    for turn in range(runs):
+        for record in records:
+            if turn and (not record.seconds or record.seconds[0] * turn > 10):
+                continue
+            clock = phases.Phases()
+            try:
+                with clock.clocking():
+                    began = time.perf_counter()
+                    if record.tool == OURS:
+                        result = inject.injective_map(*arrays, strategy=strategy)
+                        uv, record.iterations = result.uv, result.iterations
+                    else:
+                        uv = PEERS[record.tool](*arrays)
+                    record.seconds.append(time.perf_counter() - began)
+            except (RuntimeError, ValueError):
+                continue
+            if record.tool == OURS:
+                record.phases.append(clock.seconds)
+            record.injective = is_injective(arrays[1], uv)
+    return records
+
+
+def warm_up(tools: list[str]) -> list[str]:
+    """Load every tool and let it compile what it compiles on first use; the tools that are there."""
+    present = []
+    for tool in tools:
+        try:
+            measure("", cat(100, "C"), [tool], 1, "speed")
+            present.append(tool)
+        except ImportError as error:
+            print(f"without {tool}: {error}; pip install 'quasiharmonic[bench]'", file=sys.stderr)
+    return present
+
+
+def peak_megabytes(arrays: Arrays, tool: str) -> float | None:
+    """What a tool's call adds to the peak of a fresh process that holds no more than the arrays."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "problem.npz")
+        np.savez(path, *arrays)
+        command = [sys.executable, __file__, "--peak", tool, str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return float(done.stdout) if done.returncode == 0 else None
+
+
+def print_peak(tool: str, path: Path) -> None:
+    """The child's part of `peak_megabytes`."""
+    with np.load(path) as stored:
+        arrays = tuple(stored[name] for name in stored.files)
+    run: Callable[..., object] = inject.injective_map if tool == OURS else PEERS[tool]
+    # A small problem first, for what is loaded once and for all.
+    run(*cat(100, "C"))
+    before = _peak()
+    run(*arrays)
+    print(_peak() - before)
+
+
+def _peak() -> float:
+    """Most memory this process has held, in megabytes."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # Linux's resource usage counts what the parent held before this process became another program.
+        return next(float(line.split()[1]) for line in status.read_text().splitlines() if "VmHWM" in line) / 1024
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
+
+
+def animation(triangles: int) -> list[Record]:
+    """A strip bent into a ring, frame by frame: every frame afresh, and each from the last one's map."""
+    V, F = surfaces.disk(round(np.sqrt(triangles / 6)))
+    (loop,) = boundary_loops(F, len(V))
+    strip = arc_length(V[loop], rectangle(8.0, 1.0))
+
+    def bent(angle: float) -> Floats:
+        radius, turn = 8 / angle, (strip[:, 0] / 8 - 0.5) * angle
+        return (radius + 0.5 - strip[:, 1])[:, None] * np.stack([np.sin(turn), -np.cos(turn)], axis=1)
+
+    angles = np.linspace(0.05, 5.8, FRAMES)
+    afresh = Record("100 frames, each afresh", len(F), OURS, injective=True, iterations=0)
+    onwards = Record("100 frames, each from the last", len(F), OURS, injective=True, iterations=0)
+    problem, last = Problem(V, F, loop, bent(angles[0])), None
+    for angle in angles:
+        for record in (afresh, onwards):
+            began = time.perf_counter()
+            if record is afresh:
+                result = inject.injective_map(V, F, loop, bent(angle))
+            else:
+                problem = problem.moved(bent(angle))
+                result = solve(problem, start=last)
+                last = result.uv
+            record.seconds.append(time.perf_counter() - began)
+            record.injective &= result.injective
+            record.iterations += result.iterations
+    for record in (afresh, onwards):
+        record.seconds = [sum(record.seconds)]
+    return [afresh, onwards]
+
+
+def machine() -> str:
+    """Processor, cores, threads asked for, versions."""
+    model = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
+    versions = [f"Python {platform.python_version()}"]
+    for package in ("quasiharmonic", "numpy", "scipy", "mkl", "libigl", "mouette"):
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            continue
+    threads = os.environ.get("OMP_NUM_THREADS", "as many as it likes")
+    return f"{model}, {os.cpu_count()} cores, OMP_NUM_THREADS {threads}; {', '.join(versions)}"
+
+
+def table(records: list[Record]) -> str:
+    """Markdown: the tools side by side, our phases in percent of our time, and memory where it was measured."""
+    tools = list(dict.fromkeys(record.tool for record in records))
+    measured = any(record.megabytes is not None for record in records)
+    heads = ["problem", "triangles", "iterations", *(f"{tool} s" for tool in tools), f"ratio to {YARDSTICK}"]
+    heads += [f"{name} %" for name in phases.NAMES] + [f"{tool} MB" for tool in tools if measured]
+    lines = [" | ".join(heads), " | ".join(["---"] * len(heads))]
+    rows = dict.fromkeys((record.problem, record.triangles) for record in records)
+    for name, triangles in rows:
+        row = {r.tool: r for r in records if (r.problem, r.triangles) == (name, triangles)}
+        ours, yardstick = row[OURS], row.get(YARDSTICK)
+        cells = [name, str(triangles), f"{ours.iterations}{'' if ours.injective else ' (not injective)'}"]
+        cells += [_time(row.get(tool)) for tool in tools]
+        cells.append(f"{ours.median / yardstick.median:.2f}" if yardstick else "")
+        cells += [f"{100 * ours.phase(p) / ours.median:.0f}" if ours.phases else "" for p in phases.NAMES]
+        found = [row[tool].megabytes if tool in row else None for tool in tools if measured]
+        cells += ["" if megabytes is None else f"{megabytes:.0f}" for megabytes in found]
+        lines.append(" | ".join(cells))
+    return "".join(f"| {line} |\n" for line in lines)
+
+
+def _time(record: Record | None) -> str:
+    if record is None:
+        return ""
+    if not record.seconds:
+        return "fails"
+    # Of the others only some claim to be free of inversions.
+    return f"{record.median:.4g}{'' if record.injective else ' (inverted)'}"
+
+
+def write_csv(records: list[Record], path: Path) -> None:
+    """One line for each tool and problem."""
+    with path.open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(["problem", "triangles", "tool", "seconds", "injective", "iterations", "megabytes", *phases.NAMES])
+        for r in records:
+            timed = [f"{r.phase(name):.6f}" if r.phases else "" for name in phases.NAMES]
+            facts = [r.problem, r.triangles, r.tool, f"{r.median:.6f}", r.injective, r.iterations, r.megabytes]
+            out.writerow(["" if fact is None else fact for fact in facts] + timed)
+
+
+def draw(records: list[Record], path: Path) -> None:
+    """Seconds over triangles, both logarithmic: every problem a dot, every tool a line through its medians."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
+    for tool in dict.fromkeys(record.tool for record in records):
+        done = [record for record in records if record.tool == tool and record.seconds]
+        sizes = sorted({record.triangles for record in done})
+        medians = [np.median([r.median for r in done if r.triangles == size]) for size in sizes]
+        (line,) = axes.loglog(sizes, medians, label=tool, linewidth=2 if tool == OURS else 1.2)
+        axes.loglog([r.triangles for r in done], [r.median for r in done], ".", color=line.get_color())
+    axes.set(xlabel="triangles", ylabel="seconds")
+    axes.grid(which="major", alpha=0.3)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Measure, print a table as it grows, write the files."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", type=Path, help="problem folders")
+    parser.add_argument("--triangles", nargs="*", type=int, default=list(SIZES), help="sizes of the made problems")
+    parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), help="what to compare with")
+    parser.add_argument("--strategy", default="speed")
+    parser.add_argument("-r", "--runs", type=int, default=5, help="turns of every tool")
+    parser.add_argument("--limit", type=float, default=30, help="seconds, past which a tool gets no larger problem")
+    parser.add_argument("--memory", action="store_true", help="peak memory too")
+    parser.add_argument("--animation", action="store_true", help="a moving boundary, 20 000 triangles, too")
+    parser.add_argument("-o", "--output", type=Path, default=Path("figures"))
+    parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.peak:
+        return print_peak(options.peak[0], Path(options.peak[1]))
+    tools = warm_up([OURS, *options.peers])
+    records: list[Record] = []
+    for name, arrays in problems(options.triangles, options.folders):
+        slow = {
+            record.tool for record in records if record.median > options.limit and len(arrays[1]) > record.triangles
+        }
+        found = measure(name, arrays, [tool for tool in tools if tool not in slow], options.runs, options.strategy)
+        for record in found if options.memory else ():
+            record.megabytes = peak_megabytes(arrays, record.tool)
+        records += found
+        times = ", ".join(f"{record.tool} {_time(record)}" for record in found)
+        print(f"{name}, {found[0].triangles} triangles, {found[0].iterations} iterations: {times}", flush=True)
+    frames = animation(20_000) if options.animation else []
+    text = f"{machine()}\n\n{table(records)}" if records else f"{machine()}\n"
+    for record in frames:
+        text += (
+            f"\n{record.problem}, {record.triangles} triangles: {record.median:.2f} s, {record.iterations} iterations, "
+        )
+        text += f"{'all' if record.injective else 'not all'} injective\n"
+    print(f"\n{text}")
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "speed.md").write_text(text)
+    write_csv(records + frames, options.output / "speed.csv")
+    if records:
+        draw(records, options.output / "speed.png")
+
+
+if __name__ == "__main__":
+    main()
