@@ -69,18 +69,18 @@ def flips(problem: Problem, uv: FloatArray) -> int:
     return int(flipped_triangles(problem.F, uv).size)
 
 
-def colorbar(figure: Figure, drawn: PolyCollection) -> None:
-    """A bar for σ₁/σ₂ at the right, in room added to the figure."""
+def colorbar(figure: Figure, drawn: PolyCollection, label: str = "σ₁/σ₂", extend: str = "max") -> None:
+    """A bar for what triangles are coloured by at the right, in room added to the figure."""
     width, height = figure.get_size_inches()
     kept = width / (width + 0.9)
     for ax in figure.axes:
         x, y, w, h = ax.get_position(original=True).bounds
         ax.set_position((x * kept, y, w * kept, h))
     figure.set_size_inches(width + 0.9, height)
-    bar = figure.colorbar(drawn, cax=figure.add_axes((kept, 0.15, 0.15 / (width + 0.9), 0.7)), extend="max")
+    bar = figure.colorbar(drawn, cax=figure.add_axes((kept, 0.15, 0.15 / (width + 0.9), 0.7)), extend=extend)
     bar.ax.yaxis.set_major_formatter("{x:g}")
     bar.ax.yaxis.set_minor_formatter("")
-    bar.set_label("σ₁/σ₂")
+    bar.set_label(label)
 
 
 def inverted_area(problem: Problem, uv: FloatArray) -> float:

@@ -1,4 +1,5 @@
-"""Figure 3: harmonic maps onto nonconvex outlines fold over the concave corners; si-log unfolds them.
+"""Figure 3: harmonic maps onto nonconvex outlines fold over the concave corners; si-log unfolds them
+=====================================================================================================
 
 The paper shows shapes of Du et al. and Weber and Zorin: cotangent weights invert triangles at concave corners,
 si-log does not. Here are outlines of the same kind, an arrow, a cross, and a sheet two of whose corners are bent

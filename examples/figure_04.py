@@ -1,4 +1,5 @@
-"""Figure 4: the inner rectangle turned by π, until something breaks.
+"""Figure 4: the inner rectangle turned by π, until something breaks
+====================================================================
 
 The paper shows one ring, which its method passes, with triangles that become very thin. Here are fourteen, ever
 narrower, finer, off-centre and stretched, each from several functionals: their own descent first, then Newton's method

@@ -1,4 +1,5 @@
-"""Figure 5: the paths of tanh and si-log on a curved surface that goes onto a G.
+"""Figure 5: the paths of tanh and si-log on a curved surface that goes onto a G
+================================================================================
 
 The paper maps Lucy and counts gradients: tanh is injective in fewer than 60, si-log in 190 and with a MIPS energy an
 order of magnitude below others'. Its quasi-Newton, projected Newton and soft-barrier rivals need thousands; they

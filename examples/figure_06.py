@@ -1,4 +1,5 @@
-"""Figure 6: the ring whose hole is turned by π, descended from the four functionals with si-log.
+"""Figure 6: the ring whose hole is turned by π, descended from the four functionals with si-log
+================================================================================================
 
 The paper shows V₃, V₄ and V₁, all of them injective at last: V₃ opens a hole in the middle, V₁ moves the singularity
 to a corner first, V₄ turns the whole domain and takes the fewest iterations.

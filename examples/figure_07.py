@@ -1,4 +1,5 @@
-"""Figure 7: the curves |ξ| ↦ |μ| of the two parameterisations, and what they are for.
+"""Figure 7: the curves |ξ| ↦ |μ| of the two parameterisations, and what they are for
+=====================================================================================
 
 The paper draws ``r = tanh`` and ``r = si-log``. So do we, and beside them how far ξ must go for a given angle
 distortion σ₁/σ₂ = (1 + |μ|)/(1 − |μ|): a distance that grows with the logarithm of the distortion for tanh and

@@ -1,4 +1,5 @@
-"""Figure 8: the first injective maps of tanh and si-log, coloured by their angle distortion.
+"""Figure 8: the first injective maps of tanh and si-log, coloured by their angle distortion
+============================================================================================
 
 The paper shows one pair and says that si-log's distortion is the smaller. Here are two pairs. Onto the letter S,
 si-log's first map has a MIPS energy of 5.5 against tanh's 10.3, and 99 % of its triangles lie below σ₁/σ₂ = 16

@@ -1,4 +1,5 @@
-"""Figure 11: the middle of a rectangle moved to its left, the boundary held; coloured by σ₁/σ₂.
+"""Figure 11: the middle of a rectangle moved to its left, the boundary held; coloured by σ₁/σ₂
+===============================================================================================
 
 The paper compares si-log, which keeps the largest σ₁/σ₂ small, with a map of least MIPS energy (tanh + MIPS), which
 concentrates it in a spike at the point. So it is here: si-log takes 3 iterations and its largest ratio is 2.9; the map

@@ -1,4 +1,5 @@
-"""Figure 12: a rectangle whose boundary is displaced upwards by twice |x|; the distribution of σ₁/σ₂.
+"""Figure 12: a rectangle whose boundary is displaced upwards by twice |x|; the distribution of σ₁/σ₂
+=====================================================================================================
 
 The paper's si-log distributes distortion evenly and TLC concentrates it at the concave corner. TLC is another
 program; tanh's first map is of that kind and stands in for it. The dotted line is the ratio of the plain shear

@@ -1,4 +1,5 @@
-"""Figure 17: two points of a square change places, at ever finer grids; and two small disks in their stead.
+"""Figure 17: two points of a square change places, at ever finer grids; and two small disks in their stead
+===========================================================================================================
 
 The paper's si-log succeeds up to 140 × 140 cells and fails at 160 × 160. With larger steps and less momentum, and
 without being told which parameterisation to take, we get through at every size: 90, 132, 151 and 192 iterations at 20,

@@ -1,4 +1,5 @@
-"""Figure 18: boundaries that allow no map: the search is stable, ends at the minimal surface, and says so.
+"""Figure 18: boundaries that allow no map: the search is stable, ends at the minimal surface, and says so
+==========================================================================================================
 
 The paper shows one such boundary and says that the method stays stable and yields a minimal surface. Here are three,
 each descended until nothing moves any more, and measured: the A-Dirichlet energy comes down to the unsigned area of the

@@ -1,0 +1,397 @@
+"""Surfaces that stand for the paper's scans: an angel, a gargoyle, a rabbit, a bust and a hand, from a few formulas.
+
+Each is a *field*, negative inside: rounded cones and ellipsoids that flow into each other. It is meshed by surface
+nets (a vertex in every cell of a grid that the surface passes, a square across every edge it passes), the vertices are
+relaxed along the surface, and what lies below a plane is cut off: the rim is the boundary. They stand upright along y,
+face +z and are between one and three units high.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from quasiharmonic import Problem, refine, targets
+from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, edges
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Field = Callable[[FloatArray], FloatArray]
+
+
+def cone(x: FloatArray, a: ArrayLike, b: ArrayLike, ra: float, rb: float) -> FloatArray:
+    """A ball of radius ``ra`` at ``a``, one of ``rb`` at ``b``, and what is between them."""
+    a, axis = np.asarray(a), np.subtract(b, a)
+    t = np.clip((x - a) @ axis / (axis @ axis), 0, 1)
+    return np.linalg.norm(x - a - t[..., None] * axis, axis=-1) - (ra + t * (rb - ra))
+
+
+def ball(x: FloatArray, middle: ArrayLike, radii: ArrayLike, turn: float = 0.0, axis: int = 2) -> FloatArray:
+    """An ellipsoid, turned about an axis by so many radians; the distance is a good guess near it."""
+    p = x - np.asarray(middle)
+    if turn:
+        i, j = (k for k in range(3) if k != axis)
+        w = (p[..., i] + 1j * p[..., j]) * np.exp(-1j * turn)
+        p = p.copy()
+        p[..., i], p[..., j] = w.real, w.imag
+    p = p / radii + 1e-9  # never 0 / 0
+    near = np.linalg.norm(p, axis=-1)
+    return near * (near - 1) / np.linalg.norm(p / radii, axis=-1)
+
+
+def join(smooth: float, *fields: FloatArray) -> FloatArray:
+    """The union, seams rounded over a width of ``smooth``."""
+    first, *others = fields
+    for other in others:
+        h = np.maximum(smooth - np.abs(first - other), 0) / smooth
+        first = np.minimum(first, other) - h**2 * smooth / 4
+    return first
+
+
+def carve(smooth: float, field: FloatArray, *others: FloatArray) -> FloatArray:
+    """What is left without the others."""
+    return -join(smooth, -field, *others)
+
+
+def mirrored(x: FloatArray) -> FloatArray:
+    """Points reflected to x ≥ 0, so that what is made on one side is on the other as well."""
+    return np.concatenate([np.abs(x[..., :1]), x[..., 1:]], axis=-1)
+
+
+def bust(x: FloatArray) -> FloatArray:
+    """Head and shoulders of somebody."""
+    s = mirrored(x)
+    skull = join(0.15, ball(x, (0, 1.32, -0.06), (0.40, 0.47, 0.48)), ball(x, (0, 1.08, 0.16), (0.29, 0.36, 0.27)))
+    face = carve(0.10, skull, ball(s, (0.16, 1.24, 0.50), (0.12, 0.075, 0.12)))
+    face = join(0.04, face, ball(s, (0.155, 1.235, 0.365), (0.075, 0.06, 0.06)))
+    face = join(0.08, face, cone(x, (0, 1.26, 0.40), (0, 1.09, 0.53), 0.035, 0.06))
+    face = join(0.05, face, ball(s, (0.055, 1.065, 0.47), (0.045, 0.04, 0.06)))
+    face = join(0.05, face, ball(x, (0, 0.96, 0.40), (0.12, 0.03, 0.05)), ball(x, (0, 0.91, 0.395), (0.10, 0.03, 0.05)))
+    face = join(
+        0.08, face, ball(x, (0, 0.80, 0.36), (0.10, 0.07, 0.08)), ball(s, (0.41, 1.2, -0.03), (0.05, 0.14, 0.09))
+    )
+    # Curls: a shell over crown and neck, waved.
+    wave = 0.022 * np.sin(17 * x[..., 0]) * np.sin(15 * x[..., 1] + 8 * x[..., 2]) * np.sin(13 * x[..., 2])
+    shell = ball(x, (0, 1.38, -0.13), (0.46, 0.47, 0.50)) + 1.6 * wave
+    hair = np.maximum(shell, 0.75 * (x[..., 2] - 0.18) - 0.66 * (x[..., 1] - 1.50))
+    head = join(0.05, face, hair)
+    neck = cone(x, (0, 0.15, -0.10), (0, 0.95, -0.06), 0.25, 0.20)
+    trunk = join(0.3, ball(s, (0.42, -0.12, -0.08), (0.46, 0.27, 0.28)), ball(x, (0, -0.42, 0.0), (0.72, 0.55, 0.36)))
+    return join(0.14, join(0.12, neck, head), trunk)
+
+
+def hand(x: FloatArray) -> FloatArray:
+    """A hand held up, fingers a little apart and bent."""
+    palm = join(0.2, ball(x, (0.02, 0.62, 0), (0.44, 0.50, 0.17)), cone(x, (0, -0.5, -0.02), (0, 0.3, 0), 0.23, 0.25))
+    palm = carve(0.2, palm, ball(x, (0.02, 0.66, 0.30), (0.24, 0.30, 0.18)))
+    parts = [palm]
+    for at, lean, length, radius in (
+        (-0.35, -0.34, 0.62, 0.090),
+        (-0.12, -0.11, 0.80, 0.098),
+        (0.12, 0.09, 0.86, 0.100),
+        (0.35, 0.30, 0.76, 0.096),
+    ):
+        root = np.array((at, 0.98 - 0.5 * at * at, 0.0))
+        joint = root + length * 0.42 * np.array((lean, 1.0, 0.06))
+        middle = joint + length * 0.32 * np.array((lean, 0.96, 0.24))
+        tip = middle + length * 0.26 * np.array((lean, 0.85, 0.45))
+        parts.append(
+            join(
+                0.06,
+                cone(x, root, joint, radius * 1.12, radius),
+                cone(x, joint, middle, radius * 1.02, radius * 0.9),
+                cone(x, middle, tip, radius * 0.92, radius * 0.74),
+            )
+        )
+    thumb = join(
+        0.1,
+        cone(x, (0.28, 0.32, 0.06), (0.56, 0.66, 0.20), 0.16, 0.12),
+        cone(x, (0.56, 0.66, 0.20), (0.66, 0.98, 0.26), 0.115, 0.085),
+    )
+    return join(0.1, join(0.05, *parts), thumb)
+
+
+def rabbit(x: FloatArray) -> FloatArray:
+    """A rabbit, sitting."""
+    s = mirrored(x)
+    body = join(0.35, ball(x, (0, 0.42, -0.30), (0.50, 0.52, 0.62)), ball(x, (0, 0.55, 0.15), (0.36, 0.44, 0.38)))
+    body = join(0.10, body, ball(s, (0.40, 0.26, -0.38), (0.20, 0.36, 0.40)))
+    body = join(
+        0.12, body, ball(s, (0.30, 0.02, 0.10), (0.16, 0.12, 0.36)), ball(s, (0.17, 0.10, 0.50), (0.12, 0.22, 0.17))
+    )
+    body = join(0.08, body, ball(x, (0, 0.36, -0.96), (0.19, 0.19, 0.17)))
+    head = join(0.18, ball(x, (0, 1.12, 0.42), (0.31, 0.31, 0.34)), ball(x, (0, 1.02, 0.68), (0.18, 0.17, 0.17)))
+    head = join(0.10, head, ball(s, (0.15, 1.00, 0.62), (0.13, 0.12, 0.14)))
+    head = join(
+        0.03, head, ball(s, (0.215, 1.20, 0.625), (0.065, 0.075, 0.06)), ball(x, (0, 1.07, 0.85), (0.06, 0.045, 0.04))
+    )
+    ear = carve(
+        0.06,
+        ball(s, (0.21, 1.80, 0.22), (0.145, 0.52, 0.085), -0.17),
+        ball(s, (0.215, 1.80, 0.33), (0.075, 0.40, 0.09), -0.17),
+    )
+    return join(0.10, join(0.22, body, head), ear)
+
+
+def gargoyle(x: FloatArray) -> FloatArray:
+    """A gargoyle crouching on its plinth, wings half spread."""
+    s = mirrored(x)
+    body = join(0.25, ball(x, (0, 0.50, -0.05), (0.38, 0.60, 0.34)), ball(x, (0, 0.95, 0.08), (0.40, 0.30, 0.30)))
+    legs = join(
+        0.1,
+        cone(s, (0.30, 0.34, -0.02), (0.56, 0.46, 0.34), 0.22, 0.15),
+        cone(s, (0.56, 0.46, 0.34), (0.47, 0.08, 0.28), 0.14, 0.09),
+    )
+    legs = join(
+        0.08,
+        legs,
+        ball(s, (0.48, 0.05, 0.40), (0.12, 0.09, 0.20)),
+        ball(s, (0.42, 0.22, 0.12), (0.17, 0.26, 0.24)),
+        ball(s, (0.32, 0.02, 0.24), (0.12, 0.14, 0.26)),
+    )
+    arms = join(
+        0.08,
+        cone(s, (0.34, 1.00, 0.12), (0.30, 0.56, 0.30), 0.16, 0.11),
+        cone(s, (0.30, 0.56, 0.30), (0.17, 0.08, 0.46), 0.11, 0.09),
+    )
+    arms = join(
+        0.06, arms, ball(s, (0.16, 0.04, 0.53), (0.11, 0.08, 0.12)), ball(x, (0, 0.30, 0.18), (0.30, 0.50, 0.24))
+    )
+    head = join(0.12, ball(x, (0, 1.38, 0.24), (0.27, 0.27, 0.30)), ball(x, (0, 1.28, 0.50), (0.17, 0.14, 0.17)))
+    head = carve(
+        0.06, head, ball(x, (0, 1.20, 0.66), (0.15, 0.025, 0.10)), ball(s, (0.115, 1.42, 0.54), (0.07, 0.055, 0.08))
+    )
+    head = join(
+        0.05,
+        head,
+        cone(s, (0.14, 1.56, 0.22), (0.30, 1.80, 0.12), 0.085, 0.07),
+        cone(s, (0.30, 1.80, 0.12), (0.27, 2.02, 0.18), 0.07, 0.045),
+    )
+    head = join(
+        0.05,
+        head,
+        cone(s, (0.24, 1.38, 0.16), (0.50, 1.52, 0.04), 0.09, 0.05),
+        ball(s, (0.06, 1.31, 0.66), (0.045, 0.04, 0.05)),
+    )
+    wing = join(
+        0.10,
+        ball(s, (0.70, 1.16, -0.36), (0.58, 0.24, 0.085), 0.75),
+        ball(s, (0.78, 0.88, -0.38), (0.42, 0.19, 0.075), 0.42),
+        ball(s, (0.80, 0.68, -0.39), (0.26, 0.15, 0.075), 0.15),
+        cone(s, (0.15, 0.95, -0.26), (0.55, 1.05, -0.36), 0.13, 0.09),
+    )
+    tail = join(
+        0.08,
+        cone(x, (0, 0.16, -0.25), (-0.45, 0.04, -0.48), 0.18, 0.10),
+        cone(x, (-0.45, 0.04, -0.48), (-0.66, 0.02, -0.14), 0.10, 0.07),
+    )
+    walls = np.moveaxis(np.abs(x - (0, -0.22, 0)) - (0.76, 0.20, 0.62), -1, 0)
+    plinth = -join(0.06, *-walls)
+    figure = join(0.08, join(0.12, body, head, legs), arms, wing, tail)
+    return join(0.06, figure, plinth)
+
+
+def angel(x: FloatArray) -> FloatArray:
+    """An angel with a torch, on a round base."""
+    s = mirrored(x)
+    folds = 0.035 * np.sin(11 * np.arctan2(x[..., 0], x[..., 2])) * np.clip(1.1 - x[..., 1], 0, 1)
+    robe = cone(x, (0, -0.2, 0), (0, 1.25, 0), 0.60, 0.20) * 0.92 + folds
+    chest = join(0.15, ball(x, (0, 1.42, 0.0), (0.30, 0.34, 0.21)), ball(s, (0.24, 1.60, 0.0), (0.15, 0.12, 0.14)))
+    head = join(
+        0.05, ball(x, (0, 2.08, 0.03), (0.18, 0.235, 0.20)), cone(x, (0, 2.08, 0.20), (0, 2.04, 0.245), 0.02, 0.032)
+    )
+    hair = join(0.06, ball(x, (0, 2.14, -0.04), (0.215, 0.215, 0.22)), ball(x, (0, 1.92, -0.15), (0.15, 0.17, 0.11)))
+    head = join(0.04, head, np.maximum(hair, 0.8 * (x[..., 2] - 0.10) - 0.6 * (x[..., 1] - 2.20)))
+    neck = cone(x, (0, 1.60, 0), (0, 1.95, 0), 0.11, 0.09)
+    right = join(
+        0.06,
+        cone(x, (0.32, 1.60, 0.02), (0.62, 1.78, 0.12), 0.105, 0.085),
+        cone(x, (0.62, 1.78, 0.12), (0.66, 2.22, 0.20), 0.08, 0.062),
+        ball(x, (0.67, 2.30, 0.21), (0.085, 0.09, 0.085)),
+    )
+    torch = join(
+        0.04,
+        cone(x, (0.67, 2.28, 0.21), (0.68, 2.50, 0.20), 0.05, 0.075),
+        cone(x, (0.68, 2.55, 0.20), (0.70, 2.86, 0.18), 0.115, 0.045),
+    )
+    left = join(
+        0.06,
+        cone(x, (-0.30, 1.58, 0.02), (-0.36, 1.28, 0.10), 0.115, 0.10),
+        cone(x, (-0.36, 1.28, 0.10), (-0.10, 1.34, 0.24), 0.10, 0.075),
+        ball(x, (-0.05, 1.36, 0.245), (0.09, 0.07, 0.06)),
+    )
+    wing = join(
+        0.10,
+        ball(s, (0.66, 1.96, -0.34), (0.24, 0.62, 0.095), -0.62),
+        ball(s, (0.76, 1.56, -0.36), (0.19, 0.64, 0.095), -0.36),
+        ball(s, (0.68, 1.24, -0.36), (0.17, 0.58, 0.095), -0.24),
+        cone(s, (0.08, 1.52, -0.10), (0.46, 1.66, -0.34), 0.13, 0.10),
+    )
+    base = -join(0.08, 0.74 - np.hypot(x[..., 0], x[..., 2]), 0.20 - np.abs(x[..., 1] + 0.45))
+    figure = join(0.10, join(0.12, robe, chest), join(0.08, neck, head), right, left)
+    return join(0.06, join(0.07, figure, wing), torch, base)
+
+
+# The field and the corners of its box, at whose lower end it is cut open.
+SCULPTURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, float, float]]] = {
+    "angel": (angel, (-1.4, -0.55, -0.9), (1.4, 3.1, 0.9)),
+    "gargoyle": (gargoyle, (-1.35, -0.34, -0.85), (1.35, 2.15, 0.95)),
+    "rabbit": (rabbit, (-0.75, 0.0, -1.25), (0.75, 2.45, 1.05)),
+    "bust": (bust, (-1.05, -0.6, -0.75), (1.05, 2.0, 0.75)),
+    "hand": (hand, (-0.85, -0.45, -0.4), (0.95, 2.05, 0.75)),
+}
+
+
+@lru_cache
+def sculpture(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
+    """A surface with one boundary loop, its grid ``size`` cells high; without chords, angles mostly above 20°.
+
+    Returns
+    -------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        Counterclockwise seen from outside.
+    """
+    field, low, high = SCULPTURES[name]
+    step, floor = (high[1] - low[1]) / size, low[1]
+    V, F = cut_off(*surface_net(field, np.subtract(low, (0, 2 * step, 0)), high, step), floor)
+    rim = np.concatenate(boundary_loops(F, len(V)))
+    inside = np.setdiff1d(np.arange(len(V)), rim)
+    for _ in range(12):
+        V[inside] = onto_surface(field, centroids(V, F), None)[inside]
+        # Around the rim each vertex goes between its neighbours.
+        V[rim] = onto_surface(field, (V[np.roll(rim, 1)] + V[np.roll(rim, -1)]) / 2, floor)
+    refined = refine(V, F, chords(F, len(V)))
+    return refined.V, refined.F
+
+
+def surface_net(field: Field, low: ArrayLike, high: ArrayLike, step: float) -> tuple[FloatArray, IntArray]:
+    """Mesh the surface where a field is zero: a vertex for each cell it passes, a square for each edge it crosses."""
+    axes = [np.arange(a, b + step, step) for a, b in zip(np.asarray(low), np.asarray(high), strict=True)]
+    values = field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    # Empty all around, so that every edge crossed has four cells.
+    for axis in range(3):
+        ends = np.moveaxis(values, axis, 0)[[0, -1]]
+        np.moveaxis(values, axis, 0)[[0, -1]] = np.maximum(ends, step)
+    values = well_composed(values, 0.01 * step)
+    inside = values < 0
+    cells = np.array(values.shape) - 1
+    total, count = np.zeros((*cells, 3)), np.zeros(cells, dtype=int)
+    squares = []
+    for k in range(3):
+        here, there = (np.take(values, range(a, cells[k] + a), axis=k) for a in (0, 1))
+        crossed = (here < 0) != (there < 0)
+        at = np.argwhere(crossed)
+        place = at.astype(float)
+        place[:, k] += (here / np.where(crossed, here - there, 1))[crossed]
+        around = []
+        # The four cells around an edge, in a circle.
+        for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)):
+            cell = at.copy()
+            cell[:, (k + 1) % 3] -= i
+            cell[:, (k + 2) % 3] -= j
+            around.append(cell)
+            np.add.at(total, tuple(cell.T), place)
+            np.add.at(count, tuple(cell.T), 1)
+        ring = np.stack([np.ravel_multi_index(tuple(cell.T), tuple(cells)) for cell in around], axis=1)
+        outwards = inside[tuple(at.T)]
+        squares.append(np.where(outwards[:, None], ring, ring[:, ::-1]))
+    used, quads = np.unique(np.concatenate(squares), return_inverse=True)
+    V = np.array([a[0] for a in axes]) + step * (total.reshape(-1, 3)[used] / count.ravel()[used, None])
+    quads = quads.reshape(-1, 4)
+    a, b, c, d = (V[quads[:, k]] for k in range(4))
+    short = np.linalg.norm(a - c, axis=1) < np.linalg.norm(b - d, axis=1)
+    quads = np.where(short[:, None], quads, np.roll(quads, 1, axis=1))
+    return V, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def well_composed(values: FloatArray, depth: float) -> FloatArray:
+    """Fill places where the solid touches itself along an edge or in a corner, so that its surface is a manifold."""
+    values = values.copy()
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    faces = [corners[corners[:, axis] == side] for axis in range(3) for side in (0, 1)]
+    # Opposite corners that must not be alone in being solid, or in being empty, among some.
+    opposite = [(face[[k, 3 - k]], face[[1 - k, 2 + k]]) for face in faces for k in (0, 1)]
+    opposite += [(corners[[k, 7 - k]], np.delete(corners, [k, 7 - k], axis=0)) for k in range(4)]
+    while True:
+        solid = values < 0
+        bad = np.zeros(np.array(values.shape) - 1, dtype=bool)
+        for pair, rest in opposite:
+            here, there = (np.array([solid[shifted(c, solid.shape)] for c in which]) for which in (pair, rest))
+            bad |= here.all(axis=0) & ~there.any(axis=0)
+            bad |= ~here.any(axis=0) & there.all(axis=0)
+        if not bad.any():
+            return values
+        for i, j, k in np.argwhere(bad):
+            cell = values[i : i + 2, j : j + 2, k : k + 2]
+            cell[cell == np.where(cell < 0, np.inf, cell).min()] = -depth
+
+
+def shifted(corner: IntArray, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """One corner of every cell of a grid."""
+    return tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))
+
+
+def cut_off(V: FloatArray, F: IntArray, floor: float) -> tuple[FloatArray, IntArray]:
+    """What is above a plane, without closed caves and without triangles that have all their vertices on the rim."""
+    F = F[(V[F, 1] > floor).all(axis=1)]
+    while True:
+        rim = np.zeros(len(V), dtype=bool)
+        rim[boundary_edges(F, len(V)).ravel()] = True
+        ears = rim[F].all(axis=1)
+        if not ears.any():
+            break
+        F = F[~ears]
+    joined = csr_array((np.ones(F.size), (F.ravel(), np.roll(F, 1, axis=1).ravel())), shape=(len(V), len(V)))
+    piece = connected_components(joined, directed=False)[1]
+    F = F[piece[F[:, 0]] == np.bincount(piece[F.ravel()]).argmax()]
+    used, F = np.unique(F, return_inverse=True)
+    return V[used], F.reshape(-1, 3).astype(np.int64)
+
+
+def centroids(V: FloatArray, F: IntArray) -> FloatArray:
+    """For every vertex the mean of its triangles' middles, weighted by area."""
+    corners = V[F]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    triangle = np.arange(F.size) // 3
+    around = csr_array((area[triangle], (F.ravel(), triangle)), shape=(len(V), len(F)))
+    return np.asarray((around @ corners.mean(axis=1)) / around.sum(axis=1)[:, None])
+
+
+def onto_surface(field: Field, x: FloatArray, floor: float | None) -> FloatArray:
+    """Points moved to where a field is zero, in a plane y = floor if there is one."""
+    width = 1e-4
+    if floor is not None:
+        x = np.stack([x[:, 0], np.full(len(x), floor), x[:, 2]], axis=1)
+    value = field(x)
+    slope = np.stack([field(x + width * e) - value for e in np.eye(3)], axis=1) / width
+    if floor is not None:
+        slope[:, 1] = 0
+    step = value / np.maximum((slope**2).sum(axis=1), 0.1)
+    return x - step[:, None] * slope
+
+
+def chords(F: IntArray, n: int) -> IntArray:
+    """Edges inside that join two vertices of the boundary."""
+    rim = np.zeros(n, dtype=bool)
+    rim[boundary_edges(F, n).ravel()] = True
+    interior = edges(F, n).interior
+    return interior[rim[interior].all(axis=1)]
+
+
+@lru_cache
+def seven(size: int = 64) -> dict[str, Problem]:
+    """The pairs of surface and letter of the paper's Figure 10 and its tables, with our surfaces."""
+    pairs = ("angel", "GS"), ("gargoyle", "GH"), ("rabbit", "R"), ("bust", "A"), ("hand", "P")
+    found = {}
+    for name, letters in pairs:
+        V, F = sculpture(name, size)
+        for letter in letters:
+            fixed, target = targets.boundary_to(V, F, targets.filled(targets.letter(letter)))
+            found[f"{name} onto {letter}"] = Problem(V, F, fixed, target)
+    return found
