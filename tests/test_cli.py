@@ -15,6 +15,7 @@ import pytest
 from meshes import boundary_of, lift, signed_areas
 from quasiharmonic import io
 from quasiharmonic.cli import main
+from quasiharmonic.measures import distortion
 from quasiharmonic.surfaces import random_delaunay
 from test_inject import star_problem, turned_ring
 
@@ -56,7 +57,7 @@ class TestMap:
         assert facts["iterations"] > 0
         assert facts["seconds"] > 0
         assert facts["linear_solver"]
-        assert facts["stages"][0]["iterations"] == facts["iterations"]
+        assert sum(stage["iterations"] for stage in facts["stages"]) == facts["iterations"]
         assert facts["triangles"] == len(F)
         assert picture.read_bytes().startswith(b"\x89PNG")
         said = capsys.readouterr()
@@ -276,9 +277,42 @@ class TestDiagnose:
 
 
 class TestPolish:
+    def test_a_little_unasked(self, star, tmp_path, monkeypatch):
+        facts, maps = {}, {}
+        for name, options in {"unasked": [], "none": ["--no-polish"], "asked": ["--polish", "blend"]}.items():
+            out, report = tmp_path / f"{name}.obj", tmp_path / f"{name}.json"
+            assert run("map", star, "-o", out, "--json", report, *options) == 0
+            facts[name], maps[name] = json.loads(report.read_text()), io.map_of(io.read_mesh(out))
+        assert [stage["name"] for stage in facts["unasked"]["stages"]][-1] == "polish, blend"
+        assert len(facts["none"]["stages"]) == len(facts["unasked"]["stages"]) - 1
+        assert facts["none"]["status"] == facts["unasked"]["status"] == "injective"
+        assert facts["asked"]["status"] == "polished"
+        V, F, _, _ = star_problem()
+        worst = {name: distortion(V, F, uv).summary("isometric").maximum for name, uv in maps.items()}
+        assert worst["unasked"] < 0.9 * worst["none"]
+        # On large meshes the first map is what one gets.
+        monkeypatch.setattr("quasiharmonic.cli.map._LARGEST", 100)
+        assert run("map", star, "-o", tmp_path / "large.obj") == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "large.obj")), maps["none"])
+
+    def test_not_unasked_where_distortion_is_undefined(self, tmp_path):
+        V, F, fixed, target = star_problem(n=120)
+        V = np.asarray(V, dtype=float).copy()
+        inner = next(t for t in range(len(F)) if not np.isin(F[t], fixed).any())
+        V[F[inner, 0]] = V[F[inner, 1]]
+        problem = write_problem(tmp_path, V, F, fixed, target)
+        arguments = "--reference", "equilateral", "--json", tmp_path / "r.json"
+        assert run("map", problem, "-o", tmp_path / "o.obj", *arguments) == 0
+        assert "polish" not in json.loads((tmp_path / "r.json").read_text())["stages"][-1]["name"]
+
+    def test_not_both_ways(self, star, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            run("map", star, "-o", tmp_path / "o.obj", "--polish", "mips", "--no-polish")
+        assert "not allowed" in capsys.readouterr().err
+
     def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):
         first, polished = tmp_path / "first.obj", tmp_path / "polished.obj"
-        assert run("map", star, "-o", first) == 0
+        assert run("map", star, "-o", first, "--no-polish") == 0
         assert run("polish", first, "-o", polished, "--energy", "mips", "--json", tmp_path / "r.json") == 0
         facts = json.loads((tmp_path / "r.json").read_text())
         assert facts["distortion"]["mips"]["mean"] < facts["distortion_before"]["mips"]["mean"]
@@ -293,12 +327,44 @@ class TestPolish:
         assert not (tmp_path / "o.obj").exists()
 
     def test_names_are_those_of_the_library(self):
-        from quasiharmonic import linsolve
+        from quasiharmonic import harmonising, linsolve
         from quasiharmonic.cli import arguments
         from quasiharmonic.polishing import ENERGIES
 
         assert set(arguments.ENERGIES) == set(ENERGIES)
+        assert set(arguments.HARMONISED) == set(harmonising.ENERGIES)
         assert set(arguments.LINEAR_SOLVERS) - {"auto"} == set(linsolve._BACKENDS)
+
+
+class TestHarmonise:
+    @pytest.mark.parametrize("energy", ["arap", "mips"])
+    def test_lowers_distortion_and_stays_certified(self, star, tmp_path, energy):
+        first, out, report = tmp_path / "first.obj", tmp_path / "out.obj", tmp_path / "r.json"
+        assert run("map", star, "-o", first, "--no-polish") == 0
+        assert run("harmonise", first, "-o", out, "--energy", energy, "--json", report) == 0
+        facts = json.loads(report.read_text())
+        assert facts["distortion"][energy]["mean"] < facts["distortion_before"][energy]["mean"]
+        assert facts["injective"]
+        assert run("check", out) == 0
+        _, _, fixed, target = star_problem()
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(out))[fixed], target)
+
+    def test_options_reach_it(self, star, tmp_path):
+        first, report = tmp_path / "first.obj", tmp_path / "r.json"
+        assert run("map", star, "-o", first) == 0
+        arguments = "--eta", 0.5, 0.25, "--iterations", 6, "--linear-solver", "superlu", "--json", report
+        assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", *arguments) == 0
+        facts = json.loads(report.read_text())
+        assert [s["name"] for s in facts["stages"][:2]] == [f"harmonise, springs, η = {eta}" for eta in (0.5, 0.25)]
+        assert all(s["iterations"] <= 6 for s in facts["stages"][:2])
+        assert facts["linear_solver"] == "superlu"
+
+    def test_refuses_what_it_cannot_begin_with(self, star, tmp_path, capsys):
+        assert run("harmonise", star, "-o", tmp_path / "o.obj", "--energy", "mips") == 2
+        assert "injective" in capsys.readouterr().err
+        assert run("harmonise", star, "-o", tmp_path / "o.obj", "--eta", "-1") == 2
+        assert "eta must be a positive number" in capsys.readouterr().err
+        assert not (tmp_path / "o.obj").exists()
 
 
 class TestCheck:

@@ -13,10 +13,40 @@ import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 
-from . import check, demo, diagnose, map, polish
+from . import (
+    batch,
+    batch_report,
+    check,
+    demo,
+    diagnose,
+    harmonise,
+    map,
+    measure,
+    morph,
+    plot,
+    polish,
+    refine,
+    repair,
+    view,
+)
 from .report import ReportError
 
-COMMANDS = (map, polish, check, diagnose, demo)
+COMMANDS = (
+    map,
+    morph,
+    repair,
+    polish,
+    harmonise,
+    check,
+    measure,
+    plot,
+    view,
+    diagnose,
+    refine,
+    batch,
+    batch_report,
+    demo,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run(options)
     except ReportError as error:
         return _fail(options.command, str(error), 1)
-    except (ValueError, OSError, ImportError, ArithmeticError) as error:
+    except (ValueError, OSError, ImportError, ArithmeticError, RuntimeError) as error:
         # Wrong input of any kind: the library's messages name the elements and what to do.
         return _fail(options.command, str(error), 2)
     except KeyboardInterrupt:

@@ -7,8 +7,20 @@ from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-# Those of quasiharmonic.polishing and quasiharmonic.linsolve, which are not imported to say them.
+# Those of quasiharmonic.polishing, .harmonising, .linsolve and .measures, which are not imported to say them.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap"
+HARMONISED = "arap", "area", "springs", "mips", "symmetric-dirichlet"
+MEASURES = (
+    "sigma1",
+    "sigma2",
+    "mips",
+    "conformal",
+    "isometric",
+    "symmetric_dirichlet",
+    "arap",
+    "area_ratio",
+    "shear",
+)
 LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "qdldl", "superlu"
 
 

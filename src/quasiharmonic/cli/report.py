@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,8 +68,8 @@ def check_outputs(map_path: Path, plot: Path | None, json_path: str | None, inpu
     from quasiharmonic import io
 
     io.check_output(map_path)
-    if plot is not None and plot.suffix.lower() != ".png":
-        raise ValueError(f"--plot {plot}: pictures are written as .png")
+    if plot is not None:
+        check_picture("--plot", plot, inputs)
     taken = {map_path.resolve(): "the map (-o)"}
     for option, path in (("--plot", plot), ("--json", None if json_path in (None, "-") else Path(str(json_path)))):
         if path is None:
@@ -86,12 +86,49 @@ def check_json(json_path: str | None, inputs: Sequence[Path | None]) -> None:
         _check_replaces_nothing("--json", Path(str(json_path)), inputs)
 
 
+def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for a mesh in a format whose suffix its own library judges."""
+    _check_replaces_nothing("-o", output, inputs)
+    check_json(json_path, (*inputs, output))
+
+
+def check_new(outputs: Mapping[str, Path], json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for files none of which may replace an input; what each is, and where."""
+    taken: list[Path] = []
+    for what, path in {**outputs, **({} if json_path in (None, "-") else {"--json": Path(str(json_path))})}.items():
+        _check_replaces_nothing(what, path, inputs)
+        if any(_same(path, other) for other in taken):
+            raise ValueError(f"{what} {path} is also another output")
+        taken.append(path)
+
+
+def check_picture(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for a picture."""
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"{option} {path}: pictures are written as .png")
+    _check_replaces_nothing(option, path, inputs)
+
+
+def check_export(path: Path, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for values per triangle."""
+    from quasiharmonic import io
+
+    if path.suffix.lower() not in io.PER_TRIANGLE_FORMATS:
+        raise ValueError(f"--export {path}: values per triangle are written as {', '.join(io.PER_TRIANGLE_FORMATS)}")
+    _check_replaces_nothing("--export", path, inputs)
+
+
 def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
     from quasiharmonic import io
 
     io.check_writable(path)
-    if path.resolve() in {source.resolve() for source in inputs if source is not None}:
+    if any(_same(path, source) for source in inputs if source is not None):
         raise ValueError(f"{option} {path} would replace an input file")
+
+
+def _same(path: Path, other: Path) -> bool:
+    """Whether two paths lead to one file, be it by links, symbolic or hard."""
+    return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
 
 
 @contextmanager
