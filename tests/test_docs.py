@@ -1,0 +1,37 @@
+"""Every Python block of the pages runs; those of one section, and all of the tutorial, share their names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent.parent
+PAGES = (
+    FOLDER / "README.md",
+    FOLDER / "docs" / "index.md",
+    FOLDER / "docs" / "howto.md",
+    FOLDER / "docs" / "method.md",
+    FOLDER / "docs" / "tutorial.md",
+)
+
+
+def sections(page):
+    """Title and code of each section that has code; the tutorial is one."""
+    text = page.read_text(encoding="utf-8")
+    for section in [text] if page.stem == "tutorial" else re.split(r"^#+ ", text, flags=re.MULTILINE):
+        blocks = re.findall(r"^```python\n(.*?)^```", section, flags=re.MULTILINE | re.DOTALL)
+        if blocks:
+            yield section.splitlines()[0], "\n".join(blocks)
+
+
+CASES = [
+    pytest.param(code, id=f"{page.stem}: {title}") for page in PAGES if page.exists() for title, code in sections(page)
+]
+
+
+@pytest.mark.parametrize("code", CASES)
+def test_block_runs(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "block", "exec"), {"__name__": "block"})
