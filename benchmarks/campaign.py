@@ -247,10 +247,10 @@ def summary(records: Sequence[Record]) -> str:
 
 def _by_stage(records: Sequence[Record]) -> list[str]:
     """How many problems were solved before each fallback: after the first stage, the second and so on, by family."""
-    if not records:
-        return []
     solved = [r for r in records if r["outcome"] == "injective"]
-    most = max((len(r["stages"]) for r in solved), default=1)
+    if not solved:
+        return []
+    most = max(len(r["stages"]) for r in solved)
     names = [Counter(r["stages"][k][0].split(",")[0] for r in solved if len(r["stages"]) > k) for k in range(most)]
     words = [count.most_common(1)[0][0] for count in names]
     lines = ["feasible problems solved up to each stage: the first, and after each fallback"]

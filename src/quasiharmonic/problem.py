@@ -135,7 +135,9 @@ class Problem:
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
         """The Laplacian of this mesh and these fixed vertices, analysed once and kept."""
         if linear_solver not in self._laplacians:
-            self._laplacians[linear_solver] = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
+            made = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
+            # "auto" and the name it stands for share one analysis.
+            self._laplacians[linear_solver] = self._laplacians.setdefault(made.solver.name, made)
         return self._laplacians[linear_solver]
 
     def mesh(self, kind: Reference) -> ReferenceMesh:
