@@ -9,9 +9,6 @@ triangles, where no map is that small.
 
 The status says that no map exists, and the diagnosis why: loops wound the wrong way, turning numbers, and for
 the ring vertices whose fixed neighbours no point of the target sees together.
-
-The least area is reached by the map of least energy, drawn here; a result's ``uv`` is the one with the fewest
-inverted triangles.
 """
 
 from __future__ import annotations
@@ -60,9 +57,8 @@ def main(output: Path, size: int = 16) -> dict[str, Any]:
     cases = problems(size)
     figure, axes = panels(2, len(cases), (3.6, 3.9))
     for above, below, (name, problem) in zip(*axes, cases.items(), strict=True):
-        result = first_map(problem, "tanh", 3000, record=1)
-        deepest = min(result.history, key=lambda step: step.energy)
-        uv = result.path[deepest.iteration].uv
+        result = first_map(problem, "tanh", 3000, record=3000)
+        deepest, uv = min(result.history, key=lambda step: step.energy), result.uv
         area = problem.mesh("rest").derivatives(uv @ (1, 1j)).area
         signed, unsigned = float(area.sum()), float(np.abs(area).sum())
         show(above, problem, result.path[0].uv, f"{name}: first guess")

@@ -240,6 +240,29 @@ class TestNoMap:
             # Any area at all will do, as long as the doubles around it are fine enough.
             assert result.injective == (squash[1] > 0 and not shift)
 
+    def test_the_map_of_least_area_is_handed_back(self):
+        """Onto a lopsided eight, no map covers less than its two lobes."""
+        V, F = disk(12)
+        (loop,) = boundary_loops(F, len(V))
+        t = 2 * np.pi * np.arange(len(loop)) / len(loop)
+        eight = np.stack([np.cos(t), 0.5 * np.sin(2 * t) + 0.25 * np.sin(t)], axis=1)
+        result = injective_map(V, F, loop, eight)
+        assert result.status is Status.IMPOSSIBLE
+        # Midpoint sums over t, split where the curve crosses itself: at cos t = -1/4.
+        s = 2 * np.pi * (np.arange(100_000) + 0.5) / 100_000
+        density = (
+            np.pi
+            / 100_000
+            * (np.cos(s) * (np.cos(2 * s) + 0.25 * np.cos(s)) + np.sin(s) * (0.5 * np.sin(2 * s) + 0.25 * np.sin(s)))
+        )
+        left = np.cos(s) < -0.25
+        lobes = abs(density[left].sum()) + abs(density[~left].sum())
+        assert 0.5 * np.abs(signed_areas(F, result.uv)).sum() == pytest.approx(lobes, rel=0.02)
+        assert result.certificate.flipped.size > 0
+        # Its tensors are this map's, as they are an injective one's.
+        again = quasi_harmonic_map(Problem(V, F, loop, eight), result.mu, reference=result.reference)
+        np.testing.assert_allclose(again, result.uv, atol=1e-9)
+
     def test_no_vertex_is_free(self):
         """A reversed corner triangle: two triangles, all four vertices fixed."""
         result = injective_map(
