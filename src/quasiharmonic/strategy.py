@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from numbers import Integral
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -66,9 +67,9 @@ class Descent:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for name, hint in get_type_hints(Descent).items():
-            words, given = get_args(hint), getattr(self, name)
-            if words and all(isinstance(word, str) for word in words) and given not in words:
+        for name, words in _words():
+            given = getattr(self, name)
+            if given not in words:
                 raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
         whole_number("iterations", self.iterations, least=1)
         try:
@@ -109,6 +110,13 @@ class Descent:
     def steps(self) -> Sequence[tuple[int, float]]:
         """VectorAdam's step lengths."""
         return self.schedule or (TANH_STEPS if self.parameterization == "tanh" else SI_LOG_STEPS)
+
+
+@cache
+def _words() -> list[tuple[str, tuple[str, ...]]]:
+    """The attributes of a `Descent` that are one of several words, and those words."""
+    hints = [(name, get_args(hint)) for name, hint in get_type_hints(Descent).items()]
+    return [(name, words) for name, words in hints if words and all(isinstance(word, str) for word in words)]
 
 
 def whole_number(name: str, value: Any, *, least: int) -> None:
