@@ -5,6 +5,7 @@
     python benchmarks/speed.py --triangles 500000 1000000 3500000 --peers igl.harmonic --memory
     python benchmarks/speed.py FOLDER … --triangles             # problem folders only
     python benchmarks/speed.py --animation                      # 100 frames of a moving boundary besides
+    python benchmarks/speed.py --fine                           # every iteration on the mesh itself, never a coarse one
 
 A made problem maps the head of a cat onto the letters C, R and S. A folder is a problem (``input.obj`` +
 ``handles.txt``) or holds problems at any depth. Tools take turns, and medians over the turns are taken; a tool that
@@ -32,19 +33,22 @@ from numpy.typing import NDArray
 
 import phases
 from peers import PEERS
-from quasiharmonic import Problem, inject, io, is_injective, solve, surfaces
+from quasiharmonic import Descent, Problem, inject, io, is_injective, solve, surfaces
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.targets import arc_length, letter, rectangle
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Arrays = tuple[Floats, Ints, Ints, Floats]
+Strategy = str | list[Descent]
 
 OURS = "quasiharmonic"
 YARDSTICK = "igl.harmonic"
 LETTERS = "CRS"
 SIZES = (1_000, 4_000, 16_000, 64_000, 130_000)
 FRAMES = 100
+# What an iteration does besides factoring and solving.
+_REST = "assembly", "gradient", "optimiser"
 
 
 @dataclass
@@ -91,7 +95,7 @@ def problems(sizes: list[int], folders: list[Path]) -> Iterator[tuple[str, Array
             yield path.parent.name, (problem.V, problem.F, problem.fixed, problem.target)
 
 
-def measure(name: str, arrays: Arrays, tools: list[str], runs: int, strategy: str) -> list[Record]:
+def measure(name: str, arrays: Arrays, tools: list[str], runs: int, strategy: Strategy) -> list[Record]:
     """Let the tools take turns at a problem."""
     records = [Record(name, len(arrays[1]), tool) for tool in tools]
     for turn in range(runs):
@@ -213,6 +217,7 @@ def table(records: list[Record]) -> str:
     tools = list(dict.fromkeys(record.tool for record in records))
     measured = any(record.megabytes is not None for record in records)
     heads = ["problem", "triangles", "iterations", *(f"{tool} s" for tool in tools), f"ratio to {YARDSTICK}"]
+    heads += ["an iteration's rest / factor + solve"]
     heads += [f"{name} %" for name in phases.NAMES] + [f"{tool} MB" for tool in tools if measured]
     lines = [" | ".join(heads), " | ".join(["---"] * len(heads))]
     rows = dict.fromkeys((record.problem, record.triangles) for record in records)
@@ -222,6 +227,8 @@ def table(records: list[Record]) -> str:
         cells = [name, str(triangles), f"{ours.iterations}{'' if ours.injective else ' (not injective)'}"]
         cells += [_time(row.get(tool)) for tool in tools]
         cells.append(f"{ours.median / yardstick.median:.2f}" if yardstick else "")
+        rest, solving = (sum(map(ours.phase, names)) for names in (_REST, ("factor", "solve")))
+        cells.append(f"{rest / solving:.2f}" if ours.phases else "")
         cells += [f"{100 * ours.phase(p) / ours.median:.0f}" if ours.phases else "" for p in phases.NAMES]
         found = [row[tool].megabytes if tool in row else None for tool in tools if measured]
         cells += ["" if megabytes is None else f"{megabytes:.0f}" for megabytes in found]
@@ -276,7 +283,8 @@ def main() -> None:
     parser.add_argument("folders", nargs="*", type=Path, help="problem folders")
     parser.add_argument("--triangles", nargs="*", type=int, default=list(SIZES), help="sizes of the made problems")
     parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), help="what to compare with")
-    parser.add_argument("--strategy", default="speed")
+    parser.add_argument("--strategy", default="speed", help="speed or quality (%(default)s)")
+    parser.add_argument("--fine", action="store_true", help="VectorAdam alone, on the mesh itself")
     parser.add_argument("-r", "--runs", type=int, default=5, help="turns of every tool")
     parser.add_argument("--limit", type=float, default=30, help="seconds, past which a tool gets no larger problem")
     parser.add_argument("--memory", action="store_true", help="peak memory too")
@@ -287,12 +295,13 @@ def main() -> None:
     if options.peak:
         return print_peak(options.peak[0], Path(options.peak[1]))
     tools = warm_up([OURS, *options.peers])
+    strategy: Strategy = [Descent()] if options.fine else options.strategy
     records: list[Record] = []
     for name, arrays in problems(options.triangles, options.folders):
         slow = {
             record.tool for record in records if record.median > options.limit and len(arrays[1]) > record.triangles
         }
-        found = measure(name, arrays, [tool for tool in tools if tool not in slow], options.runs, options.strategy)
+        found = measure(name, arrays, [tool for tool in tools if tool not in slow], options.runs, strategy)
         for record in found if options.memory else ():
             record.megabytes = peak_megabytes(arrays, record.tool)
         records += found
