@@ -213,27 +213,40 @@ def machine() -> str:
 
 
 def table(records: list[Record]) -> str:
-    """Markdown: the tools side by side, our phases in percent of our time, and memory where it was measured."""
+    """Markdown: the tools side by side, with memory where it was measured."""
     tools = list(dict.fromkeys(record.tool for record in records))
     measured = any(record.megabytes is not None for record in records)
-    heads = ["problem", "triangles", "iterations", *(f"{tool} s" for tool in tools), f"ratio to {YARDSTICK}"]
-    heads += ["an iteration's rest / factor + solve"]
-    heads += [f"{name} %" for name in phases.NAMES] + [f"{tool} MB" for tool in tools if measured]
-    lines = [" | ".join(heads), " | ".join(["---"] * len(heads))]
-    rows = dict.fromkeys((record.problem, record.triangles) for record in records)
-    for name, triangles in rows:
+    heads = ["problem", "triangles", *(f"{tool} s" for tool in tools), f"ratio to {YARDSTICK}"]
+    heads += [f"{tool} MB" for tool in tools if measured]
+    rows = []
+    for name, triangles in _rows(records):
         row = {r.tool: r for r in records if (r.problem, r.triangles) == (name, triangles)}
-        ours, yardstick = row[OURS], row.get(YARDSTICK)
-        cells = [name, str(triangles), f"{ours.iterations}{'' if ours.injective else ' (not injective)'}"]
-        cells += [_time(row.get(tool)) for tool in tools]
-        cells.append(f"{ours.median / yardstick.median:.2f}" if yardstick else "")
-        rest, solving = (sum(map(ours.phase, names)) for names in (_REST, ("factor", "solve")))
-        cells.append(f"{rest / solving:.2f}" if ours.phases else "")
-        cells += [f"{100 * ours.phase(p) / ours.median:.0f}" if ours.phases else "" for p in phases.NAMES]
+        yardstick = row.get(YARDSTICK)
+        cells = [name, f"{triangles:,}", *(_time(row.get(tool)) for tool in tools)]
+        cells.append(f"{row[OURS].median / yardstick.median:.2f}" if yardstick else "")
         found = [row[tool].megabytes if tool in row else None for tool in tools if measured]
-        cells += ["" if megabytes is None else f"{megabytes:.0f}" for megabytes in found]
-        lines.append(" | ".join(cells))
-    return "".join(f"| {line} |\n" for line in lines)
+        rows.append(cells + ["" if megabytes is None else f"{megabytes:.0f}" for megabytes in found])
+    return f"{_markdown(heads, rows)}\n×: has inverted triangles.\n"
+
+
+def phase_table(records: list[Record]) -> str:
+    """Markdown: what share of our time each phase has, in percent, and what an iteration does besides solving."""
+    heads = ["problem", "triangles", "iterations", *phases.NAMES, "an iteration's rest / factor + solve"]
+    rows = []
+    for name, triangles in _rows(records):
+        ours = next(r for r in records if (r.problem, r.triangles, r.tool) == (name, triangles, OURS))
+        shares = [f"{100 * ours.phase(phase) / ours.median:.0f}" for phase in phases.NAMES]
+        rest, solving = (sum(map(ours.phase, names)) for names in (_REST, ("factor", "solve")))
+        rows.append([name, f"{triangles:,}", str(ours.iterations), *shares, f"{rest / solving:.2f}"])
+    return _markdown(heads, rows)
+
+
+def _rows(records: list[Record]) -> list[tuple[str, int]]:
+    return list(dict.fromkeys((record.problem, record.triangles) for record in records))
+
+
+def _markdown(heads: list[str], rows: list[list[str]]) -> str:
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (heads, ["---"] * len(heads), *rows))
 
 
 def _time(record: Record | None) -> str:
@@ -242,7 +255,7 @@ def _time(record: Record | None) -> str:
     if not record.seconds:
         return "fails"
     # Of the others only some claim to be free of inversions.
-    return f"{record.median:.4g}{'' if record.injective else ' (inverted)'}"
+    return f"{record.median:.4g}{'' if record.injective else ' ×'}"
 
 
 def write_csv(records: list[Record], path: Path) -> None:
@@ -308,7 +321,9 @@ def main() -> None:
         times = ", ".join(f"{record.tool} {_time(record)}" for record in found)
         print(f"{name}, {found[0].triangles} triangles, {found[0].iterations} iterations: {times}", flush=True)
     frames = animation(20_000) if options.animation else []
-    text = f"{machine()}\n\n{table(records)}" if records else f"{machine()}\n"
+    text = f"{machine()}\n"
+    if records:
+        text += f"\n{table(records)}\nOur time by phase, in percent:\n\n{phase_table(records)}"
     for record in frames:
         text += (
             f"\n{record.problem}, {record.triangles} triangles: {record.median:.2f} s, {record.iterations} iterations, "

@@ -31,11 +31,10 @@ extensions = [
     "bars",
     "commands",
     "mathml",
-    "measured",
     "names",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build", "_templates", "sg_execution_times.rst"]
+exclude_patterns = ["_build", "_templates", "sg_execution_times.rst", "choose/*", "speed/*"]
 templates_path = ["_templates"]
 suppress_warnings = [
     "config.cache",  # the gallery's scraper is a function
@@ -65,6 +64,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "within_subsection_order": "FileNameSortKey",
     "notebook_images": False,
+    "first_notebook_cell": "# Run this in the folder examples/ of a checkout: what the scripts share is in common.py there.",
 }
 
 html_theme = "furo"

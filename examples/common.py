@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.plot import plot_map
 
 FloatArray = NDArray[np.float64]
+BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 RED, INK = (0.89, 0.07, 0.17), (0.06, 0.12, 0.29)
 COLORS = {"tanh": (0.85, 0.45, 0.10), "si-log": (0.16, 0.38, 0.75)}
 
@@ -148,7 +150,10 @@ def save(figure: Figure, output: Path, name: str) -> None:
 
 
 def run(main: Callable[..., dict[str, Any]]) -> None:
-    """Call ``main(output, …)`` from the command line, its further integer and boolean parameters as options."""
+    """Call ``main(output, …)`` from the command line, its further integer and boolean parameters as options.
+
+    In a notebook, call it as it is and show the pictures it made.
+    """
     parser = argparse.ArgumentParser(
         description=inspect.getmodule(main).__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -158,5 +163,13 @@ def run(main: Callable[..., dict[str, Any]]) -> None:
             parser.add_argument(f"--{name}", action="store_true")
         else:
             parser.add_argument(f"--{name}", type=int, default=parameter.default, help=f"({parameter.default})")
-    options = vars(parser.parse_args())
+    in_notebook = "ipykernel" in sys.modules
+    options = vars(parser.parse_args([] if in_notebook else None))
+    before = {path: path.stat().st_mtime_ns for path in options["output"].glob("*")}
     print(json.dumps(main(**options), indent=2, ensure_ascii=False))
+    if in_notebook:
+        from IPython.display import Image, display
+
+        for path in sorted(options["output"].glob("*.png")):
+            if path.stat().st_mtime_ns != before.get(path):
+                display(Image(path))

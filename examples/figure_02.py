@@ -38,7 +38,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
         mean = float(share @ ratio)
         below = axes[1][k]
         below.set_position(((k + 0.18) / len(maps), 0.07, 0.76 / len(maps), 0.36))
-        below.hist(ratio, bins=np.geomspace(1, 1000, 91), weights=share, color=colors[name])
+        below.hist(ratio, bins=np.geomspace(1, 10_000, 121), weights=share, color=colors[name])
         below.axvline(mean, color="black", lw=0.8, ls=":")
         below.set(xscale="log", yscale="log", ylim=(1e-5, 1), xlabel="σ₁/σ₂", ylabel="part of the surface")
         numbers[name] = {

@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from common import COLORS, panels, save
+from common import BENCHMARKS, COLORS, panels, save
 from quasiharmonic import batch
 from quasiharmonic.batch.report.numbers import load
 
-sys.path.append(str(Path(__file__).resolve().parent.parent / "benchmarks"))
+sys.path.append(str(BENCHMARKS))
 from dataset import drawn, plan, write
 
 RUNS = {

@@ -11,8 +11,8 @@ SBP has to find an injective map on its way. From one at hand both of its terms 
 the shear where room is short (mean MIPS of 11 against 45 on R, and 25 against 101 on H). Where an energy has a
 barrier and second derivatives Newton's method is the better one; quasi-harmonisation needs neither.
 
-θ = 0 does what the paper says: areas vary by many orders of magnitude, more than for si-log's first map, which
-minimises no energy of angles.
+θ = 0 does what the paper says: areas span 7 to 11 orders of magnitude, and triangles at the boundary grow to between 28
+and 67 times their area. si-log's first map, which minimises no energy of angles, spans nearly as many but stops at 27.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ hand onto P     1.17         0.744  0.083       0.781, 0.391, 0.0910
 =============== ============ ====== =========== ====================
 
 The last column is the least on all seven. Scale is what it pays with: its largest stretch max(σ₁, 1/σ₂) is from 22 to
-eight million times that of the first column's maps. The paper's Table 4 has the same of si-log.
+nine million times that of the first column's maps. The paper's Table 4 has the same of si-log.
 """
 
 from __future__ import annotations

@@ -1,0 +1,57 @@
+"""The boundary of a finite-element mesh has moved: a flap turned in its channel
+============================================================================
+
+A mesh around a flap, which is then turned by up to 75°, while the walls stay. What is commonly done is to spread the
+displacement of the boundary over the interior by Laplace's equation; that inverts triangles in the end. ``morph``
+never does. It starts from the same extension, searches where triangles are inverted and then lowers a distortion
+energy, so that the triangles keep the shapes and sizes they had.
+
+Of the 4,588 triangles at the default size Laplace's equation inverts 8 at 25°, 62 at 50° and 156 at 75°, ``morph``
+none. The worst mean ratio (1 for an equilateral triangle, 0 for one without area) falls from 0.84 to 0.21, 0.15 and
+0.08, at the flap's tips. For files of Gmsh and VTK there is ``qhm morph mesh.msh --field NAME -o moved.msh``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import flips, panels, run, save, show
+from quasiharmonic import Problem, morph, quasi_harmonic_map, surfaces
+from quasiharmonic.mesh.topology import boundary_loops
+
+DEGREES = (25, 50, 75)
+
+
+def main(output: Path, size: int = 48) -> dict[str, Any]:
+    points, F = surfaces.annulus(size, hole=(-0.6, -0.05, 0.6, 0.05))
+    walls, flap = boundary_loops(F, len(points))
+    fixed = np.concatenate([walls, flap])
+    figure, axes = panels(2, 1 + len(DEGREES), (3.0, 3.3))
+    rest = Problem(points, F, fixed, points[fixed])
+    show(axes[0][0], rest, points, "the mesh", pins=False)
+    axes[1][0].set_axis_off()
+    numbers: dict[str, Any] = {"triangles": len(F)}
+    for k, degrees in enumerate(DEGREES, 1):
+        angle = np.radians(degrees)
+        place = points[flap] @ np.array([(np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))])
+        problem = Problem(points, F, fixed, np.concatenate([points[walls], place]))
+        spread = quasi_harmonic_map(problem, reference="rest")
+        morphed = morph(points, F, flap, place)
+        show(axes[0][k], problem, spread, f"{degrees}°, by Laplace's equation", pins=False)
+        show(axes[1][k], problem, morphed.points, f"{degrees}°, morphed", pins=False)
+        numbers[f"{degrees}°"] = {
+            "inverted by Laplace's equation": flips(problem, spread),
+            "valid": morphed.valid,
+            "worst mean ratio before": float(morphed.quality_before.min()),
+            "worst mean ratio": float(morphed.quality_after.min()),
+            "boundary off by": float(np.abs(morphed.points[fixed] - problem.target).max()),
+        }
+    save(figure, output, "morph")
+    return numbers
+
+
+if __name__ == "__main__":
+    run(main)
