@@ -64,7 +64,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "within_subsection_order": "FileNameSortKey",
     "notebook_images": False,
-    "first_notebook_cell": "# Run this in the folder examples/ of a checkout: what the scripts share is in common.py there.",
+    "first_notebook_cell": "# Run this in the folder examples/ of a checkout, where what the scripts share is.",
 }
 
 html_theme = "furo"

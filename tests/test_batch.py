@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import quasiharmonic
 from datasets import record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch, certify, io
 from quasiharmonic.batch import keeper, records
+from quasiharmonic.batch import settings as settings_module
+from quasiharmonic.batch.keeper import Finished
 from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus
@@ -49,6 +54,28 @@ class TestFinding:
         assert found[1].mesh == stars / "b/c/input.obj"
         assert found[1].fixed == stars / "b/c/handles.txt"
 
+    @pytest.mark.skipif(os.name != "posix", reason="makes links and pipes")
+    def test_files_that_cannot_be_read_are_invalid_and_hold_nobody_up(self, stars, tmp_path):
+        (stars / "a" / "handles.txt").unlink()
+        (stars / "a" / "handles.txt").symlink_to("nowhere")
+        (stars / "z" / "input.obj").unlink()
+        os.mkfifo(stars / "z" / "input.obj")
+        assert batch.run(stars, tmp_path / "out", jobs=1).outcomes == {"injective": 2, "invalid": 2}
+        a, z = (record_of(tmp_path / "out", name)["error"] for name in "az")
+        assert re.fullmatch(r"\S+/a/handles.txt: cannot be read: No such file or directory", a)
+        assert re.fullmatch(r"\S+/z/input.obj: cannot be read: it is not a regular file", z)
+
+    def test_a_folder_that_cannot_be_read_is_not_passed_over(self, stars, tmp_path, monkeypatch):
+        def refuse(folder):
+            if folder == stars / "b" / "d":
+                raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+            return scandir(folder)
+
+        scandir = os.scandir
+        monkeypatch.setattr(os, "scandir", refuse)
+        with pytest.raises(OSError, match=r"\S+/b/d: the folder cannot be read: Permission denied"):
+            batch.run(stars, tmp_path / "out")
+
     def test_a_problem_may_have_others_below_and_be_alone(self, stars):
         write_stars(stars, ["b"])
         assert names(stars) == ["a", "b", "b/c", "b/d/e", "z"]
@@ -69,8 +96,14 @@ class TestFinding:
         text = f"# a list\n\nz # the last\nb\n{elsewhere}/y\nb/c\na/input.obj\n"
         (stars / "list.txt").write_text(text)
         assert names(stars / "list.txt") == ["z", "b/c", "b/d/e", f"{elsewhere}/y".lstrip("/"), "a/input.obj"]
+        write_stars(stars, ["no#1"])
+        (stars / "list.txt").write_bytes(b"\xef\xbb\xbfno#1\r\n\t# from another system\r\n")
+        assert names(stars / "list.txt") == ["no#1"]
         (stars / "list.txt").write_text("a\nnowhere\n")
         with pytest.raises(ValueError, match=r"list.txt: line 2: .*nowhere"):
+            names(stars / "list.txt")
+        (stars / "list.txt").write_bytes(b"\x89PNG\r\n\x1a\0")
+        with pytest.raises(ValueError, match=r"line 1: there is no folder and no OBJ or OFF file '\\udc89PNG'"):
             names(stars / "list.txt")
         with pytest.raises(ValueError, match="there is no folder, list or mesh"):
             names(stars / "none")
@@ -156,6 +189,53 @@ class TestRun:
         assert batch.run(stars, out, jobs=1).resumed == 4
         assert batch.run(stars, out, batch.Settings(strategy="quality"), jobs=1).resumed == 0
 
+    def test_what_another_state_of_the_code_has_done_is_done_anew(self, stars, tmp_path, monkeypatch):
+        assert batch.run(stars / "a", tmp_path / "out").resumed == 0
+        assert batch.run(stars / "a", tmp_path / "out").resumed == 1
+        package = tmp_path / "package"
+        (package / "batch" / "report").mkdir(parents=True)
+        monkeypatch.setattr(quasiharmonic, "__file__", str(package / "__init__.py"))
+        states = []
+        for file, text in (
+            ("__init__.py", ""),
+            ("inject.py", "a = 1"),
+            ("inject.py", "a = 2"),
+            ("batch/report/page.py", "only shows"),
+        ):
+            (package / file).write_text(text)
+            states.append(settings_module._code.__wrapped__())
+        assert len(set(states)) == 3
+        assert states[2] == states[3]
+        monkeypatch.setattr(settings_module, "_code", lambda: states[0])
+        assert batch.run(stars / "a", tmp_path / "out").resumed == 0
+
+    def test_one_run_at_a_time(self, stars, tmp_path):
+        pytest.importorskip("fcntl")
+        out, refused = tmp_path / "out", []
+
+        def again(progress):
+            with pytest.raises(OSError, match=r"another run is writing to .*out"):
+                batch.run(stars, out)
+            refused.append(progress.done)
+
+        assert batch.run(stars, out, jobs=1, callback=again).solved == 4
+        assert refused[-1] == 4
+        assert batch.run(stars, out).resumed == 4
+
+    def test_nothing_that_is_not_of_a_run_is_written_over(self, stars, tmp_path):
+        for out in (stars, stars / "b", stars / "a"):
+            with pytest.raises(ValueError, match=r"holds a problem, .*input.obj: name another folder"):
+                batch.run(stars, out)
+            assert not list(stars.rglob("qhm-batch*"))
+        (tmp_path / "records.csv").write_text("mine")
+        with pytest.raises(OSError, match=r"has a records.csv that is of no run"):
+            batch.run(stars, tmp_path)
+        assert (tmp_path / "records.csv").read_text() == "mine"
+        assert not (tmp_path / "results").exists()
+        # Above the problems there is room.
+        (tmp_path / "records.csv").unlink()
+        assert batch.run(stars / "b", stars).solved == batch.run(stars / "b", stars).resumed == 2
+
     def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
         batch.run(stars, tmp_path / "out", jobs=1)
         monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
@@ -217,6 +297,8 @@ class TestRun:
         (tmp_path / "file").write_text("")
         with pytest.raises(OSError, match="cannot write to"):
             batch.run(stars, tmp_path / "file" / "out")
+        with pytest.raises(OSError, match="it is no folder"):
+            batch.run(stars, tmp_path / "file")
 
     def test_worker_that_does_not_start(self, stars, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(keeper, "COMMAND", [sys.executable, "-c", "raise SystemExit('no such luck')"])
@@ -225,6 +307,33 @@ class TestRun:
         monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
         assert main(["batch", str(stars), "-o", str(tmp_path / "out")]) == 2
         assert "cannot start /nonexistent" in capsys.readouterr().err
+
+    def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
+        """Thousands of folders with a file each that nobody looks into."""
+
+        def attend(keeper, files):
+            records.clear(keeper.orders.folder(files.name))
+            records.write_record(keeper.orders.folder(files.name), {"problem": files.name, "outcome": "injective"})
+            return Finished(files.name, "injective", 0.0)
+
+        def look(progress):
+            if progress.done in (100, 1000):
+                held = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/batch/*.py")])
+                sizes[progress.done] = sum(trace.size for trace in held.traces)
+
+        monkeypatch.setattr(keeper.Keeper, "attend", attend)
+        for k in range(1000):
+            folder = tmp_path / "set" / f"{k // 50}" / f"{k}"
+            folder.mkdir(parents=True)
+            (folder / "input.obj").touch()
+        sizes = {}
+        tracemalloc.start()
+        try:
+            assert batch.run(tmp_path / "set", tmp_path / "out", jobs=1, callback=look).solved == 1000
+        finally:
+            tracemalloc.stop()
+        # A list of the problems would take half a megabyte.
+        assert sizes[1000] < sizes[100] + 50_000
 
     def test_an_interrupt_stops_at_once_and_keeps_what_is_done(self, stars, tmp_path, troubled):
         write_stars(stars, ["y_sleep"])

@@ -126,3 +126,14 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[dask\]'"):
         batch.run(source, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+
+
+@pytest.mark.parametrize("address", ["nonsense", "tcp://host", "http://host:1", "tcp://host:port"])
+def test_wrong_addresses_are_refused_at_once(tmp_path, capfd, address):
+    source = write_stars(tmp_path / "set", ["a"])
+    began = time.monotonic()
+    assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", address]) == 2
+    error = capfd.readouterr().err
+    assert f"'{address}' is not the address of a Dask scheduler, which looks like tcp://HOST:8786" in error
+    assert "Traceback" not in error
+    assert time.monotonic() - began < 20

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from datasets import write_stars
+from datasets import star_of, write_problem, write_stars
 from quasiharmonic import batch
 from quasiharmonic.batch import records
 from quasiharmonic.batch.report import figures, numbers, page
@@ -112,6 +112,33 @@ class TestPage:
         (tmp_path / "out" / "results" / "c" / "record.json").unlink()
         assert "2 of 2 certified" in Reader(written(tmp_path, tmp_path / "out")).text
 
+    def test_spoilt_files_are_passed_over(self, tmp_path):
+        out = tmp_path / "out"
+        batch.run(write_stars(tmp_path / "set", list("abcdefg")), out, jobs=1)
+        (out / "records.csv").unlink()
+        for name, text in {
+            "a": '{"problem": "a", "outc',
+            "b": "[1]",
+            "c": "{}",
+            "d": '{"problem": 7, "outcome": "injective"}',
+            "e": '{"problem": "e", "outcome": "injective", "seconds": "long"}',
+        }.items():
+            (out / "results" / name / "record.json").write_text(text)
+        (out / "results" / "f" / "map.obj").write_text("spoilt")
+        for text in ("[]", '{"settings": 1}', "{"):
+            (out / "qhm-batch.json").write_text(text)
+            assert "2 of 2 certified" in Reader(written(tmp_path, out)).text
+        assert batch.run(tmp_path / "set", out, jobs=1).resumed == 1
+
+    def test_problems_proven_impossible_are_told_apart(self, tmp_path):
+        V, F, fixed, target = star_of(4)
+        write_problem(tmp_path / "set" / "mirrored", V, F, fixed, target * [1, -1])
+        write_stars(tmp_path / "set", ["a"])
+        batch.run(tmp_path / "set", tmp_path / "out", jobs=1)
+        text = Reader(written(tmp_path, tmp_path / "out")).text
+        assert "1 no injective map found; it is proven of 1 that they have no such map" in text
+        assert "The target is wound against the mesh" in text
+
     @pytest.mark.parametrize("column", ["problem", "error", "outcome", "source", "versions"])
     def test_whatever_things_are_called(self, tmp_path, column):
         made(tmp_path, 30, **{column: VILE, "certified": False})
@@ -140,6 +167,11 @@ class TestPage:
         assert "0 of 4 certified" in text
         (tmp_path / "t.csv").write_text("problem,certified\na,True\n")
         assert "1 of 1 certified" in Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "t.csv")).text
+        pyarrow = pytest.importorskip("pyarrow")
+        from pyarrow import parquet
+
+        parquet.write_table(pyarrow.table({"problem": [0, 1], "seconds": [0.5, None]}), tmp_path / "t.parquet")
+        assert "0 of 2 certified" in Reader(written(tmp_path, tmp_path / "t.parquet")).text
 
     def test_many_failures_and_many_dots_stay_bounded(self, tmp_path):
         made(tmp_path, 20_000, name="many.csv")
@@ -151,7 +183,9 @@ class TestPage:
         (tmp_path / "t.csv").write_text("problem,seconds\n")
         assert main(["report", str(tmp_path / "t.csv")]) == 2
         assert "no records" in capsys.readouterr().err
-        assert main(["report", str(tmp_path / "none.csv")]) == 2
+        for name in ("none.csv", "none"):
+            assert main(["report", str(tmp_path / name)]) == 2
+            assert "there is no folder and no table" in capsys.readouterr().err
         assert main(["report", str(tmp_path)]) == 2
         made(tmp_path)
         assert main(["report", str(tmp_path / "t.csv"), "-o", str(tmp_path / "no" / "r.html")]) == 2

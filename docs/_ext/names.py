@@ -29,6 +29,13 @@ def _attributes(self: NumpyDocstring, section: str) -> list[str]:
         del self._consume_fields
 
 
+def _letters(app: Sphinx, doctree: nodes.document) -> None:
+    """The letters of a shape, ``(n, 2)``, are no names, although some attribute is called n."""
+    for node in list(doctree.findall(pending_xref)):
+        if node.get("refdomain") == "py" and len(node["reftarget"]) == 1:
+            node.replace_self(node.children)
+
+
 def _resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element) -> nodes.Element | None:
     """The public name, or the only one in all modules that ends so."""
     if node.get("refdomain") != "py":
@@ -48,5 +55,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     for field in PyObject.doc_field_types:
         if field.name == "variable":
             field.label = "Attributes"
+    app.connect("doctree-read", _letters)
     app.connect("missing-reference", _resolve)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -43,6 +43,8 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
     ------
     ImportError
         When ``distributed`` is not installed.
+    ValueError
+        When an address is none.
     ConnectionError
         When the scheduler is not there or not there any more.
     OutputError, WorkerError
@@ -50,13 +52,20 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
     """
     try:
         from distributed import Client
+        from distributed.comm import resolve_address
     except ImportError as error:
         raise ImportError("a Dask cluster needs distributed: pip install 'quasiharmonic[dask]'") from error
     if isinstance(scheduler, Client):
         yield from _through(scheduler, todo, orders)
         return
     try:
+        if isinstance(scheduler, str):
+            # A client that is given a wrong one hangs for a minute when it is disposed of.
+            resolve_address(scheduler)
         client = Client(scheduler, set_as_default=False)
+    except ValueError as error:
+        wanted = "the address of a Dask scheduler, which looks like tcp://HOST:8786"
+        raise ValueError(f"{scheduler!r} is not {wanted}: {error}") from error
     except (OSError, TimeoutError) as error:
         raise ConnectionError(f"there is no Dask scheduler at {scheduler}: {error}") from error
     with client:

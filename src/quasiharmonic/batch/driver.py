@@ -16,6 +16,7 @@ from typing import Any, get_args
 from quasiharmonic import __version__
 from quasiharmonic.batch import records
 from quasiharmonic.batch.keeper import ClosedError, Finished, Keeper, resident
+from quasiharmonic.batch.lock import alone
 from quasiharmonic.batch.problems import MARKER, ProblemFiles, find_problems
 from quasiharmonic.batch.settings import Orders, Settings
 from quasiharmonic.io.atomic import write_whole
@@ -129,9 +130,10 @@ def run(
     Raises
     ------
     ValueError
-        When there are no problems, or an argument makes no sense.
+        When there are no problems, some lie in ``output``, or an argument makes no sense.
     OutputError
-        When results cannot be written, as on a full disk. What is finished stays.
+        When results cannot be written, as on a full disk, or while another run is writing to ``output``. What is
+        finished stays.
     ImportError
         When a package that was asked for is not installed.
     WorkerError
@@ -144,30 +146,27 @@ def run(
     records.check_table(table_path)
     began = time.perf_counter()
     # Counted first and found once more while they are solved, so that no list of them is kept.
-    progress = Progress(sum(1 for _ in find_problems(source, plain=settings.plain)))
-    if not progress.total:
-        raise ValueError(
-            f"there are no problems in {source}: a problem is a folder with input.obj and handles.txt"
-            + ("" if settings.plain else "; to take plain meshes, say what to map them to")
-        )
-    _prepare(folder, source, settings)
-    orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
-    todo = find_problems(source, plain=settings.plain)
-    if scheduler is None:
-        finished = _local(todo, orders, min(jobs or _cores(), progress.total))
-    else:
-        from quasiharmonic.batch.cluster import on_cluster
+    progress = Progress(_count(source, settings, folder))
+    _make(folder)
+    with alone(folder):
+        _prepare(folder, source, settings)
+        orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
+        todo = find_problems(source, plain=settings.plain)
+        if scheduler is None:
+            finished = _local(todo, orders, min(jobs or _cores(), progress.total))
+        else:
+            from quasiharmonic.batch.cluster import on_cluster
 
-        finished = on_cluster(todo, orders, scheduler)
-    with closing(finished):
-        for item in finished:
-            progress.seconds = time.perf_counter() - began
-            if item is not None:
-                progress.outcomes[item.outcome] = progress.outcomes.get(item.outcome, 0) + 1
-                progress.resumed += item.resumed
-            if callback is not None:
-                callback(progress)
-    records.write_table(table_path, _records(source, orders))
+            finished = on_cluster(todo, orders, scheduler)
+        with closing(finished):
+            for item in finished:
+                progress.seconds = time.perf_counter() - began
+                if item is not None:
+                    progress.outcomes[item.outcome] = progress.outcomes.get(item.outcome, 0) + 1
+                    progress.resumed += item.resumed
+                if callback is not None:
+                    callback(progress)
+        records.write_table(table_path, _records(source, orders))
     return progress
 
 
@@ -210,10 +209,37 @@ def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limi
         raise ValueError("a limit of memory needs psutil on this system: pip install 'quasiharmonic[batch]'")
 
 
-def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -> None:
-    """Make the run's folder and say in it what it is."""
+def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> int:
+    """How many problems there are, none of which would be passed over as the output of a run."""
+    count, inside = 0, folder.is_relative_to(os.path.abspath(source))
+    for files in find_problems(source, plain=settings.plain):
+        if inside and files.mesh.is_relative_to(folder):
+            raise ValueError(f"{folder} holds a problem, {files.mesh}: name another folder for the results")
+        count += 1
+    if not count:
+        raise ValueError(
+            f"there are no problems in {source}: a problem is a folder with input.obj and handles.txt"
+            + ("" if settings.plain else "; to take plain meshes, say what to map them to")
+        )
+    return count
+
+
+def _make(folder: Path) -> None:
+    """Make the run's folder, unless it is one already."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        tables = [name for name in records.TABLES if (folder / name).exists()]
+    except FileExistsError as error:
+        raise OutputError(f"cannot write to {folder}: it is no folder") from error
+    except OSError as error:
+        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+    if tables and not (folder / MARKER).exists():
+        raise OutputError(f"{folder} has a {tables[0]} that is of no run: name another folder for the results")
+
+
+def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -> None:
+    """Say in the run's folder what it is."""
+    try:
         for name in records.TABLES:
             # Not that of the last run until there is that of this one.
             (folder / name).unlink(missing_ok=True)

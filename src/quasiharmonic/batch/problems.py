@@ -15,6 +15,8 @@ MARKER = "qhm-batch.json"
 
 # Files that are a mesh by their names; whatever else is named as a source is a list.
 _MESH = re.compile(r"\.(obj|off)", re.IGNORECASE)
+# In a list; a name may have the sign inside.
+_COMMENT = re.compile(r"(?:^|\s)#")
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
     ----------
     source : path
         A folder, searched at any depth, links followed; a mesh; or a text file that lists folders and meshes,
-        one a line, relative to its own folder, with blank lines and ``#`` comments.
+        one a line, relative to its own folder, with blank lines and comments: ``#`` at the start or after a space.
     plain : bool
         Take every mesh for a problem. Otherwise a problem is a folder with ``input.obj`` and, usually,
         ``handles.txt``, or an OBJ file that is named itself.
@@ -73,12 +75,16 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
 
 def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int]]) -> Iterator[ProblemFiles]:
     """Problems in a folder and below; ``above`` are the folders it lies in, for links that lead back."""
-    status = folder.stat()
-    here = (status.st_dev, status.st_ino)
-    if here in above:
-        return
-    with os.scandir(folder) as entries:
-        kinds = sorted((entry.name, entry.is_dir()) for entry in entries)
+    try:
+        status = folder.stat()
+        here = (status.st_dev, status.st_ino)
+        if here in above:
+            return
+        with os.scandir(folder) as entries:
+            kinds = sorted((entry.name, entry.is_dir()) for entry in entries)
+    except OSError as error:
+        # Passing it over would lose the problems in it, and nobody would know.
+        raise OSError(f"{folder}: the folder cannot be read: {error.strerror or error}") from error
     files = {entry for entry, is_folder in kinds if not is_folder}
     if MARKER in files:
         return
@@ -95,14 +101,17 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
 
 def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
     seen = set()
-    with open(path, encoding="utf-8", errors="surrogateescape") as lines:
+    with open(path, encoding="utf-8-sig", errors="surrogateescape") as lines:
         for number, line in enumerate(lines, 1):
-            text = line.split("#", 1)[0].strip()
+            text = _COMMENT.split(line, maxsplit=1)[0].strip()
             if not text:
                 continue
             place = Path(os.path.abspath(path.parent / text))
             if not (place.is_dir() or (_MESH.fullmatch(place.suffix) and place.is_file())):
-                raise ValueError(f"{path}: line {number}: there is no folder and no mesh {text}")
+                raise ValueError(
+                    f"{path}: line {number}: there is no folder and no OBJ or OFF file {text[:100]!r}; "
+                    "a list names one in every line"
+                )
             base = path.parent if place.is_relative_to(path.parent) else Path(place.anchor)
             name = place.relative_to(base).as_posix()
             if place.is_dir():

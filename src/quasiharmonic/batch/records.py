@@ -108,7 +108,17 @@ def read_record(folder: Path) -> Record | None:
         record = json.loads((folder / FILE).read_bytes())
     except (OSError, ValueError):
         return None
-    return record if isinstance(record, dict) else None
+    return record if isinstance(record, dict) and _is_whole(record) else None
+
+
+def _is_whole(record: Record) -> bool:
+    """Whether a record says what it is about, and all else in it is of its column's type."""
+
+    def fits(value: Any, kind: type) -> bool:
+        return value is None or isinstance(value, kind) or (kind is float and isinstance(value, int))
+
+    named = bool(record.get("problem")) and bool(record.get("outcome"))
+    return named and all(fits(record.get(column), kind) for column, kind in COLUMNS.items())
 
 
 def clear(folder: Path) -> None:
@@ -193,7 +203,7 @@ def read_table(path: str | os.PathLike[str]) -> Iterator[Record]:
     """
     rows = _csv_rows(path) if _suffix(path) == ".csv" else _parquet_rows(path)
     for number, row in enumerate(rows, 1):
-        if not row.get("problem"):
+        if row.get("problem") in (None, ""):
             raise MeshFileError(path, f"record {number} names no problem", remedy="a column `problem` is needed")
         yield {column: _typed(path, number, column, value) for column, value in row.items()}
 
@@ -260,11 +270,13 @@ def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
 
 
 def _typed(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:
-    """A value of a table in the type of its column; CSV knows text only."""
-    if value == "":
+    """A value of a table in the type of its column; CSV knows text only, and other programs may number problems."""
+    if value is None or value == "":
         return None
     kind = COLUMNS.get(column)
-    if not isinstance(value, str) or kind is None or kind is str:
+    if kind is str:
+        return str(value)
+    if not isinstance(value, str) or kind is None:
         return value
     try:
         return {"true": True, "false": False}[value.lower()] if kind is bool else kind(value)

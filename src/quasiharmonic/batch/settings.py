@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 from dataclasses import dataclass
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+import quasiharmonic
 from quasiharmonic import __version__
 from quasiharmonic.batch.problems import ProblemFiles
 
@@ -47,23 +50,50 @@ class Settings:
     def key(self, files: ProblemFiles) -> str:
         """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.
 
+        How it is solved are these settings, the version, and the package's sources, which change without a new version
+        while somebody works on them. Other packages do not count.
+
         Raises
         ------
         OSError
-            When a file cannot be read.
+            When a file cannot be read; the message names it.
         """
         digest = blake2b(digest_size=16)
         drawing = None if self.to is None or not os.path.isfile(self.to) else Path(self.to)
         for path in (files.mesh, files.fixed, drawing):
-            contents = b"" if path is None else path.read_bytes()
+            contents = b"" if path is None else _contents(path)
             digest.update(len(contents).to_bytes(8, "little"))
             digest.update(contents)
-        digest.update(json.dumps([__version__, self.to_dict()], sort_keys=True).encode())
+        digest.update(json.dumps([__version__, _code(), self.to_dict()], sort_keys=True).encode())
         return digest.hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return dict(vars(self))
+
+
+def _contents(path: Path) -> bytes:
+    """All of a file; a pipe, at which one might wait for ever, is none."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise OSError("it is not a regular file")
+        return path.read_bytes()
+    except OSError as error:
+        raise OSError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+@cache
+def _code() -> str:
+    """Digest of the package's sources, as they were when first asked, but for those that only show what came out."""
+    package = Path(quasiharmonic.__file__).parent
+    digest = blake2b(digest_size=16)
+    for path in sorted(package.rglob("*.py")):
+        place = path.relative_to(package).as_posix()
+        if not place.startswith(("cli/", "plot/", "batch/report/")):
+            contents = path.read_bytes()
+            digest.update(f"{place}\0{len(contents)}\0".encode())
+            digest.update(contents)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,12 @@ def serve() -> None:
     os.dup2(2, 1)
 
     def tell(message: dict[str, Any]) -> None:
-        answers.write(json.dumps(message, allow_nan=False) + "\n")
-        answers.flush()
+        try:
+            answers.write(json.dumps(message, allow_nan=False) + "\n")
+            answers.flush()
+        except OSError:
+            # Whoever listened has gone, which is no fault of the problem and must not get into its record.
+            os._exit(0)
 
     jobs: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_listen, args=(jobs,), daemon=True).start()

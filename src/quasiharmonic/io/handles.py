@@ -76,7 +76,8 @@ def problem_files(
     mesh_path = Path(source)
     if mesh_path.is_dir():
         folder, mesh_path = mesh_path, mesh_path / "input.obj"
-        if fixed is None and (folder / "handles.txt").exists():
+        # A link that leads nowhere is a list that is missing, not none.
+        if fixed is None and os.path.lexists(folder / "handles.txt"):
             fixed = folder / "handles.txt"
     return mesh_path, None if fixed is None else Path(fixed)
 

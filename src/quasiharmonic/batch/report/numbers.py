@@ -64,9 +64,11 @@ def load(source: str | os.PathLike[str]) -> Run:
     Raises
     ------
     ValueError
-        When there are no records.
+        When there are no records, or they cannot be read.
     """
     path = Path(source)
+    if not path.exists():
+        raise ValueError(f"there is no folder and no table {source}")
     if not path.is_dir():
         rows = list(records.read_table(path))
         folder = path.parent
@@ -76,12 +78,17 @@ def load(source: str | os.PathLike[str]) -> Run:
         rows = list(_single(path / "results") if table is None else records.read_table(table))
     if not rows:
         raise ValueError(f"there are no records in {source}: the folder of a run or a table of records is needed")
+    results = folder / "results"
+    return Run(path.resolve().name, rows, results if results.is_dir() else None, _about(folder))
+
+
+def _about(folder: Path) -> Record:
+    """What a run's folder says of it; nothing where it is none, or spoilt."""
     try:
         about = json.loads((folder / MARKER).read_bytes())
     except (OSError, ValueError):
-        about = {}
-    results = folder / "results"
-    return Run(path.resolve().name, rows, results if results.is_dir() else None, about)
+        return {}
+    return about if isinstance(about, dict) and isinstance(about.get("settings"), dict) else {}
 
 
 def _single(results: Path) -> Iterable[Record]:

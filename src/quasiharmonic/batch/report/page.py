@@ -138,6 +138,8 @@ def _outcomes(run: Run) -> str:
     css = {"injective": "good", "not injective": "bad"}
     bar = "".join(f'<i class="{css.get(name, "broken")}" style="flex:{count}"></i>' for name, count in counted)
     words = ", ".join(f"{count:,} {shown(OUTCOMES.get(name, name))}" for name, count in counted)
+    impossible = sum(row.get("status") == "impossible" for row in run.rows)
+    words += f"; it is proven of {impossible:,} that they have no such map" if impossible else ""
     return f'<div class="bar">{bar}</div><p class="quiet">{words}</p>'
 
 

@@ -35,6 +35,8 @@ def thumbnail(record: Record, results: Path | None) -> str:
     str
         A ``data:`` address of a PNG; empty where there is nothing that could be drawn.
     """
+    if (record.get("triangles") or 0) > _MOST:
+        return ""
     mesh, mapped = _read(record, results)
     if mesh is None or not len(mesh.F) or len(mesh.F) > _MOST:
         return ""
