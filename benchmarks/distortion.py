@@ -6,6 +6,7 @@ A folder is a problem (``input.obj`` + ``handles.txt``) or holds problems at any
 package's own go onto letters. The first table has the MIPS energy as §10 defines it, the second the worst stretch
 max(σ₁, 1/σ₂) of any triangle after scaling the map to the surface's area, and beside it what the lengths of the
 boundary's edges alone force it to be. In parentheses: seconds from arrays to that certified map, everything included.
+A dash is where no injective map was found.
 
 ``--unasked`` asks instead what a few polishing steps are worth, which is what ``qhm map`` takes without being asked:
 geometric means over the problems, relative to the first map.
@@ -101,15 +102,15 @@ def compare(folders: list[Path]) -> None:
             mips.append(f"| {name} | {len(problem.F)} |" + " – |" * len(columns))
             stretch.append(f"| {name} | {forced(problem):.3g} |" + " – |" * len(columns))
             continue
-        found = {columns[0]: first, columns[1]: first_map(problem, "quality") or first}
+        found = {columns[0]: first, columns[1]: first_map(problem, "quality")}
         for method, lower in METHODS.items():
             began = time.perf_counter()
             uv = lower(problem, first[0])
             found[method] = uv, first[1] + time.perf_counter() - began
-        values = {method: (measured(problem, uv), seconds) for method, (uv, seconds) in found.items()}
-        cells = [f"{m:.3g} ({s:.2g})" for (m, _), s in values.values()]
+        values = [(*measured(problem, of[0]), of[1]) if of else None for of in found.values()]
+        cells = [f"{value[0]:.3g} ({value[2]:.2g})" if value else "–" for value in values]
         mips.append(f"| {name} | {len(problem.F)} | {' | '.join(cells)} |")
-        cells = [f"{worst:.3g}" for (_, worst), _ in values.values()]
+        cells = [f"{value[1]:.3g}" if value else "–" for value in values]
         stretch.append(f"| {name} | {forced(problem):.3g} | {' | '.join(cells)} |")
     print("\n".join([*mips, "", *stretch]))
 

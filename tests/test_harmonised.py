@@ -357,10 +357,14 @@ class TestHarmonise:
         for eta in (0, -1, np.nan, [], [[1.0]], [1.0, np.inf]):
             with pytest.raises(ValueError, match="eta must be a positive number"):
                 harmonise(V, F, uv, fixed=fixed, eta=eta)
-        for conformal in (-1, np.inf, np.nan):
-            with pytest.raises(ValueError, match="conformal must not be negative"):
-                harmonise(V, F, uv, fixed=fixed, conformal=conformal)
-        with pytest.raises(ValueError, match="conformal must not be negative, and positive where there is no energy"):
+        with pytest.raises(ValueError, match="eta must hold real numbers"):
+            harmonise(V, F, uv, fixed=fixed, eta="much")
+        for wrong in (-1, np.inf, np.nan, None, "little"):
+            with pytest.raises(ValueError, match="conformal must be a finite number of at least 0"):
+                harmonise(V, F, uv, fixed=fixed, conformal=wrong)
+            with pytest.raises(ValueError, match="tolerance must be a finite number of at least 0"):
+                harmonise(V, F, uv, fixed=fixed, tolerance=wrong)
+        with pytest.raises(ValueError, match="conformal must be positive where there is no energy"):
             harmonise(V, F, uv, fixed=fixed, energy=None, conformal=0)
         with pytest.raises(ValueError, match="weights are the energy's"):
             harmonise(V, F, uv, fixed=fixed, energy=None, conformal=1, weights=np.ones(len(F)))
@@ -370,3 +374,38 @@ class TestHarmonise:
             harmonise(V, F, uv, fixed=fixed, reference="round")
         with pytest.raises(ValueError, match="iterations must be a whole number"):
             harmonise(V, F, uv, fixed=fixed, iterations=0)
+
+    def test_flat_rest_triangles(self):
+        """An energy is undefined there; R₁ in triangles of another shape is not."""
+        V, F, uv, fixed = bowl()
+        flat = V.copy()
+        flat[F[7, 0]] = flat[F[7, 1]]
+        for reference in ("rest", "equilateral", "corrected"):
+            with pytest.raises(ValueError, match=r"7.* of zero area in the rest mesh: distortion is undefined there"):
+                harmonise(flat, F, uv, fixed=fixed, reference=reference)
+        with pytest.raises(ValueError, match="choose the reference 'equilateral'"):
+            harmonise(flat, F, uv, fixed=fixed, energy=None, conformal=1)
+        result = harmonise(flat, F, uv, fixed=fixed, energy=None, conformal=1, reference="equilateral")
+        assert result.injective
+        assert result.history[-1].energy < result.history[0].energy
+
+    def test_what_leaves_the_numbers_range_is_not_at_rest(self):
+        V, F, uv, fixed = bowl()
+        for options in ({"eta": 1e300}, {"weights": np.full(len(F), 1e300)}):
+            result = harmonise(V, F, uv, fixed=fixed, energy="area", iterations=10, **options)
+            assert result.injective
+            assert result.status in (Status.STILL_FALLING, Status.UNIMPROVED)
+
+    def test_where_there_is_no_map(self):
+        """The reason is looked for, and told."""
+        V, F = grid(3, 3)
+        (loop,) = boundary_loops(F, len(V))
+        # The boundary crosses itself.
+        target = V[loop].copy()
+        target[[1, 5]] = target[[5, 1]]
+        problem = Problem(V, F, loop, target)
+        result = harmonise_map(problem, quasi_harmonic_map(problem), energy="arap", iterations=5)
+        assert not result.injective
+        assert result.status is Status.IMPOSSIBLE
+        assert result.diagnosis.forbids_injective
+        assert result.to_dict()["diagnosis"] is not None

@@ -80,6 +80,16 @@ def test_ply_by_its_own_header(stretched, tmp_path):
     assert (rows["values"] == 0.5).all()
 
 
+@pytest.mark.parametrize("suffix", io.PER_TRIANGLE_FORMATS)
+@pytest.mark.parametrize("name", ["triangle", "F", "uv", "file", "allow_pickle", "vertex_indices", "quality"])
+def test_names_that_the_formats_use_themselves(stretched, tmp_path, suffix, name):
+    _, V, F, uv = stretched
+    one = np.ones(len(F))
+    with pytest.raises(ValueError, match="choose another name"):
+        io.write_per_triangle(tmp_path / f"o{suffix}", V, F, uv, {"one": one, name: one})
+    assert not (tmp_path / f"o{suffix}").exists()
+
+
 def test_values_that_cannot_be_written(stretched, tmp_path):
     _, V, F, uv = stretched
     one = np.ones(len(F))

@@ -9,7 +9,7 @@ from meshes import bend, boundary_of, lift
 from quasiharmonic import newton_descent
 from quasiharmonic.certificate import is_injective
 from quasiharmonic.deformation_energy import signed_areas
-from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, conformal_area_blend
+from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.measures import distortion
 from quasiharmonic.newton_system import NewtonSystem
@@ -324,3 +324,27 @@ def test_malformed_input():
 def test_barriers_may_come_as_objects():
     V, F, uv, fixed = bowl()
     assert polish(V, F, uv, fixed=fixed, energy=MIPS()).status is Status.POLISHED
+
+
+def test_options_that_make_no_sense():
+    V, F, uv, fixed = bowl()
+    for wrong in (-1, 2.5, "many", None):
+        with pytest.raises(ValueError, match="max_iterations must be a whole number of at least 0"):
+            polish(V, F, uv, fixed=fixed, max_iterations=wrong)
+    for wrong in (-1, np.nan, np.inf, "small", None):
+        with pytest.raises(ValueError, match="tolerance must be a finite number of at least 0"):
+            polish(V, F, uv, fixed=fixed, tolerance=wrong)
+    with pytest.raises(ValueError, match="weights must hold real numbers, not <U5"):
+        polish(V, F, uv, fixed=fixed, weights=["heavy"] * len(F))
+
+    class FirstOnly(Energy):
+        barrier = True
+
+        def density(self, d):
+            return 1 / d.det
+
+        def gradient(self, d):
+            return -2 * d.p / d.det**2, 2 * d.q / d.det**2
+
+    with pytest.raises(ValueError, match=r"FirstOnly has no second derivatives, .* use `harmonise`"):
+        polish(V, F, uv, fixed=fixed, energy=FirstOnly())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import real_array
 from quasiharmonic.energies import Deformation, Energy, QuadraticForm
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import named
@@ -164,7 +165,7 @@ def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray,
 
 
 def _weights(weights: ArrayLike, f: int) -> FloatArray:
-    array = np.asarray(weights, dtype=np.float64)
+    array = real_array("weights", weights)
     if array.shape != (f,):
         raise ValueError(f"weights must have shape ({f},), one for every triangle, not {array.shape}")
     bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))

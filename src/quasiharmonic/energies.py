@@ -162,7 +162,26 @@ class Energy(ABC):
 
 
 class Isotropic(Energy):
-    """An energy ``φ(a, b)`` of ``a = |p|²`` and ``b = |q|²``; the rest follows from φ's derivatives."""
+    """An energy ``φ(a, b)`` of ``a = |p|²`` and ``b = |q|²``; the rest follows from φ's derivatives.
+
+    Singular values enter as ``σ₁² + σ₂² = 2 (a + b)`` and ``σ₁σ₂ = det = a − b``.
+
+    Examples
+    --------
+    A neo-Hookean energy, ``σ₁² + σ₂² − 2 − 2 log σ₁σ₂``, which `quasiharmonic.polish` can lower:
+
+    >>> class NeoHookean(Isotropic):
+    ...     barrier = True
+    ...     def density(self, d):
+    ...         return np.where(d.det > 0, 2 * (d.a + d.b - 1 - np.log(np.abs(d.det))), np.inf)
+    ...     def slopes(self, d):
+    ...         return 2 - 2 / d.det, 2 + 2 / d.det
+    ...     def bends(self, d):
+    ...         return 2 / d.det**2, -2 / d.det**2, 2 / d.det**2
+    >>> from quasiharmonic.derivatives import check_energy
+    >>> check_energy(NeoHookean()).passed
+    True
+    """
 
     @abstractmethod
     def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:

@@ -108,6 +108,8 @@ class HarmonicDescent:
             lowest, left = self._probe(start, iterations)
             if not self._squares.any():
                 return True
+            if not np.isfinite(self._squares).all():
+                return False  # gradients that leave the numbers' range give no units to go on in
             stiffness = np.sqrt(self._squares)
             stiffness += _SOFTEST * stiffness.mean()
             self._last = self.objective.evaluate(lowest.xi)

@@ -9,15 +9,17 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import real_array
 from quasiharmonic.certificate import certify, flipped_triangles
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
+from quasiharmonic.diagnosis import diagnose
 from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet
 from quasiharmonic.harmonic_descent import HarmonicDescent
 from quasiharmonic.harmonised import Harmonised
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.mesh.topology import named
 from quasiharmonic.objective import Objective
-from quasiharmonic.polishing import given_map
+from quasiharmonic.polishing import given_map, not_negative
 from quasiharmonic.problem import Problem
 from quasiharmonic.regularizers import Conformal
 from quasiharmonic.result import MapResult, Status, Step
@@ -90,11 +92,12 @@ def harmonise(
     conformal : float
         κ, the weight of the regulariser R₁ (eq. 35). A little of it keeps triangles from collapsing.
     weights : (f,) array, optional
-        How much each triangle's distortion counts, in E and R₁; not negative, 1 by default.
+        How much each triangle's distortion counts in E; not negative, 1 by default. R₁ counts all alike: it keeps the
+        others from collapsing.
     iterations : int
         Linear solves of each round at most.
     tolerance : float
-        A round is at rest when ten steps have lowered its objective by less than this fraction.
+        A round is at rest when ten steps have lowered its objective by less than this fraction. Not negative.
     reference : {"equilateral", "rest", "corrected"}
         Triangles in which V₃ and R₁ are taken. R₁ means the surface's angles in those of the rest mesh alone.
     linear_solver : str
@@ -107,8 +110,9 @@ def harmonise(
     MapResult
         The injective map of least E + κR₁ on the way, ``uv`` included; certified. With status ``POLISHED`` when the
         last round came to rest, ``STILL_FALLING`` when it did not, ``UNIMPROVED`` when no injective map on the way was
-        better than ``uv``, ``INTERRUPTED`` by Ctrl-C; or ``SETTLED``, with the map of fewest inversions, where none was
-        injective. The history holds E + κR₁ at every map.
+        better than ``uv``, ``INTERRUPTED`` by Ctrl-C; or, with the map of fewest inversions, where none was injective,
+        ``IMPOSSIBLE`` if the ``diagnosis`` names what forbids one and else ``SETTLED``. The history holds E + κR₁ at
+        every map.
 
     Raises
     ------
@@ -131,7 +135,10 @@ def harmonise(
     """
     began = time.perf_counter()
     # Where the fixed vertices are does not matter to these checks; where they are is where ``uv`` has them.
-    problem = Problem(V, F, fixed, np.zeros((np.size(fixed), 2)))
+    # Nor do rest triangles without area if there is an energy, which has the better words for them.
+    lenient: Reference = reference if energy is None else "equilateral"
+    problem = Problem(V, F, fixed, np.zeros((np.size(fixed), 2)), reference=lenient)
+    problem.reference = None
     return harmonise_map(
         problem,
         uv,
@@ -171,13 +178,15 @@ def harmonise_map(
     chosen = _energy(energy, problem)
     barrier = chosen is not None and chosen.barrier
     schedule = _schedule(eta, barrier)
-    if not 0 <= conformal < np.inf or (chosen is None and conformal == 0):
-        raise ValueError(f"conformal must not be negative, and positive where there is no energy, not {conformal}")
+    not_negative("conformal", conformal)
+    if chosen is None and conformal == 0:
+        raise ValueError("conformal must be positive where there is no energy, not 0")
     if weights is not None and chosen is None:
         raise ValueError("weights are the energy's, and there is none")
     if reference not in get_args(Reference):
         raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
     whole_number("iterations", iterations, least=1)
+    not_negative("tolerance", tolerance)
     start = given_map(problem, uv)
     flipped = flipped_triangles(problem.F, start)
     if barrier and flipped.size:
@@ -187,11 +196,11 @@ def harmonise_map(
         )
     name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
     with problem.moved(start[problem.fixed]).exclusive() as own, np.errstate(all="ignore"):
-        objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
         if not area > 0:
             raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
         deformation = None if chosen is None else DeformationEnergy(own.V, own.F, chosen, area=area, weights=weights)
+        objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
         regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
         q = Harmonised(
             own, objective.mesh, objective.laplacian, area, deformation, regularizer, eta=1.0, conformal=conformal
@@ -210,10 +219,12 @@ def harmonise_map(
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
     certificate = certify(problem.F, descent.uv)
+    diagnosis = None
     if status is not Status.INTERRUPTED:
         converged = status is Status.POLISHED and descent.history[-1].flipped == 0
         if not certificate.injective:
-            status = Status.SETTLED
+            diagnosis = diagnose(problem.moved(start[problem.fixed]))
+            status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
         elif not (descent.best < first or converged):
             status = Status.UNIMPROVED
     return MapResult(
@@ -222,6 +233,7 @@ def harmonise_map(
         certificate=certificate,
         stages=descent.stages,
         history=descent.history,
+        diagnosis=diagnosis,
         linear_solver=objective.laplacian.solver.name,
         seconds=time.perf_counter() - began,
     )
@@ -239,7 +251,7 @@ def _energy(energy: str | Energy | None, problem: Problem) -> Energy | None:
 def _schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float, ...]:
     if eta is None:
         return BARRIER_ETA if barrier else ETA
-    schedule = np.atleast_1d(np.asarray(eta, dtype=np.float64))
+    schedule = np.atleast_1d(real_array("eta", eta))
     if schedule.ndim != 1 or not schedule.size or not np.all((schedule > 0) & (schedule < np.inf)):
         raise ValueError(f"eta must be a positive number, or one for every round, not {eta!r}")
     return tuple(float(value) for value in schedule)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +27,7 @@ from quasiharmonic.mesh.topology import named
 from quasiharmonic.newton_descent import NewtonDescent, in_units
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
+from quasiharmonic.strategy import whole_number
 
 FloatArray = NDArray[np.float64]
 
@@ -79,7 +82,7 @@ def polish(
         Newton steps at most.
     tolerance : float
         The polish has converged when Newton's model promises a further decrease below this fraction of the
-        energy (half the squared Newton decrement over the energy).
+        energy (half the squared Newton decrement over the energy). Not negative.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
@@ -96,7 +99,8 @@ def polish(
     ------
     ValueError
         When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
-        the message names the triangles. When the energy is not known or not a barrier.
+        the message names the triangles. When the energy is not known, not a barrier or without second derivatives,
+        or another option has no such value.
 
     Examples
     --------
@@ -145,10 +149,14 @@ def polish_map(
     """
     began = time.perf_counter() if _began is None else _began
     chosen = energy_named(energy)
+    whole_number("max_iterations", max_iterations, least=0)
+    not_negative("tolerance", tolerance)
     start = _start(problem, uv)
-    if weights is not None and not np.all(np.asarray(weights) > 0):
-        bad = np.flatnonzero(~(np.asarray(weights) > 0))
-        raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
+    if weights is not None:
+        weights = real_array("weights", weights)
+        bad = np.flatnonzero(~(weights > 0))
+        if bad.size:
+            raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
     # What leaves the numbers' range is met by comparisons: it is never below anything.
     with np.errstate(all="ignore"):
         # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
@@ -237,7 +245,18 @@ def energy_named(energy: str | Energy) -> Energy:
             f"{type(energy).__name__} is no barrier: it would let the first triangles collapse and stop there; "
             "combine it with an energy that is one, such as AreaBarrier"
         )
+    if type(energy).curvature is Energy.curvature:
+        raise ValueError(
+            f"{type(energy).__name__} has no second derivatives, and Newton's method needs them: "
+            "write its curvature, or use `harmonise`, which does without"
+        )
     return energy
+
+
+def not_negative(name: str, value: Any) -> None:
+    """Raise a ValueError for what is not a finite number of at least zero."""
+    if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
+        raise ValueError(f"{name} must be a finite number of at least 0, not {value!r}")
 
 
 def given_map(problem: Problem, uv: ArrayLike) -> FloatArray:

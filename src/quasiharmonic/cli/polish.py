@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.mesh.reference import Reference
+    from quasiharmonic.measures import Distortion
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Step
 
@@ -61,11 +61,10 @@ def run(options: argparse.Namespace) -> int:
             callback=show,
         )
 
-    # Whatever is wrong with the rest triangles, the polish has the better words for it.
-    return improve(options, lower, reference="equilateral")
+    return improve(options, lower)
 
 
-def improve(options: argparse.Namespace, lower: Lower, reference: Reference | None = None) -> int:
+def improve(options: argparse.Namespace, lower: Lower) -> int:
     """Read a map, lower its distortion, write, judge, report; for every command that does so."""
     from quasiharmonic import io
     from quasiharmonic.measures import distortion
@@ -78,20 +77,35 @@ def improve(options: argparse.Namespace, lower: Lower, reference: Reference | No
     uv = io.map_of(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
-        problem = Problem(*io.problem_arrays(mesh, fixed), reference=reference)
+        # Rest triangles without area are let pass here: what is lowered has the better words for them.
+        problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
+        problem.reference = None
         with progress.line() as show:
             result = lower(problem, uv, show)
     certificate = map.write(options.output, mesh, result)
     with report.after_writing(options.output):
-        before, after = (distortion(problem.V, problem.F, w).to_dict() for w in (uv, result.uv))
+        before, after = (distortion(problem.V, problem.F, w) for w in (uv, result.uv))
         facts = {
             **result.to_dict(),
             **report.verdict(certificate),
             **report.sizes(problem),
             "input": str(options.input),
             "output": str(options.output),
-            "distortion_before": before,
-            "distortion": after,
+            "distortion_before": before.to_dict(),
+            "distortion": after.to_dict(),
         }
-        report.emit(facts, options.json, f"{report.of_map(result, certificate, options.output)}\n{result.status.value}")
+        lines = [report.of_map(result, certificate, options.output)]
+        if certificate.injective:
+            lines += [_change(before, after), result.status.value]
+        report.emit(facts, options.json, "\n".join(lines))
     return 0 if certificate.injective else 1
+
+
+def _change(before: Distortion, after: Distortion) -> str:
+    """What was won, or paid, in angles and in lengths."""
+    angles = [found.summary("mips").mean for found in (before, after)]
+    lengths = [found.summary("isometric").maximum for found in (before, after)]
+    return (
+        f"MIPS from {angles[0]:.3g} to {angles[1]:.3g} on average, "
+        f"isometric distortion from {lengths[0]:.3g} to {lengths[1]:.3g} at worst"
+    )

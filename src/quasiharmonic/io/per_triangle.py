@@ -17,6 +17,8 @@ FloatArray = NDArray[np.float64]
 
 #: Suffixes that `write_per_triangle` knows.
 FORMATS = (".csv", ".npz", ".ply")
+# Names that one of the formats, or what writes it, has a use of its own for.
+_TAKEN = {"triangle", "F", "uv", "file", "args", "kwds", "allow_pickle", "vertex_indices", "quality"}
 
 
 def write_per_triangle(
@@ -43,12 +45,13 @@ def write_per_triangle(
     F : (f, 3) int
     uv : (n, 2) float
     values : mapping of str to (f,) float
-        For example `quasiharmonic.Distortion.per_triangle`; names are words of letters, digits and ``_``.
+        For example `quasiharmonic.Distortion.per_triangle`; names are words of letters, digits and ``_``, and none
+        that the formats have a use of their own for.
 
     Raises
     ------
     ValueError
-        When an array has another shape, or a name is not a word.
+        When an array has another shape, or a name is not a word or is taken.
     OutputError
         When the suffix is another, or the file cannot be written.
     """
@@ -57,6 +60,8 @@ def write_per_triangle(
     for name, column in columns.items():
         if not (name.isascii() and name.isidentifier()):
             raise ValueError(f"{name!r} is not a word of letters, digits and _")
+        if name in _TAKEN:
+            raise ValueError(f"{name!r} means something else in such files: choose another name")
         if column.shape != (len(F),):
             raise ValueError(f"{name} has the shape {column.shape}; ({len(F)},) is needed, one for each triangle")
     if uv.shape != (len(V), 2):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.measures import Distortion, distortion
-from quasiharmonic.plot.canvas import INK, RED, as_mesh, caption, finite, new_figure, paint_map, paint_surface
+from quasiharmonic.plot.canvas import INK, RED, as_map, as_mesh, caption, new_figure, paint_map, paint_surface
 from quasiharmonic.plot.shading import lit, view
 
 if TYPE_CHECKING:
@@ -47,15 +47,24 @@ class _Scale:
         Its ends are where all but a hundredth of the area lies between.
     colormap : str
         Diverging where a perfect map lies in the middle; none has red, which is for inverted triangles.
+    beyond : {"max", "both"}
+        The ends beyond which there may be values.
     """
 
     label: str
     norm: Normalize
     colormap: str
+    beyond: str = "max"
 
     def place(self, values: FloatArray) -> FloatArray:
         """Where values (k,) stand between the ends, 0 to 1."""
         return np.asarray(self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))).clip(0, 1)
+
+    @property
+    def ticks(self) -> tuple[FloatArray, list[str]]:
+        """Values at even steps of the colours, (5,) float64, and how they read."""
+        values = np.asarray(self.norm.inverse(np.linspace(0, 1, 5)))
+        return values, [f"{value:.3g}" for value in values]
 
     def colors(self, values: FloatArray) -> FloatArray:
         """Colours (f, 3) of values (f,), grey where there is no value."""
@@ -95,7 +104,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     if measure not in LABELS:
         raise ValueError(f"measure must be one of {', '.join(LABELS)}, not {measure!r}")
     rest, F = as_mesh(V, F)
-    uv = finite(uv, "uv")
+    uv = as_map(uv, rest)
     found = distortion(rest, F, uv)
     values: FloatArray = found.per_triangle()[measure]
     scale = _scale(measure, values, found.share)
@@ -141,7 +150,7 @@ def save_distortion_figure(
     write_whole(path, lambda file: figure.savefig(file, format="png"))
 
 
-_LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.71, 0.14, 0.275, 0.74))
+_LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.265, 0.74))
 
 
 def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
@@ -160,8 +169,10 @@ def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
         return _Scale(label, AsinhNorm(linear_width=min(1.0, top), vmin=0.0, vmax=top), "viridis")
     if kind == "both ways":
         reach = max(high, 1 / low, 1.1)
-        return _Scale(label, LogNorm(1 / reach, reach), "PuOr")
-    return _Scale(label, LogNorm(low if perfect is None else perfect, max(high, 1.01 * low, 1.01)), "viridis")
+        return _Scale(label, LogNorm(1 / reach, reach), "PuOr", "both")
+    if perfect is None:
+        return _Scale(label, LogNorm(low, max(high, 1.01 * low)), "viridis", "both")
+    return _Scale(label, LogNorm(perfect, max(high, 1.01 * perfect)), "viridis")
 
 
 def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> tuple[float, float]:
@@ -178,10 +189,10 @@ def _bar(figure: Figure, scale: _Scale) -> None:
     from matplotlib.cm import ScalarMappable
 
     drawn = ScalarMappable(scale.norm, scale.colormap)
-    bar = figure.colorbar(drawn, cax=figure.add_axes((0.605, 0.14, 0.012, 0.74)), extend="max")
-    bar.ax.yaxis.set_major_formatter("{x:.4g}")
-    bar.ax.yaxis.set_minor_formatter("")
-    bar.ax.tick_params(labelsize=9)
+    bar = figure.colorbar(drawn, cax=figure.add_axes((0.605, 0.14, 0.012, 0.74)), extend=scale.beyond)
+    # The histogram's ticks: a logarithmic bar over less than a decade would have one of its own, or none.
+    bar.ax.set_yticks(*scale.ticks, size=9)
+    bar.ax.minorticks_off()
 
 
 def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, scale: _Scale) -> None:
@@ -192,8 +203,8 @@ def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, sc
     shares, steps = np.histogram(scale.place(values[known]), bins=40, range=(0, 1), weights=100 * found.share[known])
     middle = (steps[1:] + steps[:-1]) / 2
     ax.bar(steps[:-1], shares, width=1 / 40, align="edge", color=matplotlib.colormaps[scale.colormap](middle))
-    ticks = np.linspace(0, 1, 5)
-    ax.set_xticks(ticks, [f"{v:.3g}" for v in np.asarray(scale.norm.inverse(ticks))], size=9)
+    _, names = scale.ticks
+    ax.set_xticks(np.linspace(0, 1, len(names)), names, size=9)
     ax.set_xlabel(scale.label, color=INK)
     ax.set_ylabel("% of the surface's area", color=INK)
     ax.spines[["top", "right"]].set_visible(False)
