@@ -225,6 +225,15 @@ class TestReportFails:
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 1
         assert "o.obj is written; interrupted" in capsys.readouterr().err
 
+    def test_interrupt_while_what_was_written_is_judged(self, star, tmp_path, capsys, monkeypatch):
+        def interrupt(mesh):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("quasiharmonic.io.map_of", interrupt)
+        assert run("map", star, "-o", tmp_path / "o.obj") == 1
+        assert "o.obj is written; interrupted" in capsys.readouterr().err
+        assert (tmp_path / "o.obj").exists()
+
     def test_interrupt_before_there_is_a_map(self, star, tmp_path, capsys, monkeypatch):
         def interrupt(self, xi):
             raise KeyboardInterrupt
@@ -245,6 +254,15 @@ class TestReportFails:
     def test_closed_standard_error(self, star, tmp_path):
         command = f"{sys.executable} -m quasiharmonic map {star} -o {tmp_path / 'o.obj'} 2>&-"
         assert subprocess.run(command, shell=True, capture_output=True).returncode == 0
+
+    def test_distortion_is_drawn(self, star, tmp_path):
+        from matplotlib.image import imread
+
+        out, picture = tmp_path / "o.obj", tmp_path / "p.png"
+        assert run("map", star, "-o", out, "--plot", picture, "--plot-kind", "distortion") == 0
+        assert run("plot", out, "-o", tmp_path / "again.png", "--kind", "distortion") == 0
+        # The same picture as that of the written file.
+        np.testing.assert_array_equal(imread(picture), imread(tmp_path / "again.png"))
 
     def test_no_first_map_to_draw(self, star, tmp_path, monkeypatch):
         from quasiharmonic.linsolve import NotPositiveDefinite
@@ -315,7 +333,9 @@ class TestPolish:
         assert run("map", star, "-o", first, "--no-polish") == 0
         assert run("polish", first, "-o", polished, "--energy", "mips", "--json", tmp_path / "r.json") == 0
         facts = json.loads((tmp_path / "r.json").read_text())
-        assert facts["distortion"]["mips"]["mean"] < facts["distortion_before"]["mips"]["mean"]
+        before, after = (facts[name]["mips"]["mean"] for name in ("distortion_before", "distortion"))
+        assert after < before
+        assert f"MIPS from {before:.3g} to {after:.3g} on average" in capsys.readouterr().out
         assert run("check", polished) == 0
         both = tmp_path / "both.obj"
         assert run("map", star, "-o", both, "--polish", "mips") == 0
@@ -365,6 +385,20 @@ class TestHarmonise:
         assert run("harmonise", star, "-o", tmp_path / "o.obj", "--eta", "-1") == 2
         assert "eta must be a positive number" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
+
+    @pytest.mark.parametrize("command", ["polish", "harmonise"])
+    def test_refuses_flat_rest_triangles(self, star, tmp_path, capsys, command):
+        """Without advice that the command has no option for."""
+        first = tmp_path / "first.obj"
+        assert run("map", star, "-o", first) == 0
+        mesh = io.read_mesh(first)
+        mesh.V[mesh.F[5, 0]] = mesh.V[mesh.F[5, 1]]
+        io.write_obj(first, mesh)
+        capsys.readouterr()
+        assert run(command, first, "-o", tmp_path / "o.obj") == 2
+        error = capsys.readouterr().err
+        assert "of zero area in the rest mesh: distortion is undefined there" in error
+        assert "reference" not in error
 
 
 class TestCheck:

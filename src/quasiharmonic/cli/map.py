@@ -41,6 +41,12 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
     targets.add_options(parser)
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the rest surface, the start and the map")
+    parser.add_argument(
+        "--plot-kind",
+        choices=("map", "distortion"),
+        default="map",
+        help="draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂), with its histogram",
+    )
     arguments.add_report(parser)
     distortion = parser.add_mutually_exclusive_group()
     distortion.add_argument(
@@ -88,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
     certificate = write(options.output, posed.mesh, result)
     with report.after_writing(options.output):
         if options.plot is not None:
-            draw(options.plot, problem, result, certificate)
+            draw(options.plot, problem, result, certificate, options.plot_kind)
         facts = {
             **result.to_dict(),
             **report.verdict(certificate),
@@ -141,27 +147,32 @@ def write(output: Path, mesh: MeshData, result: MapResult) -> Certificate:
     from quasiharmonic import io
     from quasiharmonic.certificate import certify
 
+    from . import report
+
     io.write_map(output, mesh, result.uv)
-    written = io.read_mesh(output)
-    return certify(written.F, io.map_of(written))
+    with report.after_writing(output):
+        written = io.read_mesh(output)
+        return certify(written.F, io.map_of(written))
 
 
-def draw(path: Path, problem: Problem, result: MapResult, certificate: Certificate) -> None:
-    """Draw the rest surface, Tutte's embedding and the map."""
+def draw(path: Path, problem: Problem, result: MapResult, certificate: Certificate, kind: str = "map") -> None:
+    """Draw the rest surface, Tutte's embedding and the map; or how it distorts."""
     import numpy as np
 
     from quasiharmonic.inject import quasi_harmonic_map
     from quasiharmonic.linsolve import NotPositiveDefinite
-    from quasiharmonic.plot import save_map_figure
+    from quasiharmonic.plot import save_distortion_figure, save_map_figure
 
     def framed(uv: NDArray[np.float64]) -> NDArray[np.float64]:
         # Of unit size, so that a picture of coordinates of 1e300 does not overflow.
         return problem.frame.inward(uv).view(np.float64).reshape(-1, 2)
 
+    rest = np.ldexp(problem.V, -int(np.frexp(np.abs(problem.V).max())[1]))
+    if kind == "distortion":
+        return save_distortion_figure(path, rest, problem.F, framed(result.uv))
     try:
         tutte = framed(quasi_harmonic_map(problem, linear_solver=result.linear_solver))
     except NotPositiveDefinite:
         tutte = None
-    rest = np.ldexp(problem.V, -int(np.frexp(np.abs(problem.V).max())[1]))
     inverted = np.concatenate([certificate.flipped, certificate.degenerate])
     save_map_figure(path, rest, problem.F, framed(result.uv), tutte, flipped=inverted, fixed=problem.fixed)
