@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from quasiharmonic.mesh.topology import boundary_loops, edges
 
@@ -291,3 +292,44 @@ def test_figure_24(example):
         assert one["flips"] == ours["flips"] == zero["flips"] == first["flips"] == 0
         assert one["areas off by"] < ours["areas off by"] < 0.5 * min(zero["areas off by"], first["areas off by"])
         assert zero["MIPS"] < first["MIPS"] < ours["MIPS"]
+
+
+def test_morph(example):
+    numbers = example("morph", size=24)
+    rows = [numbers[f"{degrees}°"] for degrees in (25, 50, 75)]
+    assert [row["inverted by Laplace's equation"] for row in rows] == [2, 14, 40]
+    assert all(row["valid"] and row["boundary off by"] == 0 for row in rows)
+    assert [row["worst mean ratio"] for row in rows] == pytest.approx([0.19, 0.114, 0.08], rel=0.05)
+
+
+def test_cut(example):
+    pytest.importorskip("igl")
+    numbers = example("cut")
+    assert [row["handles"] for row in numbers.values()] == [0, 1, 2]
+    assert all(row["exit status"] == 0 and row["bijective"] for row in numbers.values())
+    # A cut without branches or crossings has a copy of every vertex but its two ends.
+    assert numbers["a sphere"]["vertices copied"] == numbers["a sphere"]["edges cut"] - 1 > 10
+    assert 0 < numbers["a torus"]["vertices added"] < 60
+
+
+def test_looks(example, tmp_path):
+    numbers = example("looks", size=12)
+    assert numbers["inverted at first"] > 30
+    assert numbers["inverted"] == 0
+    assert 10 < numbers["frames"] < 150
+    assert numbers["median stretch"] == pytest.approx(1.725, rel=0.02)
+    with Image.open(tmp_path / "looks.gif") as moving:
+        assert moving.n_frames == numbers["frames"]
+    assert imread(tmp_path / "looks_distortion.png")[..., :3].std() > 0.05
+
+
+def test_looks_in_a_window(example, tmp_path):
+    pytest.importorskip("polyscope")
+    # A program that draws with OpenGL does so by itself, so that where it cannot it takes nothing along.
+    command = [sys.executable, str(FOLDER / "looks.py"), "-o", str(tmp_path), "--size", "8", "--window"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode and ("EGL" in done.stderr or "OpenGL" in done.stderr or done.returncode < 0):
+        pytest.skip("nothing here draws without a display")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["window"] == [1280, 720]
+    assert imread(tmp_path / "looks_window.png")[..., :3].std() > 0.05

@@ -146,6 +146,11 @@ def test_broken_path_data(d, message):
         ('<rect width="1" height="1" transform="skewX(50),skewY(10)"/>', None, 4),
         ('<svg x="5"><rect width="1" height="1"/></svg>', [1], 4),
         ('<g display="none"><circle r="9"/></g><rect width="1" height="1"/>', [1], 4),
+        (
+            '<style>.a{fill:red;stroke-width:2}</style><rect width="1" height="1" style="fill:blue;x-offset:3"/>',
+            [1],
+            4,
+        ),
         ('<g style="fill:red;display:none"><circle r="9"/></g><rect width="1" height="1"/>', [1], 4),
         ('<defs><circle r="9"/></defs><title>x</title><rect width="1" height="1"><title>y</title></rect>', [1], 4),
         ('<q:rect xmlns:q="urn:x" width="9" height="9"/><rect width="1" height="1"/>', [1], 4),
@@ -155,7 +160,8 @@ def test_broken_path_data(d, message):
 def test_shapes(read, body, areas, points):
     contours = read(drawing(body))
     if areas:
-        assert [AREA(c) for c in contours] == pytest.approx(areas, rel=1e-5)
+        assert [AREA(c) for c in targets.nested(contours)] == pytest.approx(areas, rel=1e-5)
+        assert [abs(AREA(c)) for c in contours] == pytest.approx(np.abs(areas), rel=1e-5)
     if points:
         assert len(contours[0]) == points
 
@@ -208,6 +214,16 @@ def test_tolerance(read, tolerance):
         (drawing('<g transform="scale(inf)"/>'), "is not understood"),
         (drawing('<svg viewBox="0 0 1 1"/>'), "an inner <svg> with a viewBox"),
         (drawing('<rect width="1e300" height="1e300" transform="scale(1e300)"/>'), "too large|encloses|infin"),
+        (
+            drawing('<g style="fill:red; transform : rotate(9deg)"/>'),
+            "<g>: 'transform' in a style is not read at line 1",
+        ),
+        (drawing('<circle style="r:3px" r="1"/>'), "'r' in a style is not read"),
+        (drawing('<path style="d:path(&quot;M0 0&quot;)"/>'), "'d' in a style is not read"),
+        (drawing("<defs><style>.a{fill:red;translate:3px}</style></defs>"), "<style>: 'translate' in a style is not"),
+        (drawing('<g transform="scale(2)" transform-origin="3 3"/>'), "<g>: transform-origin is not read"),
+        (drawing('<path d="M0 0L1 1L1 0L0 1z"/>'), "contour 0 of the outline meets itself: .* crosses"),
+        (drawing('<rect width="2" height="2"/><circle r="1"/>'), "contours 0 and 1 of the outline meet"),
         (drawing("<g>" * 300 + "</g>" * 300), "nested more than 200 deep"),
         (b"\xff\xfe<\x00", "is UTF-16 text"),
         (b"\x1f\x8b\x08", "compressed by gzip"),
@@ -287,13 +303,16 @@ def test_files_of_points(tmp_path, text, areas):
     path.write_text(text, newline="")
     contours = targets.read_polylines(path)
     if areas:
-        assert [AREA(c) for c in contours] == pytest.approx(areas)
+        assert [AREA(c) for c in targets.nested(contours)] == pytest.approx(areas)
 
 
-def test_first_point_stays_first(tmp_path):
-    for text in ("1 0\n1 1\n0 0\n", "1 0\n0 0\n1 1\n"):
-        (tmp_path / "outline.txt").write_text(text)
-        assert targets.read_polylines(tmp_path / "outline.txt")[0].tolist() == [[1, 0], [1, 1], [0, 0]]
+def test_contours_run_as_they_are_written(tmp_path, read):
+    for points in ([(1, 0), (1, 1), (0, 0)], [(1, 0), (0, 0), (1, 1)]):
+        (tmp_path / "outline.txt").write_text("".join(f"{x} {y}\n" for x, y in points))
+        assert list(map(tuple, targets.read_polylines(tmp_path / "outline.txt")[0])) == points
+        (contour,) = read(drawing(f'<polygon points="{" ".join(f"{x},{-y}" for x, y in points)}"/>'))
+        assert list(map(tuple, contour)) == points
+        assert targets.nested([contour])[0].tolist() == [[1, 0], [1, 1], [0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -308,6 +327,8 @@ def test_first_point_stays_first(tmp_path):
         ("a b\nc d\n", "'c' is not a finite number at line 2"),
         ("0 0\n1 0\n\n1 1\n", "2 different points that encloses no area begins at line 1; blank lines separate"),
         ("0 0\n1 0\n1 1\n\n\n5 5\n6 6\n7 7\n", "encloses no area begins at line 6"),
+        ("0 0\n1 1\n1 0\n0 1\n", r"meets itself: .* crosses .* \(the contour begins at line 1\)"),
+        ("0 0\n4 0\n4 4\n\n3 1\n5 1\n5 2\n", r"contours 0 and 1 .* meet.* \(the contours begin at lines 1, 5\)"),
         ("0 0\n0 0\n0 0\n", "a contour of 1 different points"),
     ],
 )
@@ -360,7 +381,7 @@ def test_tolerance_of_round_outlines():
 def test_outline_files(tmp_path):
     (tmp_path / "a.SVG").write_text(drawing('<rect width="2" height="1"/>'))
     (tmp_path / "b.txt").write_text("0 0\n1 0\n1 1\n")
-    assert AREA(targets.outline(tmp_path / "a.SVG")[0]) == 2
+    assert AREA(targets.outline(tmp_path / "a.SVG")[0]) == -2
     assert AREA(targets.outline(str(tmp_path / "b.txt"))[0]) == 0.5
 
 
@@ -380,6 +401,7 @@ def test_outline_files(tmp_path):
         ("polygon:six", "'six' is not a whole number"),
         ("polygon:-3", "'-3' is not a whole number"),
         ("star:9999999", "9999999 is far too many"),
+        ("star:5.5", "'star:5.5': '5.5' is not a whole number"),
         ("ring:1", "between 0 and 1, not 1.0"),
         ("letter:", "one character, not of ''"),
         ("letter:GG", "one character, not of 'GG'"),

@@ -109,6 +109,13 @@ def test_what_is_no_letter_is_refused(character):
         targets.letter(character)
 
 
+def test_glyphs_whose_parts_overlap_are_refused_by_name(monkeypatch):
+    square = targets.rectangle(1, 1)
+    monkeypatch.setattr("quasiharmonic.targets.glyphs._contours", lambda *_: [square, square + 0.5])
+    with pytest.raises(ValueError, match="the glyph of 'x': contours 0 and 1 of the outline meet"):
+        targets.letter("x")
+
+
 def test_missing_glyph_and_missing_font(tmp_path):
     with pytest.raises(ValueError, match=r"DejaVuSans-Bold\.ttf has no glyph for '猫'"):
         targets.letter("猫")
@@ -125,6 +132,9 @@ def test_missing_glyph_and_missing_font(tmp_path):
         (lambda: targets.disk(np.nan), "radius must be positive"),
         (lambda: targets.disk(1, 2), "at least 3 points, not 2"),
         (lambda: targets.regular_polygon(2), "at least 3 points, not 2"),
+        (lambda: targets.star(5.5), "the number of tips must be a whole number, not 5.5"),
+        (lambda: targets.regular_polygon(6.5), "must be a whole number, not 6.5"),
+        (lambda: targets.disk(1, 99.5), "must be a whole number, not 99.5"),
         (lambda: targets.star(2), "at least 3 tips, not 2"),
         (lambda: targets.star(5, 1.0), "between 0 and 1, not 1.0"),
         (lambda: targets.ring(0), "between 0 and 1, not 0"),
@@ -191,12 +201,54 @@ def test_nesting():
     assert [targets.signed_area(c) for c in ordered] == [64, -36, 16, -4, -0.25]
     # Turned around, a contour keeps its first point.
     assert ordered[0][0].tolist() == islands[1][0].tolist()
-    assert [targets.signed_area(c) for c in targets.filled(islands)] == [64]
+    assert [targets.signed_area(c) for c in targets.filled(islands)] == [-64]
     assert [targets.signed_area(c) for c in targets.filled([square, square + 2])] == [1, 1]
     with pytest.raises(ValueError, match="encloses no area"):
         targets.nested([np.array([(0, 0), (1, 1), (2, 2)])])
     with pytest.raises(ValueError, match=r"contour 1 must be \(k, 2\)"):
         targets.nested([square, np.zeros((2, 2))])
+
+
+@pytest.mark.parametrize(
+    ("contours", "message"),
+    [
+        (
+            [[(0, 0), (1, 1), (1, 0), (0, 1)]],
+            r"contour 0 of the outline meets itself: its side from point 0 \(0, 0\) to point 1 \(1, 1\) crosses",
+        ),
+        ([[(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)]], r"contour 0 .* touches its side from point 2 \(2, 2\) to point 3"),
+        ([[(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (1, 1), (0, 1)]], r"goes back along itself at point 4 \(1, 2\)"),
+        ([[(0, 0), (9, 0), (9, 9), (0, 9)], [(1, 1), (3, 1), (3, 1 - 1e-300), (1, 0.5)]], None),
+        (
+            [[(0, 0), (9, 0), (9, 9), (0, 9)], [(1, 0), (2, 1), (1, 1)]],
+            "contours 0 and 1 of the outline meet: .* touches",
+        ),
+        ([[(8, 1), (10, 1), (9, 2)], [(0, 0), (9, 0), (9, 9), (0, 9)]], "contours 0 and 1 .* crosses"),
+        ([[(0, 0), (9, 0), (9, 9)], [(0, 0), (9, 0), (9, 9)]], "contours 0 and 1 .* runs along .*9 such pairs in all"),
+        ([[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1e-9), (3, 3e-9)], [(2, 2), (4, 4), (3, 3)]], "contour 2 .* no area"),
+    ],
+)
+def test_contours_that_bound_no_region_are_refused(contours, message):
+    contours = [np.array(c, dtype=float) for c in contours]
+    if message is None:  # a hair is room enough, and no more points than they are
+        assert [len(c) for c in targets.nested(contours)] == [4, 3]
+        return
+    for refuse in (targets.nested, targets.filled):
+        with pytest.raises(ValueError, match=message):
+            refuse(contours)
+
+
+def test_repeated_points_are_dropped():
+    square = targets.rectangle(1, 1)
+    closed = np.concatenate([square[:2], square[1:], square[:1]])
+    assert targets.nested([closed])[0].tolist() == square.tolist()
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e150, 1e300])
+def test_nesting_at_any_scale(scale):
+    outer, inner = targets.nested([scale * c for c in (targets.disk(0.5)[::-1], targets.disk(1.0))])
+    assert np.array_equal(outer, scale * targets.disk(1.0))
+    assert np.array_equal(inner, scale * targets.disk(0.5)[::-1])
 
 
 # --- correspondence

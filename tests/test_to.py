@@ -13,7 +13,7 @@ from quasiharmonic import Problem, cut_open, diagnose, injective_map, io, refine
 from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
-from quasiharmonic.targets.correspondence import arc, spread
+from quasiharmonic.targets.correspondence import arc, at, off, places_along
 from quasiharmonic.targets.holes import least_stretch
 from quasiharmonic.targets.room import _choose, _reach, _Room, make_room
 from test_cli import CASES
@@ -166,7 +166,7 @@ def test_few_vertices_between_chosen_corners(cat):
     ("corners", "message"),
     [
         ([5, 20, 66, 41], "vertices 405, 420, 466, 441 follow each other .* but in the order 405, 420, 441, 466"),
-        ([5, 20, 41], "3 corner vertices for a contour with 4 corners: name one for each"),
+        ([5, 20, 41], r"3 corner vertices for .* 4 corners \(0 at \(0, 0\), 1 at \(2, 0\), .*\): name one for each"),
         ([5, 20, 41, -3], "vertex 394 in corners, but not on the boundary"),
         ([5, 20, 41, 5], "corners name vertex 405 more than once"),
         ([], "corners must name boundary vertices"),
@@ -187,6 +187,80 @@ def test_corners_that_cannot_be(cat, corners, message):
     named = {number(k): v for k, v in corners.items()} if isinstance(corners, dict) else [number(k) for k in corners]
     with pytest.raises(ValueError, match=message):
         boundary_to(V, F, targets.rectangle(2, 1), corners=named)
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_corners_are_numbered_as_the_outline_was_given(cat, tmp_path, shift):
+    """Clockwise or not; a first point that is no corner does not count."""
+    V, F, loop = cat
+    a, b, c, d = loop[[5, 20, 41, 66]].tolist()
+    ring = np.array([(1, 0), (2, 0), (2, 1), (0, 1), (0, 0)], dtype=float)
+    if shift:
+        ring = np.roll(ring, -1, axis=0)
+    (tmp_path / "o.txt").write_text("".join(f"{x} {y}\n" for x, y in ring[::-1]))
+    for contour, order in ((ring, (a, b, c, d)), (ring[::-1], (d, c, b, a)), (outline(tmp_path / "o.txt")[0], None)):
+        sharp = [tuple(p) for p in contour.tolist() if p[0] != 1]
+        where = placed(V, F, contour, corners=list(order or (d, c, b, a)))
+        assert [tuple(p) for p in where[list(order or (d, c, b, a))].tolist()] == sharp
+        where = placed(V, F, contour, corners={a: 2})
+        assert tuple(where[a]) == sharp[2]
+    with pytest.raises(ValueError, match=r"in this order around the outline, .* to its left: name them the other way"):
+        boundary_to(V, F, ring[::-1], corners=[a, b, c, d])
+
+
+def test_edge_by_edge(cat):
+    """Every point of a curve takes the vertex that it is given, and every side the run between two."""
+    V, F, loop = cat
+    angle = np.arange(24) * 2 * np.pi / 24
+    curve = np.stack([np.cos(angle), np.sin(angle)], axis=1) * (1 + 0.2 * np.cos(3 * angle))[:, None]
+    chosen = loop[np.sort(np.random.default_rng(5).choice(len(loop), 24, replace=False))]
+    where = placed(V, F, curve, corners=chosen, corner_angle=0)
+    assert np.array_equal(where[chosen], curve)
+    with pytest.raises(ValueError, match="23 corner vertices for a contour with 24 corners"):
+        boundary_to(V, F, curve, corners=chosen[1:], corner_angle=0)
+    every = {int(v): tuple(p) for v, p in zip(loop, targets.arc_length(V[loop], curve, start=3), strict=True)}
+    where = placed(V, F, curve, corners=every)
+    assert where[list(every)] == pytest.approx(np.array(list(every.values())), abs=1e-12)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e-300, 0), (1e-150, 0), (1e150, 0), (1e300, 0), (1, 1e8), (1, 1e12)])
+def test_scale_and_place_of_the_outline(scale, offset):
+    V, F = surfaces.annulus(8)
+    contours = [c * scale + offset for c in outline("letter:O", tolerance=1e-4)]
+    vertex = int(boundary_loops(F, len(V))[0][3])
+    for corners in (None, {vertex: contours[0][5]}):
+        fixed, target = boundary_to(V, F, contours, corners=corners)
+        _, wanted = boundary_to(
+            V,
+            F,
+            [c / scale - offset / scale for c in contours],
+            corners=corners and {vertex: contours[0][5] / scale - offset / scale},
+        )
+        np.testing.assert_allclose((target - offset) / scale, wanted, atol=1e-15 * max(offset, 10))
+        assert injective_map(V, F, fixed, target).certificate.bijective
+    with pytest.raises(ValueError, match="off the outline at"):
+        boundary_to(V, F, contours, corners={vertex: (1e308, -1e308)})
+
+
+def test_outlines_that_bound_no_region_are_refused_at_once():
+    V, F = surfaces.disk(6)
+    with pytest.raises(ValueError, match="contour 0 of the outline meets itself"):
+        boundary_to(V, F, [[(0, 0), (1, 1), (1, 0), (0, 1)]])
+    with pytest.raises(ValueError, match="the outline has no contour"):
+        boundary_to(V, F, [])
+
+
+def test_too_few_vertices_for_the_shape_are_refused():
+    """A thin spiral, cut off by a straight side between two vertices."""
+    turn = np.linspace(0, 4 * np.pi, 200)
+    arm = (0.2 + turn / 10)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    spiral = np.concatenate([arm, 1.15 * arm[::-1]])
+    V, F = surfaces.disk(3)
+    with pytest.raises(ValueError, match=r"the boundary is no outline itself: boundary loop 0 meets itself.*too few"):
+        boundary_to(V, F, spiral)
+    V, F = surfaces.disk(40)
+    fixed, target = boundary_to(V, F, spiral)
+    assert injective_map(V, F, fixed, target).certificate.bijective
 
 
 # --- room for chords
@@ -211,6 +285,8 @@ def brute_force(along, wanted, room):
         sides = list(zip(itertools.pairwise(ends), room.straight, room.spare, strict=True))
         if any(b - a <= spare or (straight and room.reach[a] <= b) for (a, b), straight, spare in sides):
             continue
+        if (np.abs(along[list(chosen)] - wanted) > room.farthest).any():
+            continue
         best = min(best, (float(((along[list(chosen)] - wanted) ** 2).sum()), chosen))
     return best
 
@@ -222,7 +298,9 @@ def test_room_is_made_at_the_least_cost(rng):
         along = np.concatenate([[0], np.sort(rng.random(count - 1)), [1]])
         wanted = np.sort(rng.random(k))
         reach = np.minimum.accumulate(rng.integers(2, 8, count + 1)[::-1] + np.arange(count, -1, -1))[::-1]
-        room = _Room(np.minimum(reach, count + 1), rng.random(k + 1) < 0.7, rng.integers(0, 3, k + 1))
+        room = _Room(
+            np.minimum(reach, count + 1), rng.random(k + 1) < 0.7, rng.integers(0, 3, k + 1), rng.choice([0.3, 1])
+        )
         cost, chosen = brute_force(along, wanted, room)
         found = _choose(along, wanted, room)
         assert (found is None) == (chosen is None)
@@ -259,6 +337,33 @@ def test_chords_across_a_pin_are_left_alone():
         13,
         13,
     ]
+
+
+def test_how_far_a_contour_is_cut_off():
+    """Against the distances of points from the sides that span them."""
+    contour = targets.star(5)
+    on_tips, between = np.arange(0, 1, 0.2), np.arange(10) / 10 + 0.05
+    inner, first, second = contour[1], contour[0], contour[2]
+    normal = np.array([first[1] - second[1], second[0] - first[0]]) / np.linalg.norm(second - first)
+    assert off(contour, on_tips, at(contour, on_tips)) == pytest.approx(abs((inner - first) @ normal))
+    assert off(contour, np.arange(10) / 10, contour) == 0
+    # In whatever order the vertices begin.
+    places = at(contour, between)
+    assert off(contour, np.roll(between, 3), np.roll(places, 3, axis=0)) == pytest.approx(off(contour, between, places))
+
+
+@pytest.mark.parametrize("character", "GC352")
+@pytest.mark.parametrize("size", [(12, 8), (40, 20)])
+def test_corners_move_only_so_far(character, size):
+    """A torus cut open has ears all along the cut; the outline is not given up for them."""
+    pytest.importorskip("igl")
+    opened = cut_open(*torus(*size))
+    (contour,) = targets.filled(outline(f"letter:{character}"))
+    fixed, target = boundary_to(opened.V, opened.F, contour)
+    assert targets.signed_area(target) == pytest.approx(targets.signed_area(contour), rel=0.03)
+    refined = refine(opened.V, opened.F, flattened_edges(opened.F, fixed, target))
+    result = injective_map(refined.V, refined.F, fixed, target)
+    assert result.certificate.bijective
 
 
 def test_flattened_edges_are_named_and_splitting_them_helps():
@@ -343,7 +448,9 @@ def test_holes_are_turned_for_the_least_energy():
     for i, x in zip(inner, (0.5, -0.4), strict=True):
         s = arc(V[problem.loops[i]])
         starts = range(0, len(s), max(1, len(s) // 8))
-        choices[i] = [spread(s, square + np.array([x, 0.1]), [(k, 0.0)], corner_angle=20) for k in starts]
+        choices[i] = [
+            at(square + np.array([x, 0.1]), places_along(s, square, [(k, 0.0)], corner_angle=20)) for k in starts
+        ]
 
     def energy(places):
         uv = quasi_harmonic_map(problem.moved(np.concatenate([places[i] for i in range(3)])))
@@ -400,7 +507,7 @@ def test_a_point_says_which_loop_goes_where():
         (
             surfaces.disk(4),
             "letter:i",
-            "the outline is in 2 separate pieces, and a connected surface can fill",
+            r"the outline is in 2 separate pieces \(beginning at \(.*\), \(.*\)\), and a connected surface can fill",
         ),
         (torus(), "disk", r"the surface is closed: .* cut it open first \(cut_open; qhm map --cut\)"),
         (octahedron(), "disk", "the surface is closed"),
@@ -436,6 +543,15 @@ def test_cut_open(mesh):
     assert np.array_equal(opened.origin[opened.F], F)
     assert np.array_equal(opened.V, V[opened.origin])
     assert injective_map(opened.V, opened.F, *boundary_to(opened.V, opened.F, outline("disk"))).injective
+
+
+@pytest.mark.parametrize("scale", [0, 1e-310, 1e-200, 1e200, 1e300])
+def test_cut_open_at_any_scale(scale):
+    pytest.importorskip("igl")
+    V, F = octahedron()
+    opened = cut_open(scale * V, F)
+    assert len(boundary_loops(opened.F, len(opened.V))) == 1
+    assert np.array_equal(opened.V, scale * V[opened.origin])
 
 
 def test_cut_open_tetrahedron():
@@ -516,6 +632,66 @@ def test_to_with_corners(qhm):
     assert io.map_of(io.read_mesh(qhm.out))[[a, b]].tolist() == [[2, 0], [1.5, 1]]
 
 
+def test_to_edge_by_edge_from_a_file(qhm, tmp_path):
+    V, F = surfaces.cat(12)
+    loop = boundary_loops(F, len(V))[0]
+    square = [(0, 0), (0.5, -0.01), (1, 0), (1, 1), (0, 1)]
+    (tmp_path / "o.txt").write_text("".join(f"{x} {y}\n" for x, y in square))
+    chosen = loop[[2, 10, 20, 40, 70]].tolist()
+    to = ["--to", str(tmp_path / "o.txt"), "--corners", str(tmp_path / "pairs"), "--corner-angle", "0"]
+    for text in ("{} {}\n", "{}:{} # a comment\n\n"):
+        (tmp_path / "pairs").write_text("".join(text.format(v, k) for k, v in enumerate(chosen)))
+        assert qhm((V, F), *to)[0] == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(qhm.out))[chosen], square)
+    status, _, said = qhm((V, F), *to[:4], "--json", str(tmp_path / "pairs"))
+    assert status == 2
+    assert "would replace an input" in said
+    # Without it the slight bend has no number.
+    status, _, said = qhm((V, F), *to[:4])
+    assert status == 2
+    assert "goes to corner 4, but the contour has corners 0 to 3: 0 at (0, 0), 1 at (1, 0)" in said
+
+
+def grouped(path, V, F):
+    """Write an OBJ file with colours, and two groups."""
+    with path.open("w") as file:
+        file.writelines(f"v {x} {y} {z} {k / len(V)} 0 0\n" for k, (x, y, z) in enumerate(V))
+        for name, part in (("first", F[: len(F) // 2]), ("second", F[len(F) // 2 :])):
+            file.write(f"g {name}\nusemtl of_{name}\n")
+            file.writelines(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in part)
+
+
+def groups(path):
+    """Faces of each group, and vertices with their colours."""
+    found, lines = {}, path.read_text().splitlines()
+    for line in lines:
+        if line.startswith("g "):
+            here = found.setdefault(line[2:], [])
+        if line.startswith("f "):
+            here.append([int(word.split("/")[0]) - 1 for word in line.split()[1:]])
+    return found, np.array([line.split()[1:] for line in lines if line.startswith("v ")], dtype=float)
+
+
+def test_cut_and_refined_files_keep_groups_and_colours(tmp_path):
+    pytest.importorskip("igl")
+    V, F = torus()
+    grouped(tmp_path / "in.obj", V, F)
+    out = tmp_path / "out.obj"
+    command = ["map", str(tmp_path / "in.obj"), "-o", str(out), "--to", "letter:H", "--cut"]
+    assert main(command) == 2
+    assert main([*command, "--refine"]) == 0
+    found, vertices = groups(out)
+    assert list(found) == ["first", "second"]
+    assert "usemtl of_second" in out.read_text()
+    assert len(vertices) > len(V) + 20
+    np.testing.assert_array_equal(vertices[: len(V), 3], np.arange(len(V)) / len(V))
+    assert np.isfinite(vertices[:, 3]).all()
+    # Whatever was split, a group covers as much of the surface as before.
+    area = lambda V, F: np.linalg.norm(np.cross(*(V[F[:, k]] - V[F[:, 0]] for k in (1, 2))), axis=1).sum()  # noqa: E731
+    for part, before in (("first", F[: len(F) // 2]), ("second", F[len(F) // 2 :])):
+        assert area(vertices[:, :3], np.array(found[part])) == pytest.approx(area(V, before))
+
+
 def test_holes_that_the_surface_does_not_have_are_filled(qhm):
     status, facts, said = qhm(surfaces.cat(12), "--to", "letter:B", "--font", "DejaVu Sans")
     assert status == 0
@@ -537,6 +713,7 @@ def test_refusal_and_refinement(qhm):
     V, F = np.vstack([V, tips]), np.vstack([F, ears])
     status, _, said = qhm((V, F), "--to", "rect:2x1")
     assert status == 2
+    assert "in.obj: the inner edges" in said
     assert "boundary vertices between which rect:2x1 does not bend outwards" in said
     assert "--refine" in said
     assert not qhm.out.exists()
@@ -584,7 +761,16 @@ def test_closed_surfaces(qhm):
         (["--to", "lettr:G"], "'lettr:G' is no outline that is known"),
         (["--to", "none.svg"], "none.svg: there is no such file"),
         (["--to", "disk", "--font", "x"], "a font has no meaning for 'disk'"),
-        (["--to", "rect:1x1", "--corners", "0"], "in.obj: vertex 0 in corners, but not on the boundary"),
+        (["--to", "rect:1x1", "--corners", "0"], "in.obj --to rect:1x1: vertex 0 in corners, but not on the boundary"),
+        (["--to", "letter:i"], "in.obj --to letter:i: the outline is in 2 separate pieces"),
+        (["--to", "rect:0x1"], "--to rect:0x1: width must be positive"),
+        (["--to", "disk", "--corners", "a"], "--corners a: 'a' is none of V, V:K and V:X:Y"),
+        (["--to", "disk", "--corners", "1,,2"], "'' is none of V"),
+        (["--to", "disk", "--corners", "1:2:3:4"], "'1:2:3:4' is none of V"),
+        (["--to", "disk", "--corners", "1,2:3"], "where does vertex 1 go?"),
+        (["--to", "disk", "--corners", "1:2,1:3"], "vertex 1 is named more than once"),
+        (["--to", "disk", "--corners", "1,1"], "vertex 1 is named more than once"),
+        (["--corner-angle", "0"], "--corner-angle says how"),
     ],
 )
 def test_wrong_calls(qhm, options, message):
@@ -596,7 +782,7 @@ def test_wrong_calls(qhm, options, message):
 
 @pytest.mark.parametrize(
     "options",
-    [["--to", "disk", "--fixed", "f"], *(["--corners", c] for c in ("a", "1,,2", "1:2:3:4", "1,2:3", "1:2,1:3"))],
+    [["--to", "disk", "--fixed", "f"], ["--corner-angle", "181"], ["--corner-angle", "x"], ["--corner-angle", "nan"]],
 )
 def test_calls_that_cannot_be_read(qhm, options):
     with pytest.raises(SystemExit) as stop:

@@ -97,6 +97,8 @@ def _long_path(V: FloatArray, interior: IntArray) -> list[int]:
     from scipy.sparse.csgraph import dijkstra
 
     n = len(V)
+    # Of about unit size, so that no square overflows or vanishes.
+    V = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
     # No length is zero, which would be no edge at all.
     lengths = np.maximum(np.linalg.norm(V[interior[:, 0]] - V[interior[:, 1]], axis=1), np.finfo(np.float64).tiny)
     graph = csr_array((lengths, interior.T), shape=(n, n))

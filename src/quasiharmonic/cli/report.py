@@ -132,7 +132,7 @@ def _same(path: Path, other: Path) -> bool:
 
 
 @contextmanager
-def about(source: Path) -> Iterator[None]:
+def about(source: Path | str) -> Iterator[None]:
     """Tell of which file a message about a mesh speaks, and how it counts."""
     try:
         yield

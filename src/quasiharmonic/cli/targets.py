@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, field
+import os
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +15,10 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.mesh.reference import Reference
     from quasiharmonic.problem import Problem
+    from quasiharmonic.refinement import Refined
 
 # That of quasiharmonic.targets.specification, which is not imported to say it.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
-# Rounds of splitting edges: what is split may give way to another obstruction.
-_ROUNDS = 5
 
 
 @dataclass
@@ -54,10 +54,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--font", metavar="FONT", help="for letters and words: a font file or the name of a font")
     group.add_argument(
         "--corners",
-        type=_corners,
         metavar="V,V,…",
-        help="boundary vertices, 0-based, that go to the outline's corners in order; or V:K for its corner K (from 0), "
-        "V:X:Y for its point (X, Y)",
+        help="boundary vertices, 0-based, that go to the outline's corners in the order it has them in; or V:K for its "
+        "corner K (from 0), V:X:Y for its point (X, Y); or a file of these, one a line",
+    )
+    group.add_argument(
+        "--corner-angle",
+        type=_degrees,
+        metavar="DEG",
+        help="how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
+        "by edge (default: 20)",
     )
     group.add_argument(
         "--cut", action="store_true", help="cut a closed surface, or one with handles, open first (copies vertices)"
@@ -69,9 +75,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def files(options: argparse.Namespace) -> tuple[Path | None, ...]:
     """The files that the options name, if that is what they name; no output may replace them."""
-    return tuple(
-        None if name is None or not Path(name).is_file() else Path(name) for name in (options.to, options.font)
-    )
+    names = options.to, options.font, options.corners
+    return tuple(Path(name) if name is not None and os.path.isfile(name) else None for name in names)
 
 
 def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] | None) -> Posed:
@@ -88,18 +93,24 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
     from . import report
 
     if options.to is None:
-        for name in ("font", "corners", "cut"):
-            if getattr(options, name):
-                raise ValueError(f"--{name} says how the boundary goes to an outline: name one by --to")
-        with report.about(Path(mesh.source)):
+        for name in ("font", "corners", "corner_angle", "cut"):
+            value = getattr(options, name)
+            if value is not None and value is not False:
+                option = name.replace("_", "-")
+                raise ValueError(f"--{option} says how the boundary goes to an outline: name one by --to")
+        with report.about(mesh.source):
             posed = Posed(mesh, Problem(*io.problem_arrays(mesh, fixed), reference=options.reference))
     else:
         from quasiharmonic.targets import outline
 
-        contours = outline(options.to, font=options.font)
-        with report.about(Path(mesh.source)):
-            posed = _onto_outline(options, mesh, contours)
-            if not options.refine:
+        try:
+            contours = outline(options.to, font=options.font)
+        except ValueError as error:
+            text = str(error)
+            raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
+        posed = _onto_outline(options, mesh, contours)
+        if not options.refine:
+            with report.about(mesh.source):
                 _check_room(posed.problem, options.to)
     if options.refine:
         _refine(posed, options.reference)
@@ -108,28 +119,36 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
 
 def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[NDArray[np.float64]]) -> Posed:
     """Lay the boundary along an outline."""
-    from quasiharmonic import io
     from quasiharmonic.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets import boundary_to, filled
+
+    from . import report
 
     facts: dict[str, Any] = {"to": options.to}
     notes = []
     if options.cut:
         from quasiharmonic.cutting import cut_open
 
-        opened = cut_open(mesh.V, mesh.F)
+        with report.about(mesh.source):
+            opened = cut_open(mesh.V, mesh.F)
         facts["copied_vertices"] = copies = len(opened.V) - len(mesh.V)
         notes.append(f"cut open: {copies} vertices along the cut have a copy at the end of the list")
-        mesh = io.MeshData(opened.V, opened.F, source=mesh.source)
+        extra = None if mesh.extra is None else mesh.extra[opened.origin]
+        mesh = replace(mesh, V=opened.V, F=opened.F, extra=extra)
     whole = filled(contours)
     holes = len(contours) - len(whole)
-    if holes and len(boundary_loops(mesh.F, len(mesh.V))) == 1:
+    with report.about(mesh.source):
+        loops = len(boundary_loops(mesh.F, len(mesh.V)))
+    if holes and loops == 1:
         facts["filled_holes"] = holes
         which = "the hole" if holes == 1 else f"the {holes} holes"
         notes.append(f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled")
         contours = whole
-    places = boundary_to(mesh.V, mesh.F, contours, corners=options.corners)
+    corners = None if options.corners is None else read_corners(options.corners)
+    angle = 20.0 if options.corner_angle is None else options.corner_angle
+    with report.about(f"{mesh.source} --to {options.to}"):
+        places = boundary_to(mesh.V, mesh.F, contours, corners=corners, corner_angle=angle)
     return Posed(mesh, Problem(mesh.V, mesh.F, *places, reference=options.reference), facts, notes)
 
 
@@ -149,44 +168,80 @@ def _check_room(problem: Problem, to: str) -> None:
 
 def _refine(posed: Posed, reference: Reference | None) -> None:
     """Split edges that stand in the way of a map, until none is known."""
-    import numpy as np
-
-    from quasiharmonic import io
-    from quasiharmonic.diagnosis import diagnose
-    from quasiharmonic.problem import Problem
-    from quasiharmonic.refinement import refine
+    from quasiharmonic.refinement import refine, refine_problem
     from quasiharmonic.targets import flattened_edges
 
-    count = posed.problem.n
-    for _ in range(_ROUNDS):
-        problem = posed.problem
-        flat = flattened_edges(problem.F, problem.fixed, problem.target)
-        split = np.unique(np.concatenate([flat, diagnose(problem).split]), axis=0)
-        if not len(split):
-            break
-        refined = refine(problem.V, problem.F, split)
-        posed.problem = Problem(refined.V, refined.F, problem.fixed, problem.target, reference=reference)
-        posed.mesh = io.MeshData(refined.V, refined.F, source=posed.mesh.source)
-    posed.facts["added_vertices"] = added = posed.problem.n - count
+    before = posed.problem
+    # A chord along a straight side of the outline may be a rounding error off it; a diagnosis, which is exact, then
+    # does not name it.
+    flat = flattened_edges(before.F, before.fixed, before.target)
+    _take(posed, refine(before.V, before.F, flat), reference)
+    _take(posed, refine_problem(posed.problem).refined, reference)
+    posed.facts["added_vertices"] = added = posed.problem.n - before.n
     if added:
         posed.notes.append(f"split {added} edge{'' if added == 1 else 's'}: new vertices are at the end of the list")
 
 
-def _corners(text: str) -> list[int] | dict[int, int | tuple[float, float]]:
-    """Read ``--corners``; for argparse."""
-    parts = [part.split(":") for part in text.split(",")]
-    try:
-        if all(len(part) == 1 for part in parts):
-            return [int(part[0]) for part in parts]
-        chosen: dict[int, int | tuple[float, float]] = {}
-        for vertex, *goal in parts:
-            if int(vertex) in chosen:
-                raise argparse.ArgumentTypeError(f"vertex {vertex} is named more than once")
-            chosen[int(vertex)] = int(goal[0]) if len(goal) == 1 else (float(goal[0]), float(goal[1]))
-            if len(goal) > 2:
-                raise ValueError
-    except (ValueError, IndexError):
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: vertices V are needed with commas between, or V:K or V:X:Y for each"
-        ) from None
-    return chosen
+def _take(posed: Posed, refined: Refined, reference: Reference | None) -> None:
+    """Go over to a refined mesh, with all that stands in the file."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.problem import Problem
+
+    if not len(refined.parents):
+        return
+    # The map is still to come, and takes the place of these zeros.
+    posed.mesh, _ = io.refined_mesh(posed.mesh, refined, np.zeros((posed.problem.n, 2)))
+    fixed, target = posed.problem.fixed, posed.problem.target
+    posed.problem = Problem(posed.mesh.V, posed.mesh.F, fixed, target, reference=reference)
+
+
+def read_corners(text: str) -> list[int] | dict[int, int | tuple[float, float]]:
+    """Read what ``--corners`` says, or the file that it names.
+
+    Parameters
+    ----------
+    text : str
+        ``V,V,…``, or ``V:K`` and ``V:X:Y`` in the place of ``V``; or a text file with one of these on each line,
+        blanks in the place of colons if need be, ``#`` before comments.
+
+    Raises
+    ------
+    ValueError
+        When that is not what stands there, or a vertex stands there twice.
+    """
+    if os.path.isfile(text):
+        lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
+        entries = [":".join(line.split("#")[0].replace(":", " ").split()) for line in lines]
+        entries = [entry for entry in entries if entry]
+    else:
+        entries = text.split(",")
+    chosen: dict[int, int | tuple[float, float]] = {}
+    vertices = []
+    for entry in entries:
+        vertex, *goal = entry.split(":")
+        try:
+            vertices.append(int(vertex))
+            if len(goal) == 1:
+                chosen[vertices[-1]] = int(goal[0])
+            elif goal:
+                x, y = map(float, goal)
+                chosen[vertices[-1]] = x, y
+        except ValueError:
+            raise ValueError(f"--corners {text}: {entry!r} is none of V, V:K and V:X:Y") from None
+    if len(set(vertices)) < len(vertices):
+        twice = next(v for v in vertices if vertices.count(v) > 1)
+        raise ValueError(f"--corners {text}: vertex {twice} is named more than once")
+    if chosen and len(chosen) < len(vertices):
+        lone = next(v for v in vertices if v not in chosen)
+        raise ValueError(f"--corners {text}: where does vertex {lone} go? Others have a corner or a point")
+    return chosen or vertices
+
+
+def _degrees(text: str) -> float:
+    """For argparse."""
+    angle = float(text)
+    if not 0 <= angle <= 180:
+        raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")
+    return angle

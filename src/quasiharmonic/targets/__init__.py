@@ -2,9 +2,10 @@
 
 from quasiharmonic.targets.boundary import boundary_to
 from quasiharmonic.targets.chords import flattened_edges
-from quasiharmonic.targets.contours import filled, nested, signed_area
+from quasiharmonic.targets.contours import signed_area
 from quasiharmonic.targets.correspondence import arc_length
 from quasiharmonic.targets.glyphs import letter, word
+from quasiharmonic.targets.nesting import filled, nested
 from quasiharmonic.targets.outlines import disk, ellipse, rectangle, regular_polygon, ring, star
 from quasiharmonic.targets.polylines import read_polylines
 from quasiharmonic.targets.specification import outline

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.boundary_curves import judge_loops, listed
 from quasiharmonic.problem import Problem
-from quasiharmonic.targets.chords import STRAIGHT, chords_of, flat_chords
-from quasiharmonic.targets.contours import from_corner, nested, signed_area
-from quasiharmonic.targets.correspondence import Held, arc, best_start, seen_flat, spread
+from quasiharmonic.targets.chords import chords_of
+from quasiharmonic.targets.contours import from_corner, in_unit
+from quasiharmonic.targets.correspondence import arc, seen_flat
+from quasiharmonic.targets.course import Course
 from quasiharmonic.targets.holes import least_stretch, match_holes
+from quasiharmonic.targets.nesting import Arranged, arranged
 from quasiharmonic.targets.pins import Corners, Pins
-from quasiharmonic.targets.room import make_room
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-# Starts that are tried, nearest to the best fit first, where chords have no room.
-_MOST_STARTS = 256
-# Ways around to turn a hole.
-_TURNS = 48
 
 
 def boundary_to(
@@ -51,6 +47,7 @@ def boundary_to(
         Triangles of one connected surface without handles.
     outline : list of (k, 2) float, or one (k, 2) float
         An outer contour and as many holes as the surface has further boundary loops, wound as they like.
+        None may cross or touch itself or another.
     corners : sequence of int, or mapping from int, optional
         Boundary vertices that go to corners of the outline. In a sequence there is one for every corner
         of its contour, in order from the contour's first (an outline without corners has its first
@@ -70,20 +67,26 @@ def boundary_to(
     Raises
     ------
     ValueError
-        As `Problem` for a malformed, closed or disconnected mesh; when the surface has a handle; when
-        loops and contours differ in number, or the outline is in several pieces; when a contour has
-        more corners than its loop has vertices; when a corner vertex is not on the boundary, its place
-        not on the outline, or they follow each other in different orders.
+        As `Problem` for a malformed, closed or disconnected mesh; as `nested` for contours that meet
+        themselves or each other; when the surface has a handle; when loops and contours differ in
+        number, or the outline is in several pieces; when a contour has more corners than its loop has
+        vertices, or the boundary has so few that it would cross itself; when a corner vertex is not on
+        the boundary, its place not on the outline, or they follow each other in different orders.
     """
     # All vertices fixed, anywhere: this checks the mesh and nothing else.
     count = len(np.asarray(V))
     surface = Problem(V, F, np.arange(count), np.zeros((count, 2)), reference="equilateral")
-    contours = nested([outline] if isinstance(outline, np.ndarray) and outline.ndim == 2 else list(outline))
-    _check_fit(surface, contours)
-    contours = [from_corner(c, corner_angle) for c in contours]
+    # Numbers of corners are the user's, whichever way the outline runs: the first of them stays the first point.
+    given = [outline] if isinstance(outline, np.ndarray) and outline.ndim == 2 else list(outline)
+    found = arranged(given)
+    if not found:
+        raise ValueError("the outline has no contour")
+    _check_fit(surface, found)
+    contours, exponent = in_unit([one.wound for one in found])
+    contours = [from_corner(c, corner_angle, one.reversed) for c, one in zip(contours, found, strict=True)]
     loops = surface.loops
     space = _in_space(surface.V)
-    pins = Pins(corners, loops, contours, corner_angle)
+    pins = Pins(corners, loops, contours, [one.reversed for one in found], corner_angle, exponent)
     to = dict(pins.contour_of)
     if 0 not in to.values():
         # Of the loops that may go anywhere the one around the largest area goes outside.
@@ -91,18 +94,20 @@ def boundary_to(
         to[free[int(np.argmax([np.linalg.norm(_vector_area(space[loops[i]])) for i in free]))]] = 0
     outer = next(i for i, contour in to.items() if contour == 0)
 
-    def course(i: int) -> _Course:
+    def course(i: int) -> Course:
         chords = chords_of(loops[i], surface.edges.interior, count)
-        return _Course(arc(space[loops[i]]), contours[to[i]], pins.along(i, to[i]), chords, loops[i], corner_angle)
+        return Course(arc(space[loops[i]]), contours[to[i]], pins.along(i, to[i]), chords, loops[i], corner_angle)
 
     places = {outer: course(outer).fitted(seen_flat(space[loops[outer]], contours[0]))}
     if len(loops) > 1:
         to |= match_holes(surface, outer, places[outer], contours, to)
         places |= least_stretch(surface, places, {i: course(i).choices() for i in to if i != outer})
-    return np.concatenate(loops), np.concatenate([places[i] for i in range(len(loops))])
+    target = np.ldexp(np.concatenate([places[i] for i in range(len(loops))]), exponent)
+    _check_simple(loops, target, count)
+    return np.concatenate(loops), target
 
 
-def _check_fit(surface: Problem, contours: list[FloatArray]) -> None:
+def _check_fit(surface: Problem, contours: list[Arranged]) -> None:
     """Raise unless the surface and what the contours enclose are of one topology."""
     loops, f = len(surface.loops), len(surface.F)
     euler = surface.n - len(surface.edges.interior) - len(surface.edges.boundary) + f
@@ -112,11 +117,12 @@ def _check_fit(surface: Problem, contours: list[FloatArray]) -> None:
             f"the surface has {'a handle' if handles == 1 else f'{handles} handles'} and fits into no outline: "
             "cut it open first (cut_open; qhm map --cut)"
         )
-    pieces = sum(signed_area(c) > 0 for c in contours)
-    if pieces > 1:
+    pieces = [one.points[0].tolist() for one in contours if one.depth % 2 == 0]
+    if len(pieces) > 1:
+        where = listed([f"({x:g}, {y:g})" for x, y in pieces])
         raise ValueError(
-            f"the outline is in {pieces} separate pieces, and a connected surface can fill only one: join them, "
-            "or map a surface onto each"
+            f"the outline is in {len(pieces)} separate pieces (beginning at {where}), and a connected surface can fill "
+            "only one: join them, or map a surface onto each"
         )
     if loops == len(contours):
         return
@@ -135,69 +141,17 @@ def _check_fit(surface: Problem, contours: list[FloatArray]) -> None:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Course:
-    """One boundary loop and the contour that it goes to.
-
-    Attributes
-    ----------
-    s : (n,) float64
-        Where the vertices lie along the loop.
-    contour : (k, 2) float64
-    pins : list of (int, float)
-        Vertices whose place along the contour is given.
-    chords : (c, 2) int64
-        Interior edges between vertices of the loop.
-    names : (n,) int64
-        The loop's vertices.
-    corner_angle : float
-        Degrees.
-    """
-
-    s: FloatArray
-    contour: FloatArray
-    pins: list[tuple[int, float]]
-    chords: IntArray
-    names: IntArray
-    corner_angle: float
-
-    def laid(self, start: int = 0) -> tuple[FloatArray, bool]:
-        """Places, and whether chords have room; ``start`` goes to the contour's first point if nothing is given."""
-        pins: Held = self.pins or [(start, 0.0)]
-        places = self._spread(pins)
-        if self._has_room(places):
-            return places, True
-        roomy = make_room(self.s, self.contour, pins, corner_angle=self.corner_angle, chords=self.chords)
-        other = places if roomy is None else self._spread(roomy)
-        return (other, True) if self._has_room(other) else (places, False)
-
-    def _spread(self, pins: Held) -> FloatArray:
-        return spread(self.s, self.contour, pins, corner_angle=self.corner_angle, names=self.names)
-
-    def _has_room(self, places: FloatArray) -> bool:
-        least = STRAIGHT * float(np.ptp(self.contour, axis=0).max())
-        return next(flat_chords(self.chords, places, least), None) is None
-
-    def fitted(self, flat: FloatArray) -> FloatArray:
-        """Places from the start that fits best, or the nearest one that leaves chords room if there is any."""
-        first = best_start(self.s, flat, self.contour)
-        best, roomy = self.laid(first)
-        away = np.minimum((self.s - self.s[first]) % 1.0, (self.s[first] - self.s) % 1.0)
-        for start in np.argsort(away, kind="stable")[1 : 1 if self.pins else _MOST_STARTS]:
-            if roomy:
-                break
-            places, roomy = self.laid(int(start))
-            best = places if roomy else best
-        return best
-
-    def choices(self) -> list[FloatArray]:
-        """Places from starts all around; only those that leave chords room if there are any."""
-        if self.pins:
-            return [self.laid()[0]]
-        wanted = np.arange(_TURNS) / _TURNS
-        starts = np.unique(np.searchsorted(self.s, wanted, side="right") - 1)
-        found = [self.laid(int(start)) for start in starts]
-        return [places for places, roomy in found if roomy] or [places for places, _ in found]
+def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
+    """Raise when the target is no boundary of a region: too few vertices cut corners until they meet."""
+    places = np.zeros((n, 2))
+    places[np.concatenate(loops)] = target
+    _, reasons = judge_loops(loops, places)
+    if reasons:
+        raise ValueError(
+            f"laid along the outline, the boundary is no outline itself: {reasons[0]}. Its vertices are too few "
+            "for the shape, or crowd elsewhere: split boundary edges (refine with boundary=True), choose other "
+            "corners, or an outline with less detail"
+        )
 
 
 def _in_space(V: FloatArray) -> FloatArray:

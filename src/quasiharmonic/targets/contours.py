@@ -1,4 +1,4 @@
-"""Closed contours in the plane: area, nesting, corners, and curves flattened into them.
+"""Closed contours in the plane: area, corners, and curves flattened into them.
 
 A contour is a (k, 2) float64 array of points, the last joined to the first, none repeated. An
 outline is a list of contours, the outer ones counterclockwise and holes clockwise: the filled side
@@ -39,62 +39,18 @@ def as_complex(points: FloatArray) -> ComplexArray:
     return np.ascontiguousarray(points).view(np.complex128).ravel()
 
 
-def contains(contour: FloatArray, point: FloatArray) -> bool:
-    """Whether a ray from the point to the right crosses the contour an odd number of times."""
-    (x0, y0), (x1, y1) = contour.T, np.roll(contour, -1, axis=0).T
-    spans = (y0 > point[1]) != (y1 > point[1])
-    x = x0[spans] + (point[1] - y0[spans]) / (y1 - y0)[spans] * (x1 - x0)[spans]
-    return bool(np.count_nonzero(x > point[0]) % 2)
-
-
-def nested(contours: Sequence[ArrayLike]) -> list[FloatArray]:
-    """Order contours by decreasing area and wind them: counterclockwise outside, clockwise around holes.
-
-    What lies within an odd number of others is a hole (the even-odd rule). The contours may be wound
-    as they like, but must not cross.
-
-    Parameters
-    ----------
-    contours : sequence of (k, 2) float
+def in_unit(contours: Sequence[FloatArray]) -> tuple[list[FloatArray], int]:
+    """Contours shrunk or blown up to coordinates of about 1 at most, so that no square of theirs over- or underflows.
 
     Returns
     -------
-    list of (k, 2) float64
-
-    Raises
-    ------
-    ValueError
-        When a contour is no array of at least three finite points, or encloses no area.
+    contours : list of (k, 2) float64
+        The same divided by a power of two, which rounds nothing.
+    exponent : int
+        Of that power.
     """
-    found = sorted((checked(c, f"contour {i}") for i, c in enumerate(contours)), key=lambda c: -abs(signed_area(c)))
-    for i, contour in enumerate(found):
-        if signed_area(contour) == 0:
-            raise ValueError("a contour of the outline encloses no area")
-        # Only a larger contour can contain this one, and those come before it.
-        if (signed_area(contour) > 0) == _is_hole(contour, found[:i]):
-            # The first point stays the first.
-            found[i] = np.roll(contour[::-1], 1, axis=0)
-    return found
-
-
-def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
-    """An outline without its holes: the contours that no other one contains, counterclockwise.
-
-    Parameters
-    ----------
-    contours : sequence of (k, 2) float
-        As `nested` takes them.
-
-    Returns
-    -------
-    list of (k, 2) float64
-    """
-    ordered = nested(contours)
-    return [c for i, c in enumerate(ordered) if not any(contains(other, c[0]) for other in ordered[:i])]
-
-
-def _is_hole(contour: FloatArray, larger: list[FloatArray]) -> bool:
-    return sum(contains(other, contour[0]) for other in larger) % 2 == 1
+    exponent = max(int(np.frexp(np.abs(c).max())[1]) for c in contours)
+    return [np.ldexp(c, -exponent) for c in contours], exponent
 
 
 def checked(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> FloatArray:
@@ -121,10 +77,17 @@ def corners(contour: FloatArray, angle: float) -> IntArray:
     return np.flatnonzero(np.abs(turns(contour)) >= np.radians(angle))
 
 
-def from_corner(contour: FloatArray, angle: float) -> FloatArray:
-    """The same contour from its first corner on, so that no side is cut in two where it happens to begin."""
-    first = corners(contour, angle)[:1].sum()
-    return np.roll(contour, -first, axis=0)
+def from_corner(contour: FloatArray, angle: float, backwards: bool = False) -> FloatArray:
+    """The same contour from its first corner on, so that no side is cut in two where it happens to begin.
+
+    ``backwards`` if the contour was turned around, its first point left where it is: the first corner
+    is then the one that was the first before.
+    """
+    marks = corners(contour, angle)
+    if not marks.size:
+        return contour
+    first = marks[-1] if backwards and marks[0] > 0 else marks[0]
+    return np.roll(contour, -int(first), axis=0)
 
 
 def flatten(pieces: Pieces, tolerance: float) -> FloatArray:

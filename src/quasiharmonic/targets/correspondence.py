@@ -64,10 +64,10 @@ def arc_length(
         start = best_start(s, seen_flat(points, contour), contour)
     elif not 0 <= start < n:
         raise ValueError(f"start = {start}, but the loop has vertices 0 to {n - 1}")
-    return spread(s, contour, [(start, 0.0)], corner_angle=corner_angle)
+    return at(contour, places_along(s, contour, [(start, 0.0)], corner_angle=corner_angle))
 
 
-def spread(
+def places_along(
     s: FloatArray,
     contour: FloatArray,
     pins: Held,
@@ -75,7 +75,7 @@ def spread(
     corner_angle: float,
     names: IntArray | None = None,
 ) -> FloatArray:
-    """Lay a loop along a contour, some of its vertices given; each corner gets the vertex nearest along the way.
+    """Find places along a contour for a loop, some of them given; each corner gets the vertex nearest along the way.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ def spread(
 
     Returns
     -------
-    (n, 2) float64
+    (n,) float64
+        Where along the contour the vertices go, from 0 to 1, as `arc` tells; for `at`.
 
     Raises
     ------
@@ -111,12 +112,15 @@ def spread(
         way = np.interp(along, along[[0, *chosen, count]], np.concatenate([[0.0], wanted, [1.0]]))
         stuck = np.flatnonzero(np.diff(way) <= 0)
         if stuck.size:
-            raise ValueError(f"vertices {names[run[stuck[0]]]} and {names[run[stuck[0] + 1]]} of the loop coincide")
+            pair = f"vertices {names[run[stuck[0]]]} and {names[run[stuck[0] + 1]]} of the loop"
+            if along[stuck[0]] == along[stuck[0] + 1]:
+                raise ValueError(f"{pair} coincide")
+            raise ValueError(f"{pair} come to one place: sides of the outline are too short beside the others")
         place[run[:-1]] = (stretch.begin + stretch.gap * way[:-1]) % 1.0
         # Without rounding, so that corners are met exactly.
         place[run[chosen]] = t[here]
         place[run[0]] = stretch.begin
-    return at(contour, place)
+    return place
 
 
 @dataclass(frozen=True)
@@ -167,7 +171,9 @@ def _too_few(first: int, last: int, free: int, wanted: int) -> ValueError:
             f"there are {free} boundary vertices between {first} and {last}, "
             f"too few to keep the {wanted} corners of the outline there"
         )
-    return ValueError(f"{what}: refine the boundary, or let fewer bends count as corners (corner_angle)")
+    return ValueError(
+        f"{what}: refine the boundary, or let fewer bends count as corners (corner_angle; qhm map --corner-angle)"
+    )
 
 
 def arc(points: FloatArray) -> FloatArray:
@@ -184,6 +190,27 @@ def at(contour: FloatArray, place: FloatArray) -> FloatArray:
     t = np.append(arc(contour), 1.0)
     closed = np.concatenate([contour, contour[:1]])
     return np.stack([np.interp(place, t, closed[:, axis]) for axis in range(2)], axis=1)
+
+
+def off(contour: FloatArray, along: FloatArray, places: FloatArray) -> float:
+    """How far a contour's points are at most from the straight sides that a loop's vertices span in their place.
+
+    Parameters
+    ----------
+    contour : (k, 2) float64
+    along : (n,) float64
+        Where along the contour the vertices are, in order around;
+    places : (n, 2) float64
+        and where that is.
+    """
+    order = np.argsort(along, kind="stable")
+    # Points before the first vertex belong to the side that leads to it from the last one.
+    last = order[np.searchsorted(along[order], arc(contour), side="right") - 1]
+    begin = places[last]
+    side = places[(last + 1) % len(places)] - begin
+    length = np.maximum((side**2).sum(axis=1), np.finfo(np.float64).tiny)
+    share = np.clip(((contour - begin) * side).sum(axis=1) / length, 0, 1)
+    return float(np.linalg.norm(begin + share[:, None] * side - contour, axis=1).max())
 
 
 def _match(along: FloatArray, wanted: FloatArray) -> IntArray:

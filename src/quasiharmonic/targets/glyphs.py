@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.targets.contours import distinct, filled, flatten, nested, signed_area
+from quasiharmonic.targets.contours import distinct, flatten, signed_area
+from quasiharmonic.targets.nesting import filled, nested
 
 FloatArray = NDArray[np.float64]
 
@@ -49,7 +50,11 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
     """
     if len(character) != 1:
         raise ValueError(f"an outline is made of one character, not of {character!r}")
-    contours = nested(_contours(character, font, tolerance))
+    found = _contours(character, font, tolerance)
+    try:
+        contours = nested(found)
+    except ValueError as error:
+        raise ValueError(f"the glyph of {character!r}: {error}") from error
     if not contours:
         raise ValueError(f"the glyph of {character!r} has no outline")
     return contours

@@ -18,12 +18,25 @@ IntArray = NDArray[np.int64]
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
 # How far from the outline a point may lie that is said to be on it, as a share of its larger side.
 _ON = 1e-6
+_MOST_LISTED = 12
 
 
 class Pins:
     """Boundary vertices with a place of their own, as the user names them.
 
-    Parameters are those of `boundary_to`.
+    Parameters
+    ----------
+    corners
+        As `boundary_to` takes them.
+    loops : list of (l,) int64
+    contours : list of (k, 2) float64
+        Divided by a power of two; each from its first corner on.
+    backwards : list of bool
+        Whether a contour runs against the one that the user gave.
+    corner_angle : float
+        Degrees.
+    exponent : int
+        Of that power.
 
     Attributes
     ----------
@@ -32,12 +45,21 @@ class Pins:
     """
 
     def __init__(
-        self, corners: Corners | None, loops: list[IntArray], contours: list[FloatArray], corner_angle: float
+        self,
+        corners: Corners | None,
+        loops: list[IntArray],
+        contours: list[FloatArray],
+        backwards: list[bool],
+        corner_angle: float,
+        exponent: int,
     ) -> None:
-        self.loops, self.contours = loops, contours
+        self.loops, self.contours, self.exponent = loops, contours, exponent
         self.sharp = [corners_of(c, corner_angle) for c in contours]
         # An outline without corners is entered by its first point.
         self.sharp = [marks if marks.size else np.zeros(1, dtype=np.int64) for marks in self.sharp]
+        # In the order that the user has them in, from the first.
+        turned = zip(self.sharp, backwards, strict=True)
+        self.sharp = [np.roll(marks[::-1], 1) if back else marks for marks, back in turned]
         self.contour_of: dict[int, int] = {}
         # For every loop the positions in it, and what they go to: a corner's number, or a place along the contour.
         self.wanted: dict[int, dict[int, int | float]] = {}
@@ -54,7 +76,7 @@ class Pins:
             if isinstance(goal, int | np.integer):
                 self.wanted.setdefault(loop, {})[position] = int(goal)
                 continue
-            contour, along = _nearest(np.asarray(goal, dtype=np.float64), contours, int(vertex))
+            contour, along = self._nearest(np.asarray(goal, dtype=np.float64), int(vertex))
             self.wanted.setdefault(loop, {})[position] = along
             if self.contour_of.setdefault(loop, contour) != contour:
                 raise ValueError(f"vertex {vertex} goes to another contour than others of its boundary loop")
@@ -83,7 +105,8 @@ class Pins:
         if self.all_corners and wanted and len(wanted) != len(marks):
             raise ValueError(
                 f"{len(wanted)} corner {'vertex' if len(wanted) == 1 else 'vertices'} for a contour with {len(marks)} "
-                f"{'corner' if len(marks) == 1 else 'corners'}: name one for each, or say which corner each goes to"
+                f"{'corner' if len(marks) == 1 else 'corners'} ({self._listed(contour)}): name one for each, or say "
+                "which corner each goes to"
             )
         names = self.loops[loop]
         found = []
@@ -92,7 +115,8 @@ class Pins:
                 if not 0 <= goal < len(marks):
                     last = len(marks) - 1
                     raise ValueError(
-                        f"vertex {names[position]} goes to corner {goal}, but the contour has corners 0 to {last}"
+                        f"vertex {names[position]} goes to corner {goal}, but the contour has corners 0 to {last}: "
+                        f"{self._listed(contour)}"
                     )
                 goal = float(t[marks[goal]])
             found.append((goal, position))
@@ -103,36 +127,47 @@ class Pins:
                 raise ValueError(f"vertices {names[one[1]]} and {names[other[1]]} go to the same place on the outline")
         if positions.size and (np.diff((positions - positions[0]) % len(names)) < 0).any():
             there = positions[np.argsort((positions - positions[0]) % len(names))]
+            against = (np.diff((positions[::-1] - positions[-1]) % len(names)) > 0).all()
+            remedy = ": name them the other way around" if against else ""
             raise ValueError(
                 f"corner vertices {', '.join(map(str, names[positions]))} follow each other in this order around the "
                 f"outline, but in the order {', '.join(map(str, names[there]))} along the boundary, which has the "
-                "surface to its left"
+                f"surface to its left{remedy}"
             )
         return list(zip(positions.tolist(), places, strict=True))
 
+    def _listed(self, contour: int) -> str:
+        """The corners of a contour with their numbers."""
+        points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
+        named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
+        return ", ".join(named[:_MOST_LISTED]) + (", …" if len(named) > _MOST_LISTED else "")
 
-def _nearest(point: FloatArray, contours: list[FloatArray], vertex: int) -> tuple[int, float]:
-    """The contour on which a point lies, and where along it."""
-    if point.shape != (2,) or not np.isfinite(point).all():
-        raise ValueError(f"vertex {vertex} goes to a corner's number or a point (x, y), not to {point.tolist()}")
-    least = _ON * float(np.ptp(contours[0], axis=0).max())
-    best = (np.inf, 0, 0.0)
-    for c, contour in enumerate(contours):
-        t = np.append(arc(contour), 1.0)
-        from_points = np.linalg.norm(contour - point, axis=1)
-        k = int(np.argmin(from_points))
-        if from_points[k] <= least:
-            # A corner that is meant is met exactly.
-            return c, float(t[k])
-        side = np.roll(contour, -1, axis=0) - contour
-        share = np.clip(((point - contour) * side).sum(axis=1) / (side**2).sum(axis=1), 0, 1)
-        away = np.linalg.norm(contour + share[:, None] * side - point, axis=1)
-        k = int(np.argmin(away))
-        best = min(best, (float(away[k]), c, float(t[k] + share[k] * (t[k + 1] - t[k])) % 1.0))
-    off, c, along = best
-    if off > least:
-        x, y = at(contours[c], np.array([along]))[0]
-        raise ValueError(
-            f"vertex {vertex} goes to ({point[0]:g}, {point[1]:g}), {off:.3g} off the outline at ({x:g}, {y:g})"
-        )
-    return c, along
+    def _nearest(self, point: FloatArray, vertex: int) -> tuple[int, float]:
+        """The contour on which a point lies, and where along it."""
+        if point.shape != (2,) or not np.isfinite(point).all():
+            raise ValueError(f"vertex {vertex} goes to a corner's number or a point (x, y), not to {point.tolist()}")
+        # A point far off a tiny outline must not overflow.
+        with np.errstate(over="ignore"):
+            near = np.clip(np.ldexp(point, -self.exponent), -1e9, 1e9)
+        least = _ON * float(np.ptp(self.contours[0], axis=0).max())
+        best = (np.inf, 0, 0.0)
+        for c, contour in enumerate(self.contours):
+            t = np.append(arc(contour), 1.0)
+            from_points = np.linalg.norm(contour - near, axis=1)
+            k = int(np.argmin(from_points))
+            if from_points[k] <= least:
+                # A corner that is meant is met exactly.
+                return c, float(t[k])
+            side = np.roll(contour, -1, axis=0) - contour
+            share = np.clip(((near - contour) * side).sum(axis=1) / (side**2).sum(axis=1), 0, 1)
+            away = np.linalg.norm(contour + share[:, None] * side - near, axis=1)
+            k = int(np.argmin(away))
+            best = min(best, (float(away[k]), c, float(t[k] + share[k] * (t[k + 1] - t[k])) % 1.0))
+        off, c, along = best
+        if off > least:
+            x, y = np.ldexp(at(self.contours[c], np.array([along]))[0], self.exponent)
+            raise ValueError(
+                f"vertex {vertex} goes to ({point[0]:g}, {point[1]:g}), {np.ldexp(off, self.exponent):.3g} off the "
+                f"outline at ({x:g}, {y:g})"
+            )
+        return c, along

@@ -7,9 +7,11 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.boundary_curves import listed
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import number, read_text
-from quasiharmonic.targets.contours import MOST_POINTS, distinct, nested, signed_area
+from quasiharmonic.targets.contours import MOST_POINTS, distinct
+from quasiharmonic.targets.nesting import arranged, collinear
 
 FloatArray = NDArray[np.float64]
 
@@ -27,14 +29,15 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area, outer ones counterclockwise and holes clockwise. Those that
-        run the right way begin with the file's first point.
+        The contours by decreasing area, each as it stands in the file, from its first point on, be it
+        counterclockwise or clockwise; `nested` winds them.
 
     Raises
     ------
     MeshFileError
         With the line, for anything but two numbers on it, for a contour of fewer than three points or
-        without area, for an empty file and for one of more than a million points.
+        without area, for an empty file and for one of more than a million points; as `nested` for
+        contours that meet themselves or each other.
     """
     loops: list[list[tuple[float, float]]] = [[]]
     starts, count = [0], 0
@@ -61,18 +64,23 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         count += 1
         if count > MOST_POINTS:
             raise MeshFileError(path, f"more than {MOST_POINTS:,} points", line, "thin them out")
-    contours = []
+    contours, begins = [], []
     for loop, start in zip(loops, starts, strict=True):
         if not loop:
             continue
         contour = distinct(np.array(loop), 0.0)
-        if len(contour) < 3 or signed_area(contour) == 0:
+        if len(contour) < 3 or collinear(contour):
             what = f"a contour of {len(contour)} different points that encloses no area begins"
             raise MeshFileError(path, what, start, "blank lines separate contours, and nothing else")
         contours.append(contour)
+        begins.append(start)
     if not contours:
         raise MeshFileError(path, "has no points")
-    return nested(contours)
+    try:
+        return [one.points for one in arranged(contours)]
+    except ValueError as error:
+        plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
+        raise MeshFileError(path, f"{error} (the {plural} {listed(begins)})") from None
 
 
 def _is_number(word: bytes) -> bool:

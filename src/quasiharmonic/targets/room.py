@@ -22,6 +22,9 @@ BoolArray = NDArray[np.bool_]
 
 # A bend to the left that is one, and not a straight line rounded; radians.
 _BEND = 1e-9
+# How far a vertex may be moved to a corner, as a share of the way around: beyond it the target is not the outline's
+# likeness to the surface any more, and splitting edges does less harm.
+FARTHEST = 0.2
 
 
 def make_room(
@@ -45,7 +48,8 @@ def make_room(
     -------
     list of (int, float) or None
         The pins and the chosen vertices with their corners, in order around; None if no choice makes
-        room for all chords. Chords across a pin are not looked at.
+        room for all chords, or only one that moves a vertex by more than a fifth of the way around.
+        Chords across a pin are not looked at.
     """
     t, bends = arc(contour), turns(contour)
     sharp = corners(contour, corner_angle)
@@ -55,7 +59,8 @@ def make_room(
         here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
         spare = _between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
         straight = _between(wanted, stretch.within(t, left)[1]) == 0
-        chosen = _choose(stretch.along, wanted, _Room(_reach(stretch, chords, len(s)), straight, spare))
+        room = _Room(_reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
+        chosen = _choose(stretch.along, wanted, room)
         if chosen is None:
             return None
         found.append((int(stretch.run[0]), stretch.begin))
@@ -75,11 +80,14 @@ class _Room:
         Whether each side, from one convex corner to the next, bends nowhere to the left.
     spare : (w + 1,) int64
         Vertices that it needs for other corners.
+    farthest : float
+        How far a vertex may be from the place it takes.
     """
 
     reach: IntArray
     straight: BoolArray
     spare: IntArray
+    farthest: float
 
 
 def _reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
@@ -114,7 +122,8 @@ def _choose(along: FloatArray, wanted: FloatArray, room: _Room) -> IntArray | No
         low = np.searchsorted(room.reach, vertex, side="right") if room.straight[j] else np.zeros(count + 1, np.int64)
         best = _least(cost[j], low, vertex - room.spare[j])
         if j < len(wanted):
-            best += (along - wanted[j]) ** 2
+            away = np.abs(along - wanted[j])
+            best += np.where(away <= room.farthest, away**2, np.inf)
             best[count] = np.inf
         cost.append(best)
     if not np.isfinite(cost[-1][count]):

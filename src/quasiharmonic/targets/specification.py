@@ -45,7 +45,8 @@ def outline(
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area, outer ones counterclockwise and holes clockwise.
+        The contours by decreasing area. Those of files run as they stand there; of the others the outer
+        ones run counterclockwise and holes clockwise.
 
     Raises
     ------

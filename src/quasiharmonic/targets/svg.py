@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import read_text
-from quasiharmonic.targets.contours import MOST_POINTS, Pieces, flatten, nested, signed_area
+from quasiharmonic.targets.contours import MOST_POINTS, Pieces, as_complex, flatten
+from quasiharmonic.targets.nesting import arranged
 from quasiharmonic.targets.svgpath import parse_path
 
 FloatArray = NDArray[np.float64]
@@ -37,6 +38,10 @@ _FOREIGN = {
 _LENGTH = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([a-z%]*)\s*", re.IGNORECASE)
 _UNITS = {"": 1.0, "px": 1.0, "in": 96.0, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 96 / 72, "pc": 16.0}
 _TRANSFORM = re.compile(r"[\s,]*([a-zA-Z]+)\s*\(([^()]*)\)[\s,]*")
+# What a style may say that an attribute of the same name would have to: it is not read there, and not passed over.
+_SHAPING = re.compile(
+    r"(?:^|[;{\s])\s*(transform(?:-origin)?|translate|rotate|scale|offset-path|d|[cr]?[xy]|r)\s*:", re.IGNORECASE
+)
 _HIDDEN = re.compile(r"(?:^|;)\s*display\s*:\s*none\s*(?:;|!|$)")
 
 
@@ -55,15 +60,17 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area, outer ones counterclockwise and holes clockwise, in the units
-        of the file with the y-axis turned upwards, so that the outline looks as the drawing does.
+        The contours by decreasing area, in the units of the file with the y-axis turned upwards, so
+        that the outline looks as the drawing does. Each runs as it is drawn, from its first point on,
+        be it counterclockwise or clockwise; `nested` winds them.
 
     Raises
     ------
     MeshFileError
         With the line, when the file is no SVG drawing, breaks its rules, declares entities, has text or
-        clones, which are not outlines, is larger than 64 MiB, nested more than 200 deep, or draws
-        nothing that encloses an area.
+        clones, which are not outlines, or style sheets that move or shape what is drawn, is larger than
+        64 MiB, nested more than 200 deep, or draws nothing that encloses an area; as `nested` for
+        contours that meet themselves or each other.
     ValueError
         When the tolerance is out of range.
     """
@@ -84,13 +91,22 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     try:
         for pieces in subpaths if size > 1 / _LARGEST else []:
             contour = flatten(pieces, tolerance * size)
-            if len(contour) > 2 and abs(signed_area(contour)) > (tolerance * size) ** 2:
+            if len(contour) > 2 and _breadth(contour) > (tolerance * size) ** 2:
                 contours.append(contour)
     except ValueError as error:
         raise MeshFileError(path, str(error)) from None
     if not contours:
         raise MeshFileError(path, "draws nothing that encloses an area")
-    return nested(contours)
+    try:
+        return [one.points for one in arranged(contours)]
+    except ValueError as error:
+        raise MeshFileError(path, f"{error} (in units of the drawing, the y-axis upwards)") from None
+
+
+def _breadth(contour: FloatArray) -> float:
+    """Area of the triangles that a contour's sides span with its first point: 0 only if all lies on one line."""
+    w = as_complex(contour - contour[0])
+    return float(np.abs((w.conj() * np.roll(w, -1)).imag).sum()) / 2
 
 
 class _Drawing:
@@ -109,6 +125,9 @@ class _Drawing:
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
         self.parser.EntityDeclHandler = self._entity
+        self.parser.CharacterDataHandler = self._text
+        # The text of the style sheet that is being read.
+        self.sheet: list[str] | None = None
 
     def read(self, data: bytes) -> list[Pieces]:
         try:
@@ -124,13 +143,25 @@ class _Drawing:
     def _entity(self, name: str, *_: object) -> None:
         raise self._error(f"declares the entity {name[:40]!a}, and entities are not read", "save it as plain SVG")
 
+    def _text(self, text: str) -> None:
+        if self.sheet is not None:
+            self.sheet.append(text)
+
+    def _check_style(self, tag: str, style: str) -> None:
+        if found := _SHAPING.search(style):
+            remedy = "write it as an attribute, or apply the transform to the paths in a drawing program"
+            raise self._error(f"<{tag}>: {found.group(1)!r} in a style is not read", remedy)
+
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self.depth += 1
         if self.depth > _DEEPEST:
             raise self._error(f"elements nested more than {_DEEPEST} deep")
+        namespace, _, tag = name.rpartition(" ")
+        if tag == "style" and namespace in ("", _SVG):
+            # Wherever it stands, be it among definitions that draw nothing.
+            self.sheet = []
         if self.skipped:
             return
-        namespace, _, tag = name.rpartition(" ")
         if self.depth == 1 and (tag != "svg" or namespace not in ("", _SVG)):
             raise self._error(f"is not an SVG drawing: the root element is {tag[:40]!a}")
         hidden = attributes.get("display") == "none" or _HIDDEN.search(attributes.get("style", ""))
@@ -139,6 +170,9 @@ class _Drawing:
             return
         if tag in _FOREIGN:
             raise self._error(f"a <{tag}> has no outline that could be read", _FOREIGN[tag])
+        self._check_style(tag, attributes.get("style", ""))
+        if "transform" in attributes and "transform-origin" in attributes:
+            raise self._error(f"<{tag}>: transform-origin is not read", "apply the transform in a drawing program")
         try:
             transform = self.transforms[-1] @ _transform(attributes.get("transform", ""))
             if tag == "svg" and self.depth > 1:
@@ -155,6 +189,9 @@ class _Drawing:
             raise self._error(f"<{tag}>: {error}") from None
 
     def _end(self, name: str) -> None:
+        if self.sheet is not None:
+            sheet, self.sheet = "".join(self.sheet), None
+            self._check_style("style", sheet)
         if self.skipped == self.depth:
             self.skipped = 0
         elif not self.skipped:
