@@ -30,10 +30,12 @@ import numpy as np
 
 from problems import FAMILIES, Case, make, parse
 from quasiharmonic import Problem, solve
+from quasiharmonic.strategy import STRATEGIES
 
 Record = dict[str, Any]
 
 BANDS = 5
+_DEFAULTS = {"strategy": "speed", "max_iterations": 2000}
 # Outcomes that are failures whether or not a solution is known to exist.
 _ALWAYS = "exception", "warning", "not finite", "crash", "timeout"
 
@@ -50,7 +52,8 @@ def names(count: int, families: Sequence[str]) -> Iterator[str]:
 def run(name: str, *, strategy: str = "speed", max_iterations: int = 2000) -> Record:
     """Make and solve one problem; never raises but for what ends the process."""
     family, seed, difficulty = parse(name)
-    record: Record = {"name": name, "strategy": strategy, "family": family, "difficulty": difficulty}
+    record: Record = {"name": name, "family": family, "difficulty": difficulty}
+    record |= {"strategy": strategy, "max_iterations": max_iterations}
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
@@ -141,7 +144,7 @@ class _Worker:
         self.stop()
         self._start()
         family, _, difficulty = parse(self.name)
-        record = {"name": self.name, "strategy": self.options["strategy"], "family": family, "difficulty": difficulty}
+        record = {"name": self.name, "family": family, "difficulty": difficulty, **self.options}
         return record | {"outcome": outcome, "message": message}
 
     def stop(self) -> None:
@@ -167,8 +170,13 @@ def campaign(
     **options
         As `run` takes them.
     """
-    options = {"strategy": "speed"} | options
-    done = {record["name"] for record in read(output)}
+    options = _DEFAULTS | options
+    # What was solved in another way is not done in this one.
+    done = {
+        record["name"]
+        for record in read(output)
+        if all(record.get(key, default) == options[key] for key, default in _DEFAULTS.items())
+    }
     left = [name for name in todo if name not in done][::-1]
     workers = [_Worker(limit, options) for _ in range(min(processes, len(left)))]
     try:
@@ -219,12 +227,14 @@ def summary(records: Sequence[Record]) -> str:
     groups: dict[str, list[Record]] = defaultdict(list)
     for record in records:
         groups[record["family"]].append(record)
-    feasible = [r for r in records if r.get("feasible")]
+    # What crashed or ran out of time could not say so itself, but a family is feasible as a whole.
+    solvable = {r["family"] for r in records if r.get("feasible")}
+    feasible = [r for r in records if r["family"] in solvable]
     for family in [f for f in FAMILIES if f in groups]:
-        lines.append(_row(family + ("" if any(r.get("feasible") for r in groups[family]) else " ?"), groups[family]))
+        lines.append(_row(family + ("" if family in solvable else " ?"), groups[family]))
     lines += [
         _row("feasible", feasible),
-        _row("  simple", [r for r in feasible if r["simple"]]),
+        _row("  simple", [r for r in feasible if r.get("simple")]),
         "",
         "?: nobody knows which of these have a solution.",
         "",
@@ -241,7 +251,12 @@ def summary(records: Sequence[Record]) -> str:
         f"{len(failures)} failures among {len(records)} problems, {len(feasible)} of them known to be feasible"
     )
     for r in failures:
-        lines.append(f"  python benchmarks/campaign.py --case {r['name']} --strategy {r['strategy']}  # {_story(r)}")
+        changed = "".join(
+            f" --{key.replace('_', '-')} {r[key]}"
+            for key, default in _DEFAULTS.items()
+            if r.get(key, default) != default
+        )
+        lines.append(f"  python benchmarks/campaign.py --case {r['name']}{changed}  # {_story(r)}")
     return "\n".join(lines)
 
 
@@ -295,7 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-n", "--count", type=int, default=1000, help="problems of the campaign (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("results.jsonl"), help="records (%(default)s)")
     parser.add_argument("--families", default=",".join(FAMILIES), help="separated by commas (all)")
-    parser.add_argument("--strategy", default="speed", help="speed or quality (%(default)s)")
+    parser.add_argument("--strategy", choices=STRATEGIES, default="speed", help="%(choices)s (%(default)s)")
     parser.add_argument("--max-iterations", type=int, default=2000, help="linear solves a problem (%(default)s)")
     parser.add_argument("-j", "--processes", type=int, default=1, help="problems at a time (%(default)s)")
     parser.add_argument("--limit", type=float, default=120.0, help="seconds a problem (%(default)s)")
@@ -306,6 +321,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [family for family in families if family not in FAMILIES]
     if unknown:
         parser.error(f"no family {', '.join(unknown)}; there are {', '.join(FAMILIES)}")
+    for name in options.case or ():
+        try:
+            parse(name)
+        except ValueError as error:
+            parser.error(f"--case {name}: {error}")
+    if options.summary and not options.summary.exists():
+        parser.error(f"there is no file {options.summary}")
 
     if options.summary:
         records = read(options.summary)

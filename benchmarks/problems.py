@@ -85,7 +85,10 @@ def parse(name: str) -> tuple[str, int, float]:
     ValueError
         When it names no problem.
     """
-    family, seed, difficulty = name.split(":")
+    try:
+        family, seed, difficulty = name.split(":")
+    except ValueError:
+        raise ValueError(f"{name!r} is no name of a problem, such as maze:7:0.8") from None
     if family not in FAMILIES:
         raise ValueError(f"there is no family {family!r}; there are {', '.join(FAMILIES)}")
     return family, int(seed), float(difficulty)

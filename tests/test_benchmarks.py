@@ -92,6 +92,11 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
     assert [record["name"] for record in rest] == todo[1:]
     assert [record["name"] for record in campaign.read(output)] == todo
     assert list(campaign.campaign(todo, output)) == []
+    # In another way they are not done, and a failure says which way that was.
+    (other,) = campaign.campaign(todo[:1], output, limit=60, max_iterations=1, strategy="quality")
+    again = campaign.summary([other | {"outcome": "exception", "message": "lost"}])
+    assert f"--case {todo[0]} --strategy quality --max-iterations 1 " in again
+    output.write_text("".join(output.read_text().splitlines(keepends=True)[:-1]))
 
     campaign.main(["--summary", str(output)])
     text = capsys.readouterr().out
@@ -177,6 +182,37 @@ def test_loops_drift_as_rigid_bodies():
         carried.append(abs(after.mean() - before.mean()))
     assert max(turned) > 0.01
     assert max(carried) > 1e-3
+
+
+def test_a_timeout_is_no_success_of_the_feasible_families():
+    solved = {"name": "jam:0:0.5", "strategy": "speed", "family": "jam", "difficulty": 0.5, "feasible": True,
+              "simple": True, "outcome": "injective", "stages": [("vector-adam, tanh", 1, 5, 0, 0.1)],
+              "iterations": 3, "seconds": 0.1}  # fmt: skip
+    late = {"name": "jam:1:0.5", "strategy": "speed", "family": "jam", "difficulty": 0.5,
+            "outcome": "timeout", "message": "over 9 s"}  # fmt: skip
+    text = campaign.summary([solved, late])
+    assert next(line for line in text.splitlines() if line.startswith("feasible ")).split()[6] == "1/2"
+    assert "1 failures among 2 problems, 2 of them known to be feasible" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--strategy", "fast"], "invalid choice"),
+        (["--case", "bogus:1:0.5"], "no family 'bogus'"),
+        (["--case", "maze:1"], "no name of a problem"),
+        (["--summary", "nowhere.jsonl"], "no file nowhere.jsonl"),
+        (["--families", "maze,bogus"], "no family bogus"),
+    ],
+)
+def test_wrong_calls_of_a_campaign_are_refused(arguments, message, tmp_path, monkeypatch, capsys):
+    """Before ten thousand records say so one by one."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        campaign.main(arguments)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_summary_counts_what_each_fallback_adds():

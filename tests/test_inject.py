@@ -12,9 +12,11 @@ import pytest
 import quasiharmonic
 import quasiharmonic.linsolve
 from meshes import bend, boundary_of, lift, signed_areas
+from obstructed import OBSTRUCTED
 from quasiharmonic import Descent, Problem, Status, injective_map, quasi_harmonic_map, solve
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.optimize.untangling import _Descent, untangled
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 
 
@@ -299,6 +301,73 @@ class TestNoMap:
     def test_a_strategy_of_ones_own_that_ends_early_has_not_settled(self):
         result = injective_map(*turned_ring(180), strategy=[Descent(iterations=3)])
         assert result.status is Status.OUT_OF_ITERATIONS
+
+    @pytest.mark.parametrize(
+        ("start", "words"),
+        [
+            ("here", "start must hold real numbers"),
+            (np.zeros((80, 2), dtype=complex), "start must hold real numbers"),
+            ([[0.0], [1.0, 2.0]], "start is not an array"),
+            (np.zeros((80, 3)), r"start must have shape \(80, 2\)"),
+            (np.full((80, 2), np.inf), "start is not finite at vertices 0, 1"),
+        ],
+    )
+    def test_wrong_start(self, start, words):
+        with pytest.raises(ValueError, match=words):
+            injective_map(*star_problem(n=80), start=start)
+
+    @pytest.mark.parametrize("size", [1e-320, 1e-200, 1e200, 1e308])
+    def test_start_of_any_size(self, size, rng):
+        """Only its shape counts."""
+        problem = Problem(*star_problem(n=80))
+        far = size * rng.uniform(-1, 1, (problem.n, 2))
+        assert solve(problem, start=far).injective
+
+    @pytest.mark.parametrize("optimizer", ["vector-adam", "l-bfgs", "newton", "untangling", "patches", "shaking"])
+    def test_no_method_takes_more_iterations_than_it_may(self, optimizer):
+        V, F = disk(12)
+        (loop,) = boundary_loops(F, len(V))
+        t = 2 * np.pi * np.arange(len(loop)) / len(loop)
+        bean = (1 + 0.95 * np.cos(3 * t))[:, None] * np.stack([np.cos(t), np.sin(t)], axis=1)
+        problem = Problem(V, F, loop, bean)
+        assert len(solve(problem, max_iterations=1).certificate.flipped) > 50, "too few for shaking to untangle first"
+        for most in (1, 3):
+            result = solve(problem, strategy=[Descent(optimizer)], max_iterations=most)
+            assert result.iterations <= most
+
+    def test_l_bfgs_keeps_to_its_iterations_within_a_line_search(self):
+        """Where nothing lowers the energy any more, line searches are long."""
+        problem, _ = OBSTRUCTED["chord over a notch"]
+        for most in range(20, 60, 5):
+            result = solve(problem, strategy=[Descent("l-bfgs", iterations=most)])
+            assert result.stages[0].iterations <= most
+
+    def test_untangling_gives_up_on_what_is_exactly_a_point(self, monkeypatch):
+        """There is no ε far below a determinant of zero."""
+        V, F = grid(4, 4)
+        inner = next(t for t in F if not np.isin(t, boundary_of(F)).any())
+        w = V[:, :2].ravel().view(np.complex128).copy()
+        w[inner] = 0.5 + 0.5j
+        held = np.append(boundary_of(F), inner)
+        steps = []
+        step = _Descent.step
+
+        def counted(descent, before):
+            steps.append(before)
+            assert len(steps) < 2000, "it does not end"
+            return step(descent, before)
+
+        monkeypatch.setattr(_Descent, "step", counted)
+        assert len(list(untangled(F, w, held, grading=0.0))) < 2000
+
+    def test_untangling_that_is_cut_short_has_not_settled(self):
+        result = injective_map(*turned_ring(180), strategy=[Descent("untangling", iterations=2)])
+        assert result.status is Status.OUT_OF_ITERATIONS
+
+    def test_stages_for_a_coarse_mesh_alone_solve_a_small_one_as_it_is(self):
+        result = injective_map(*star_problem(n=80), strategy=[Descent("coarse-to-fine")])
+        assert result.injective
+        assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"]
 
     def test_a_stage_resumes_where_the_energy_was_lowest(self):
         """Not at ξ = 0, and not at the last iterate."""

@@ -15,13 +15,14 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import check_finite, real_array
 from quasiharmonic.certificate import certify
 from quasiharmonic.energies import Energy
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.mesh.topology import named
 from quasiharmonic.objective import Objective
 from quasiharmonic.polishing import energy_named, polished
-from quasiharmonic.problem import Problem
+from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search import Search
 from quasiharmonic.strategy import Descent, stages_of, whole_number
@@ -208,11 +209,9 @@ def quasi_harmonic_map(
 
 
 def _first_map(problem: Problem, start: ArrayLike) -> ComplexArray:
-    """The caller's first map, checked, as complex numbers in the problem's frame."""
-    uv = np.array(start, dtype=np.float64, order="C")
+    """The caller's first map, checked, as complex numbers in a frame of its own: only its tensors count."""
+    uv = real_array("start", start)
     if uv.shape != (problem.n, 2):
         raise ValueError(f"start must have shape ({problem.n}, 2), a place for every vertex, not {uv.shape}")
-    bad = np.flatnonzero(~np.isfinite(uv).all(axis=1))
-    if bad.size:
-        raise ValueError(f"start is not finite at {named('vertex', 'vertices', bad)}")
-    return problem.frame.inward(uv)
+    check_finite("start", "vertex", "vertices", uv)
+    return Frame(uv).inward(uv)

@@ -69,7 +69,7 @@ class Search:
     record : int
         Keep every so many-th map in ``path``; none for 0.
     first : (n,) complex128, optional
-        A map in the problem's frame to begin with.
+        A map to begin with, of any size and anywhere.
 
     Attributes
     ----------
@@ -118,7 +118,8 @@ class Search:
         """Run stages until one finds an injective map; why the search ended."""
         status = Status.OUT_OF_ITERATIONS
         try:
-            here = [stage for stage in given if stage.optimizer != "coarse-to-fine"] or [Descent()]
+            plain = replace(given[0], optimizer="vector-adam")
+            here = [stage for stage in given if stage.optimizer != "coarse-to-fine"] or [plain]
             if not self.problem.encloses_area:
                 self._descend(replace(here[0], iterations=1))
                 self._examine()
@@ -143,6 +144,11 @@ class Search:
                 # What is tried after the first stage takes long, and is pointless where there is a reason.
                 if self._left <= 0 or (number == 0 and self._examine().forbids_injective):
                     break
+            if number == -1 and self.best_field is None and self._left > 0:
+                # Stages for a coarse mesh alone, and none was to be had or it led to nothing.
+                status = self._descend(here[0])
+                if status is Status.INJECTIVE:
+                    return status
             if self._examine().forbids_injective:
                 self._sink()
                 return Status.IMPOSSIBLE
@@ -229,9 +235,10 @@ class Search:
             self._visit(start)
             begun, allowed = len(self.history), min(stage.iterations, self._left)
             _METHODS[stage.optimizer](objective, start, self._visit, stage, allowed)
-            # A method that returns before its iterations are spent has nothing left to do.
+            # A method that returns before its iterations are spent has nothing left to do. Those of local repair are
+            # tries, of which it has made enough.
             spent = len(self.history) - begun >= allowed
-            ended = (spent or stage.optimizer == "newton") and not stage.moves_vertices
+            ended = (spent or stage.optimizer == "newton") and stage.optimizer not in ("patches", "shaking")
             status = Status.OUT_OF_ITERATIONS if ended or self._left <= 0 else Status.SETTLED
         except Stop as stop:
             status = stop.status
@@ -288,6 +295,8 @@ class Search:
             self.deepest = here
         if flipped == 0:
             raise Stop(Status.INJECTIVE)
+        if self._left <= 0:
+            raise Stop(Status.OUT_OF_ITERATIONS)
         flips, energy = self._mark
         if flipped < flips or step.energy < (1 - self._progress) * energy:
             self._mark = min(flipped, flips), min(step.energy, energy)

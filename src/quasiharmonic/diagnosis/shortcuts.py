@@ -94,6 +94,8 @@ class Shortcuts:
             # what a vertex sees of its neighbours has been looked at without this.
             far = (np.minimum((i - j) % n, (j - i) % n) > k) & (k > 2)
             i, j = i[far], j[far]
+            if not i.size:
+                continue
             hidden = ~self._within(i, j, k)
             for a, b in zip(i[hidden].tolist(), j[hidden].tolist(), strict=True):
                 if self._polygon.work > budget:
@@ -144,8 +146,8 @@ class Shortcuts:
     def _obstruction(self, a: int, b: int, k: int) -> Obstruction:
         ends = self._loop[[a, b]]
         message = (
-            f"The boundary {named_vertices(ends)} are {k} edges apart, and inside the target it takes "
-            f"more than {k} segments from one to the other."
+            f"A path of {k} edges inside the mesh joins the boundary {named_vertices(ends)}, and inside the target "
+            f"it takes more than {k} segments from one to the other."
         )
         path = self._paths(a, b, k)
         return Obstruction(Kind.LINK_DISTANCE, Forbids.INJECTIVE, message, vertices=ends, edges=path, split=path)

@@ -19,6 +19,7 @@ from .base import Floats, Ints, LinearSolver, NotPositiveDefinite
 _ANALYSE, _FACTOR, _SOLVE, _FORWARD_ONLY, _RELEASE = 11, 22, 33, 331, -1
 _MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3
 _CLASSIC_TWO_LEVEL, _IMPROVED_TWO_LEVEL = 1, 10
+_INTEL_THREADS = 0
 
 # Below this many unknowns: minimum degree ordering, one thread. Above: dissection, all threads. At 10k METIS takes
 # three times as long to order (25 against 10 ms), and what it then saves, in parallel factorisation, is 1 ms of 4.
@@ -187,6 +188,8 @@ def load_mkl() -> ctypes.CDLL:
     # The environment or another package may already have switched MKL to 64-bit integers, for the whole process.
     if layer & 1:
         raise ImportError("MKL is set to 64-bit integers (ILP64) in this process; PARDISO is called with 32-bit ones")
+    # Left to itself MKL takes GNU's threads once another package, such as gmsh, has loaded them, and PARDISO crashes.
+    library.MKL_Set_Threading_Layer(_INTEL_THREADS)
     library.pardiso.restype = None
     return library
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,16 +38,19 @@ def lbfgs(
 
     # The objective's own scale is that of the target's area; SciPy's first step is of the gradient's length.
     scale = 1.0 / abs(start.value) if start.value else 1.0
-    known = start
+    known, left = start, iterations
 
     def evaluate(x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """The objective after ξ is clipped to its bound, which no path that leads anywhere reaches."""
-        nonlocal known
+        nonlocal known, left
         xi = x.view(np.complex128)
         inside = objective.bounded(xi)
         if not np.array_equal(inside, known.xi):
             known = objective.evaluate(inside.copy())
             visit(known)
+            left -= 1
+            if left <= 0:
+                raise _Spent
         gradient = known.gradient
         if inside is not xi:
             # Beyond the bound only the direction of ξ counts.
@@ -57,10 +61,16 @@ def lbfgs(
             gradient[beyond] *= np.abs(inside[beyond]) / np.abs(xi[beyond])
         return scale * known.value, scale * gradient.view(np.float64)
 
-    minimize(
-        evaluate,
-        start.xi.view(np.float64),
-        jac=True,
-        method="L-BFGS-B",
-        options={"maxiter": iterations, "maxfun": iterations, "maxcor": 10, "ftol": 0.0, "gtol": 0.0},
-    )
+    # SciPy looks at its own limits only between one line search and the next.
+    with suppress(_Spent):
+        minimize(
+            evaluate,
+            start.xi.view(np.float64),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": iterations, "maxfun": iterations, "maxcor": 10, "ftol": 0.0, "gtol": 0.0},
+        )
+
+
+class _Spent(Exception):  # noqa: N818 - a signal, not an error
+    """As many evaluations as were allowed are done."""

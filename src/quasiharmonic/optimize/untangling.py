@@ -45,6 +45,8 @@ _LAMBDA = 1e-4
 _FIRST, _STEPS, _WORTHWHILE = 0.2, 20, 1e-3
 # With ε this far below the least determinant hardly a triangle has ever been righted.
 _HOPELESS = 5e-3
+# Determinants below are those of triangles as small as positions are rounded; one of zero has no ε below it.
+_FLAT = 1e-30
 # Smallest reference triangle, relative to the largest: their areas must stay within the numbers' range.
 _SMALLEST = 1e-100
 # Raised diagonals, one after the other until a factorisation exists.
@@ -157,7 +159,7 @@ def untangled(
         descent = _Descent(F, w, held, sizes, linear_solver)
     least = descent.least
     descent.energy.epsilon = np.hypot(1e-9, _FIRST * least)
-    while not least > 0 and descent.energy.epsilon > _HOPELESS * abs(least):
+    while not least > 0 and descent.energy.epsilon > _HOPELESS * max(abs(least), _FLAT):
         before = descent.value()
         for _ in range(_STEPS):
             with np.errstate(all="ignore"):
