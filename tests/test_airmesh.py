@@ -132,8 +132,8 @@ def test_thin_air_is_raised_to_the_gap():
         (lambda V, F, frame: (V, F[:0], frame), "f > 0"),
         (lambda V, F, frame: (np.concatenate([V, [[0, 0]]]), F, frame), "in no triangle"),
         (lambda V, F, frame: (V, F[:, ::-1], frame), "not counterclockwise"),
-        (lambda V, F, frame: (V, F, [square(1)]), "must not meet|not inside"),
-        (lambda V, F, frame: (V, F, [square(4), square(1, 1)]), "must not meet"),
+        (lambda V, F, frame: (V, F, [square(1)]), "and the container meet at|not inside"),
+        (lambda V, F, frame: (V, F, [square(4), square(1, 1)]), "and obstacle 0 meet at"),
         (lambda V, F, frame: (V, F, [square(4), square(1, 9)]), "not inside"),
         (lambda V, F, frame: (V, F, [square(4) * np.nan]), "not finite"),
         (lambda V, F, frame: (V, F, []), "loops"),
@@ -143,6 +143,36 @@ def test_wrong_input(change, message):
     V, F = surfaces.disk(2)
     with pytest.raises(ValueError, match=message):
         AirMesh(*change(V, F, [square(4)]))
+
+
+@pytest.mark.parametrize(
+    ("offset", "obstacle", "names"),
+    [
+        ((1, 1), (3, 3), "vertex 0 and the shape's boundary through vertex 4 meet at \\(1, 1\\)"),
+        ((1, 0.5), (3, 3), "vertex 0 and the shape's boundary through vertex 4 meet at \\(1, 0.5\\)"),
+        ((2, 0), (1, 1), "vertex 0 and obstacle 0 meet at \\(1, 1\\)"),
+        ((4, 0), (3, 3), "vertex 4 and the container meet at \\(5, "),
+        ((2, 0), (4, 4), "the container and obstacle 0 meet at \\(5, "),
+    ],
+)
+def test_what_touches_at_a_vertex_is_refused_by_name(offset, obstacle, names):
+    box = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    F = np.array([[0, 1, 2], [0, 2, 3]])
+    container = 10 * box - 5
+    with pytest.raises(ValueError, match=names):
+        AirMesh(np.concatenate([box, box + offset]), np.concatenate([F, F + 4]), [container, box + obstacle])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_frame_that_cannot_be_is_told_in_one_way(seed):
+    rng = np.random.default_rng(seed)
+    box = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    air = AirMesh(box, [[0, 1, 2], [0, 2, 3]], [10 * box - 5, box + 2])
+    before = air.moment
+    wild = [10 * box - 5, box[::-1] + 2, 11 * box - 5.5, (box - 0.5) * (-1, 1) + rng.normal(size=2), box * 0 + 3]
+    with pytest.raises(RuntimeError, match="of the way only"):
+        air.advance([10 * box - 5 + 9 * (seed == 0), wild[seed] if seed < 5 else rng.normal(size=(4, 2))])
+    assert air.moment is before
 
 
 @pytest.mark.parametrize("options", [{"gap": 0}, {"gap": np.nan}, {"air_weight": 0}, {"air_weight": 2}])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from meshes import bend, lift, random_annulus, signed_areas, surfaces
-from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints
+from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints, distortion
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.nested_grid import NestedGrid
 from quasiharmonic.predicates import twice_area
@@ -117,6 +117,17 @@ def test_identity(name, V, F, rng):
     # And the other way round.
     places = inverse.plane(at)
     np.testing.assert_allclose(inverse.plane(inverse.locate(places)), places, rtol=0, atol=1e-15)
+
+
+def test_error_is_what_the_map_makes_of_rounding(rng):
+    V, F = random_delaunay(3000, seed=4)
+    for uv in (V * np.hypot(*V.T)[:, None] ** 5, V * [1, 1e-7] + [3, 0], bend(V)):
+        inverse = InverseMap(V, F, uv)
+        start = SurfacePoints(rng.integers(len(F), size=20_000), rng.dirichlet((1, 1, 1), 20_000))
+        back = inverse.surface(inverse.locate(inverse.plane(start)))
+        error = np.linalg.norm(back - inverse.surface(start), axis=1)
+        shrunk = distortion(V, F, uv).sigma2[start.triangle]
+        assert (error <= 10 * 2.0**-53 * (np.abs(uv).max() / shrunk + 1)).all()
 
 
 def test_graded_over_twelve_orders_of_magnitude(rng):
@@ -278,6 +289,8 @@ def test_bad_input_is_named():
         inverse.values(at, V, per="face")
     with pytest.raises(ValueError, match="there is no triangle 54: they are 0 … 53"):
         inverse.surface(SurfacePoints(np.array([3, 54]), np.full((2, 3), 1 / 3)))
+    with pytest.raises(ValueError, match="there is no triangle 54: they are 0 … 53"):
+        inverse.plane(SurfacePoints(np.array([3, 54]), np.full((2, 3), 1 / 3)))
     with pytest.raises(ValueError, match="a planar surface has no normals"):
         inverse.normals(at)
     with pytest.raises(ValueError, match="at least 2 points along each axis, not 1 by 5"):

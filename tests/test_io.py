@@ -484,6 +484,18 @@ def test_map_with_seams_is_refused_by_vertex(put):
     uv, seam = io.vertex_places(seams)
     assert seam.tolist() == [True, False, True, False]
     assert uv[[1, 3]].tolist() == [[2, 0], [0, 2]]
+    V, F, places = io.cut_at_seams(seams)
+    assert F.tolist() == [[0, 1, 2], [4, 5, 3]]
+    assert np.array_equal(V, seams.V[[0, 1, 2, 3, 0, 2]])
+    assert np.array_equal(places[F], seams.vt[seams.FT])
+
+
+def test_rounding_in_z_leaves_a_mesh_planar(put):
+    mesh = io.read_mesh(put(SQUARE.replace("v 1 1 0", "v 1 1 1e-17") + "f 1 2 3\nf 1 3 4\n"))
+    assert (mesh.V[:, 2] != 0).any()
+    assert np.array_equal(io.map_of(mesh), mesh.V[:, :2])
+    with pytest.raises(MeshFileError, match="is not planar"):
+        io.map_of(io.read_mesh(put(SQUARE.replace("v 1 1 0", "v 1 1 1e-3") + "f 1 2 3\nf 1 3 4\n")))
 
 
 def test_map_of_only_some_faces_is_refused(put):

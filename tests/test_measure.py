@@ -154,3 +154,15 @@ def test_outputs_that_cannot_be(stretched, tmp_path, monkeypatch, capsys, argume
     assert main([*arguments, "map.obj"]) == 2
     assert message in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["map.obj"]
+
+
+def test_vertices_of_no_triangle_have_no_place(stretched, tmp_path):
+    path, V, F, uv = stretched
+    spaced = np.concatenate([[[9, 9]], V])
+    io.write_obj(path, io.MeshData(spaced, F + 1, vt=uv, FT=F))
+    assert main(["check", str(path)]) == 0
+    assert main(["measure", str(path), "--export", str(tmp_path / "faces.npz")]) == 0
+    with np.load(tmp_path / "faces.npz") as file:
+        assert file["mips"] == pytest.approx(distortion(V, F, uv).mips)
+    for kind in ("map", "texture"):
+        assert main(["plot", str(path), "-o", str(tmp_path / f"{kind}.png"), "--kind", kind]) == 0

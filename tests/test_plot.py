@@ -12,7 +12,7 @@ import pytest
 from matplotlib.image import imread
 from PIL import Image
 
-from quasiharmonic import surfaces
+from quasiharmonic import flipped_triangles, surfaces
 from quasiharmonic.measures import MEASURES
 from quasiharmonic.plot import (
     interactive,
@@ -25,7 +25,7 @@ from quasiharmonic.plot import (
     save_map_figure,
     save_texture_figure,
 )
-from quasiharmonic.plot.canvas import new_figure
+from quasiharmonic.plot.canvas import RED, new_figure
 from quasiharmonic.plot.distortion import LABELS
 from quasiharmonic.plot.shading import view
 from quasiharmonic.targets.correspondence import upright
@@ -224,6 +224,20 @@ def test_distortion_histogram_has_all_the_area(planar):
     assert max(heights) == pytest.approx(100)
 
 
+@pytest.mark.parametrize("measure", LABELS)
+def test_colours_can_be_read_off(planar, measure):
+    """Five values beside the bar, those of the histogram; open where there may be values beyond."""
+    V, F, _ = planar
+    figure = plot_distortion(V, F, np.column_stack([V[:, 0] ** 2 + V[:, 0], 1e-3 * V[:, 1]]), measure)
+    figure.canvas.draw()
+    bars, bar = figure.axes[2:]
+    names = [label.get_text() for label in bar.get_yticklabels()]
+    assert names == [label.get_text() for label in bars.get_xticklabels()]
+    assert len(names) == 5
+    ends = "both" if measure in ("sigma1", "sigma2", "area_ratio") else "max"
+    assert bar._colorbar.extend == ends
+
+
 def test_distortion_of_flat_triangles_and_of_no_value():
     V, F = np.array([[0, 0], [1, 0], [2, 0], [0, 1.0]]), np.array([[0, 1, 2], [0, 1, 3]])
     uv = np.array([[0, 0], [1, 0], [2, 0.5], [0, 1.0]])
@@ -301,7 +315,35 @@ def test_animation_says_what_is_wrong(planar, tmp_path):
         save_animation(
             tmp_path / "a.gif", V, F, [("first", V), ("second", np.where(np.arange(len(V))[:, None] == 3, np.nan, V))]
         )
+    for rows, message in ((V[:-1], r"second must have shape \(\d+, 2\)"), (V[:, :1], "second must have shape")):
+        with pytest.raises(ValueError, match=message):
+            save_animation(tmp_path / "a.gif", V, F, [("first", V), ("second", rows)])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("plot", [plot_map, plot_texture, plot_distortion])
+def test_maps_and_triangles_that_do_not_fit_are_refused(planar, plot):
+    V, F, _ = planar
+    with pytest.raises(ValueError, match=r"uv must have shape"):
+        plot(V, F, V[:-1])
+    with pytest.raises(ValueError, match="F refers to vertices outside"):
+        plot(V, F + len(V), V)
+
+
+@pytest.mark.parametrize("unit", [1e-200, 1e200])
+def test_pictures_have_no_scale(planar, unit):
+    V, F, folded = planar
+    for plot in (plot_map, plot_texture):
+        plain, scaled = (plot(rest, F, uv) for rest, uv in ((V, folded), (V * unit, folded * unit)))
+        plain, scaled = (shown.figure if plot is plot_map else shown for shown in (plain, scaled))
+        assert np.abs(pixels(plain) - pixels(scaled)).mean() < 0.005
+
+
+def test_pictures_without_matplotlib(planar, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    V, F, _ = planar
+    with pytest.raises(ImportError, match="pip install 'matplotlib"):
+        plot_map(V, F, V)
 
 
 def test_window(planar, tmp_path, monkeypatch):
@@ -313,7 +355,15 @@ def test_window(planar, tmp_path, monkeypatch):
     polyscope.init("openGL_mock")
     interactive.add(V, F, folded)
     assert polyscope.has_surface_mesh("surface")
-    assert polyscope.get_surface_mesh("map").n_faces() == len(F)
+    # Inverted triangles are meshes of their own, red; all is in the picture.
+    parts = [polyscope.get_surface_mesh(name).n_faces() for name in ("map", "map: inverted")]
+    assert sum(parts) == len(F)
+    assert parts[1] == len(flipped_triangles(F, folded)) > 0
+    assert polyscope.get_surface_mesh("surface: inverted").get_color() == pytest.approx(RED)
+    camera, target = interactive.view_of(np.array([[0, 0, 0], [20, 2, 0]]), 2.0, np.pi / 2)
+    assert target.tolist() == [10, 1, 0]
+    assert 5 < camera[2] < 5.5
+    assert polyscope.get_view_camera_parameters().get_position()[2] > 1.3
     polyscope.remove_all_structures()
     assert not list(tmp_path.iterdir())
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, lift, signed_areas
-from quasiharmonic import certify, flipped_triangles, io, repair
+from quasiharmonic import certify, distortion, flipped_triangles, io, repair
 from quasiharmonic.cli import main
 from quasiharmonic.seams import fans, islands
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
@@ -421,6 +421,27 @@ class TestCommand:
         assert f"wrote {out}: 3 islands: {facts['inverted_before']} triangles inverted before, 0 now" in said.out
         assert said.err == ""
 
+    def test_the_other_commands_take_seams(self, uv_file, tmp_path, capsys):
+        out, report, faces = tmp_path / "repaired.obj", tmp_path / "report.json", tmp_path / "faces.npz"
+        assert run("check", uv_file, "--json", report) == 1
+        mesh = io.read_obj(uv_file)
+        wrong = np.flatnonzero(exact_signs(mesh.vt, mesh.FT) <= 0)
+        assert json.loads(report.read_text())["flipped"] == wrong.tolist()
+        assert run("repair", uv_file, "-o", out) == 0
+        capsys.readouterr()
+        assert run("check", out) == 0
+        assert f"vertices from {len(mesh.V)} on are further places" in capsys.readouterr().out
+        assert run("measure", out, "--export", faces) == 0
+        # The same corner by corner: no triangle shares anything with another.
+        written = io.read_obj(out)
+        apart = np.arange(mesh.F.size).reshape(-1, 3)
+        expected = distortion(written.V[written.F].reshape(-1, 3), apart, written.vt[written.FT].reshape(-1, 2))
+        with np.load(faces) as file:
+            assert file["uv"][file["F"]].tolist() == written.vt[written.FT].tolist()
+            assert file["isometric"] == pytest.approx(expected.isometric)
+        for kind in ("map", "distortion", "texture"):
+            assert run("plot", out, "-o", tmp_path / f"{kind}.png", "--kind", kind) == 0
+
     def test_in_place(self, uv_file):
         assert run("repair", uv_file, "-o", uv_file) == 0
         repaired = uv_file.read_bytes()
@@ -454,6 +475,7 @@ class TestCommand:
         ("text", "output", "message"),
         [
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.obj", "no face has texture coordinates"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3\n", "out.obj", "at all three corners"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 3\n", "out.obj", "face with 4 corners"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "written as .obj"),
             (None, "out.obj", "there is no such file"),

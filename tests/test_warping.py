@@ -70,6 +70,56 @@ def test_another_shape():
     assert drawn[0].sum() == drawn[:, :2].sum() == drawn[:, 6].sum() == 0
 
 
+def test_landmarks_on_the_border_take_it_along():
+    image = np.tile(np.arange(1, 65, dtype=np.int16), (64, 1))
+    # The lower side bends up, the right upper corner comes in; the left side stays.
+    before = [[31.5, 63], [63, 0], [20, 20]]
+    after = [[31.5, 40], [50, 5], [22, 20]]
+    warped = warp_by_landmarks(image, before, after)
+    assert warped.result.certificate.bijective
+    for start, end in zip(before, after, strict=True):
+        assert warped.moved[(warped.points == start).all(axis=1)].tolist() == [end]
+    left = warped.points[:, 0] == 0
+    assert np.array_equal(warped.moved[left], warped.points[left])
+    # Straight from the corner, which stays, to the landmark.
+    lower = (warped.points[:, 1] == 63) & (warped.points[:, 0] <= 31.5)
+    assert warped.moved[lower, 1] == pytest.approx(63 - 23 * warped.points[lower, 0] / 31.5)
+    assert warped.moved[lower, 0] == pytest.approx(warped.points[lower, 0])
+    assert (warped.image[50:, 24:40] == 0).all()
+    assert (warped.image[:, 0] == image[:, 0]).all()
+    with pytest.raises(ValueError, match="crosses itself"):
+        warp_by_landmarks(image, [[31.5, 63]], [[31.5, -10]])
+
+
+@pytest.mark.parametrize("shape", [None, (300, 500)])
+def test_filled_triangles_are_as_located_ones(shape, monkeypatch):
+    rng = np.random.default_rng(2)
+    image = rng.normal(size=(200, 300))
+    points, F = surfaces.grid(4, 4)
+    upper = np.flatnonzero(points[:, 1] == 1)
+    moved = morph(points, F, upper, points[upper] + [0.1, -0.2]).points
+    size = (299, 199)
+    quick = warp_along(image, points * size, F, moved * size, shape=shape)
+    monkeypatch.setattr("quasiharmonic.warping._LARGE", np.inf)
+    slow = warp_along(image, points * size, F, moved * size, shape=shape)
+    assert np.array_equal(quick == 0, slow == 0)
+    assert quick == pytest.approx(slow, abs=1e-9)
+
+
+def test_points_without_a_place_are_named():
+    points = np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]])
+    lost = points.copy()
+    lost[2, 1] = np.nan
+    for before, after, message in ((lost, points, "points is not finite at vertex 2"), (points, lost, "moved is not")):
+        with pytest.raises(ValueError, match=message):
+            warp_along(np.zeros((4, 4)), before, [[0, 1, 2], [0, 2, 3]], after)
+
+
+def test_a_warp_that_cannot_be_says_what_to_do():
+    with pytest.raises(RuntimeError, match="Move them less far"):
+        warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -77,8 +127,11 @@ def test_another_shape():
         ((np.zeros((9, 9), complex), [[1, 1]], [[1, 1]]), "real numbers"),
         ((np.zeros((9, 9)), [[1, 1, 1]], [[1, 1]]), r"landmarks must have shape \(k, 2\)"),
         ((np.zeros((9, 9)), [[1, 1]], [[1, 8]]), "moved: point 0 not inside"),
-        ((np.zeros((9, 9)), [[1, np.nan]], [[1, 1]]), "landmarks: point 0 not inside"),
-        ((np.zeros((9, 9)), [[1, 1], [1, 1]], [[1, 1], [2, 2]]), "two points are the same"),
+        ((np.zeros((9, 9)), [[1, np.nan]], [[1, 1]]), "landmarks: point 0 not finite"),
+        (
+            (np.zeros((9, 9)), [[1, 1], [1, 1]], [[1, 1], [2, 2]]),
+            r"landmarks: points 0, 1 are at the same place, \(1.0, 1.0\)",
+        ),
         ((np.zeros((9, 9)), [[1, 1]], [[1, 1], [2, 2]]), "as many rows"),
     ],
 )

@@ -125,6 +125,8 @@ class AirMesh:
         self._loops = boundary_loops(self._F, len(self._rest))
         self._sizes = [len(np.asarray(loop)) for loop in frame]
         self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(frame)]))
+        if not self.moment.certificate.bijective:
+            raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")
 
     def advance(self, frame: Sequence[ArrayLike], *, max_iterations: int = 300) -> Moment:
         """Move the frame and let the shapes come to rest.
@@ -147,9 +149,10 @@ class AirMesh:
         Raises
         ------
         ValueError
-            When loops have other sizes than at the start.
+            When loops have other sizes than at the start, or a point is not finite.
         RuntimeError
-            When that does not help. The present is then as it was.
+            When that does not help: the frame leaves no room, or crosses itself or what it may not. The present is
+            then as it was.
         """
         there = self._stacked(frame)
         n, present = len(self._rest), self.moment
@@ -157,9 +160,9 @@ class AirMesh:
         try:
             while done < 1:
                 t = min(done + step, 1.0)
-                moved = self._moved(here + t * (there - here) if t < 1 else there, max_iterations)
-                if moved is not None:
-                    self.moment, done = self._at_rest(moved), t
+                reached = self._step(here + t * (there - here) if t < 1 else there, max_iterations)
+                if reached is not None:
+                    self.moment, done = reached, t
                 elif step > _SHORTEST:
                     step /= 2
                 else:
@@ -171,6 +174,16 @@ class AirMesh:
             self.moment = present
             raise
         return self.moment
+
+    def _step(self, frame: FloatArray, max_iterations: int) -> Moment | None:
+        """The present with the frame elsewhere, at rest; None where that cannot be."""
+        try:
+            moved = self._moved(frame, max_iterations)
+            reached = None if moved is None else self._at_rest(moved)
+        except ValueError:
+            # What has been checked when it was given is a frame by its form only: it may meet itself or the shapes.
+            return None
+        return reached if reached is not None and reached.certificate.bijective else None
 
     def _moved(self, frame: FloatArray, max_iterations: int) -> FloatArray | None:
         """The points with the frame elsewhere and no triangle inverted; None where the air does not let it."""
@@ -251,7 +264,7 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     Raises
     ------
     ValueError
-        When loops cross or touch.
+        When loops cross or touch, or one is not inside the container; the message names them.
     ImportError
         When Shapely is not installed.
     """
@@ -259,6 +272,11 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     ends = len(points) - sum(frame) + np.cumsum(frame)
     container, *obstacles = (points[end - size : end] for end, size in zip(ends, frame, strict=True))
     around = [points[loop] for loop in loops]
+    _check_apart(
+        [*around, container, *obstacles],
+        [f"the shape's boundary through vertex {loop[0]}" for loop in loops]
+        + ["the container", *(f"obstacle {k}" for k in range(len(obstacles)))],
+    )
     solid = [*(loop for loop in around if _area(loop) > 0), *obstacles]
     # Spaces with air in them: the container, and the holes of shapes. A thing lies in the smallest one around it.
     spaces = [container, *(loop for loop in around if _area(loop) < 0)]
@@ -267,7 +285,7 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     for thing in solid:
         holding = [k for k, room in enumerate(rooms) if room.contains(shapely.Point(thing[0]))]
         if not holding:
-            raise ValueError(f"something near {tuple(thing[0].tolist())} is not inside the container")
+            raise ValueError(f"what has a corner at {tuple(thing[0].tolist())} is not inside the container")
         inside[min(holding, key=lambda k: rooms[k].area)].append(thing)
     regions = [shapely.Polygon(space, things) for space, things in zip(spaces, inside, strict=True)]
     for region in regions:
@@ -278,6 +296,17 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     triangles = np.array([order[x, y] for x, y in corners.reshape(-1, 2).tolist()], dtype=np.int64).reshape(-1, 3)
     sign = orientation(*(points[triangles[:, k]] for k in range(3)))
     return np.where((sign < 0)[:, None], triangles[:, ::-1], triangles)
+
+
+def _check_apart(loops: Sequence[FloatArray], names: Sequence[str]) -> None:
+    """Refuse loops that meet, be it in a single point."""
+    shapely = _shapely()
+    rings = [shapely.LinearRing(loop) for loop in loops]
+    first, second = shapely.STRtree(rings).query(rings, predicate="intersects")
+    for i, j in sorted(zip(first.tolist(), second.tolist(), strict=True)):
+        if i < j:
+            x, y = shapely.get_coordinates(shapely.intersection(rings[i], rings[j]))[0].tolist()
+            raise ValueError(f"{names[i]} and {names[j]} meet at ({x:.6g}, {y:.6g}): leave room for air between them")
 
 
 def thickened(corners: FloatArray, gap: float) -> FloatArray:

@@ -117,10 +117,7 @@ class Repaired:
     def summary(self) -> str:
         """What was done, in all and for each island that needed it."""
         count = len(self.islands)
-        before, now = (
-            sum(len(which) for which in lists)
-            for lists in zip(*((i.inverted_before, i.inverted) for i in self.islands), strict=True)
-        )
+        before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
         lines = [
             f"{count} {'island' if count == 1 else 'islands'}: {before} triangles inverted before, {now} now; "
             f"{len(self.moved)} vertices moved"

@@ -18,7 +18,7 @@ def add_parser(commands: Commands) -> None:
         "check",
         help="judge a map: every triangle positive? no overlap?",
         description="Judge a planar map exactly: the texture coordinates (vt) of an OBJ file whose faces refer to "
-        "them, else the first two coordinates of its vertices.",
+        "them, else the first two coordinates of its vertices. A map with seams is judged as it lies in the plane.",
         epilog="Exit status: 0 injective (every triangle strictly positive); 1 not; 2 the file cannot be judged.",
     )
     parser.add_argument("input", type=Path, metavar="FILE", help="OBJ or OFF file")
@@ -44,16 +44,21 @@ def run(options: argparse.Namespace) -> int:
 
     report.check_json(options.json, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
-    uv = io.map_of(mesh)
+    V, F, uv = io.cut_at_seams(mesh)
     if options.precision == "float32":
         with np.errstate(over="ignore"):
             uv = uv.astype(np.float32)
-    certificate = certify(mesh.F, uv)
+    certificate = certify(F, uv)
+    further = len(V) - len(mesh.V)
     facts = {
         **report.verdict(certificate),
         "input": str(options.input),
         "precision": options.precision,
         "triangles": len(mesh.F),
+        "further_places": further,
     }
-    report.emit(facts, options.json, f"{options.input}: {certificate.summary()}")
+    text = f"{options.input}: {certificate.summary()}"
+    if further:
+        text += f"\nThe map has seams: vertices from {len(mesh.V)} on are further places of vertices there."
+    report.emit(facts, options.json, text)
     return 0 if certificate.injective else 1

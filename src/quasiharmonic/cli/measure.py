@@ -42,13 +42,13 @@ def run(options: argparse.Namespace) -> int:
     if options.export is not None:
         report.check_export(options.export, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
-    uv = io.map_of(mesh)
+    V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
     with report.about(options.input):
-        found = distortion(mesh.V, mesh.F, uv)
+        found = distortion(V, F, uv)
     if options.export is not None:
         # What is coloured by first is what bounds the error of a texture.
         values = {"isometric": found.isometric, **found.per_triangle()}
-        io.write_per_triangle(options.export, mesh.V, mesh.F, uv, values)
+        io.write_per_triangle(options.export, V, F, uv, values)
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
     report.emit(facts, options.json, _table(found, len(mesh.F)))
     return 0

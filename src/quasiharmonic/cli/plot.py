@@ -48,14 +48,13 @@ def run(options: argparse.Namespace) -> int:
     from . import report
 
     report.check_picture("-o", options.output, inputs=(options.input,))
-    mesh = io.read_mesh(options.input)
-    uv = io.map_of(mesh)
+    V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
     with report.about(options.input):
         if options.kind == "distortion":
-            save_distortion_figure(options.output, mesh.V, mesh.F, uv, options.measure)
+            save_distortion_figure(options.output, V, F, uv, options.measure)
         elif options.kind == "texture":
-            save_texture_figure(options.output, mesh.V, mesh.F, uv)
+            save_texture_figure(options.output, V, F, uv)
         else:
-            save_map_figure(options.output, mesh.V, mesh.F, uv, flipped=flipped_triangles(mesh.F, uv))
+            save_map_figure(options.output, V, F, uv, flipped=flipped_triangles(F, uv))
     print(f"wrote {options.output}")
     return 0

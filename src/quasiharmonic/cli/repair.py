@@ -58,8 +58,10 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.output}: a map with seams is written as .obj")
     report.check_outputs(options.output, None, options.json, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
-    if mesh.vt is None or mesh.FT is None:
-        raise ValueError(f"{options.input}: there is no map to repair: no face has texture coordinates (vt)")
+    if mesh.vt is None or mesh.FT is None or (mesh.FT < 0).any(axis=1).all():
+        raise ValueError(
+            f"{options.input}: there is no map to repair: no face has texture coordinates (vt) at all three corners"
+        )
     with report.about(options.input), progress.line() as show:
         result = repair(
             mesh.V,

@@ -37,5 +37,5 @@ def run(options: argparse.Namespace) -> int:
         report.check_picture("--screenshot", options.screenshot, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
     with report.about(options.input):
-        show(mesh.V, mesh.F, io.map_of(mesh), screenshot=options.screenshot)
+        show(*io.without_idle(*io.cut_at_seams(mesh)), screenshot=options.screenshot)
     return 0

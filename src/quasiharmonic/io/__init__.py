@@ -17,6 +17,7 @@ from .off import read_off, write_off
 from .per_triangle import FORMATS as PER_TRIANGLE_FORMATS
 from .per_triangle import write_per_triangle
 from .refined import refined_mesh
+from .seamed import cut_at_seams, without_idle
 
 __all__ = [
     "PER_TRIANGLE_FORMATS",
@@ -26,6 +27,7 @@ __all__ = [
     "ProblemArrays",
     "check_output",
     "check_writable",
+    "cut_at_seams",
     "map_of",
     "problem_arrays",
     "problem_files",
@@ -36,6 +38,7 @@ __all__ = [
     "read_problem",
     "refined_mesh",
     "vertex_places",
+    "without_idle",
     "write_map",
     "write_obj",
     "write_off",

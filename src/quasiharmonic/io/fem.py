@@ -1,19 +1,14 @@
-"""Planar meshes of finite-element programs: Gmsh, VTK/VTU and what else meshlane reads and writes.
+"""Planar meshes of finite-element programs: Gmsh's MSH, VTK's legacy and XML files.
 
-Only positions are ever changed. Cells, point and cell data, physical groups and their names, and the order of
-everything come through as they were.
+Only positions are ever changed, where they stand in the file. Every other byte stays: cells, data, several times,
+physical groups and their names, numbering.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shutil
-import tempfile
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,13 +17,18 @@ from quasiharmonic.mesh.topology import named
 
 from .atomic import check_writable, write_whole
 from .errors import MeshFileError
+from .gmsh import read_gmsh
+from .legacy_vtk import read_legacy_vtk
+from .meshdata import is_planar
+from .meshparts import MeshParts
+from .vtu import read_vtu
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Cells without area, which a triangle mesh may have besides its triangles.
-_LOWER = ("vertex", "line")
-_MSH = {"2": "gmsh22", "4.0": "gmsh40", "4.1": "gmsh"}
+_READERS = {".msh": read_gmsh, ".vtk": read_legacy_vtk, ".vtu": read_vtu}
+# What readers meet in files that are damaged.
+_DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,27 +42,48 @@ class FemMesh:
     F : (f, 3) int64
         Triangles of all blocks of the file, in their order.
     source : Path
-    content : meshlane.Mesh
-        The file as it was read.
+    parts : MeshParts
+        The file taken apart.
     """
 
     points: FloatArray
     F: IntArray
     source: Path
-    content: Any
+    parts: MeshParts
 
-    def point_field(self, name: str) -> FloatArray:
-        """A vector at every point, (n, 2) float64, from the file's point data."""
-        fields = self.content.point_data
+    def point_field(self, name: str, vertices: ArrayLike) -> FloatArray:
+        """Vectors at some points, (k, 2) float64, from the file's point data; of several times the last.
+
+        Raises
+        ------
+        MeshFileError
+            When there are no such data, they are no vectors in the plane, or one at these points is missing or not
+            finite.
+        """
+        which, fields = np.asarray(vertices, dtype=np.int64), self.parts.fields
         if name not in fields:
             there = ", ".join(map(repr, sorted(fields))) or "none"
             raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"there are: {there}")
-        values = np.asarray(fields[name], dtype=np.float64)
-        if values.ndim != 2 or values.shape[1] not in (2, 3) or (values[:, 2:] != 0).any():
-            raise MeshFileError(self.source, f"the point data {name!r} are no vectors in the plane")
-        lost = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        try:
+            # A NaN of single precision may be one that signals when it is made double.
+            with np.errstate(invalid="ignore"):
+                values = fields[name]()[which]
+        except _DAMAGE as error:
+            raise MeshFileError(self.source, f"the point data {name!r} cannot be read: {error}") from error
+        if values.shape[1] not in (2, 3):
+            raise MeshFileError(
+                self.source,
+                f"the point data {name!r} are no vectors in the plane: {values.shape[1]} numbers at each point",
+            )
+        lost = which[~np.isfinite(values).all(axis=1)]
         if lost.size:
-            raise MeshFileError(self.source, f"{name!r} is not finite at {named('point', 'points', lost)} (0-based)")
+            raise MeshFileError(
+                self.source,
+                f"{name!r} has no finite value at {named('boundary point', 'boundary points', lost)} (0-based)",
+                remedy="give every point of the boundary one, 0 where it stays",
+            )
+        if values[:, 2:].any():
+            raise MeshFileError(self.source, f"the point data {name!r} lead out of the plane")
         return values[:, :2].copy()
 
 
@@ -72,95 +93,107 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
     Parameters
     ----------
     path : str or path-like
-        A ``.msh``, ``.vtu``, ``.vtk``, or another format that meshlane reads.
+        A ``.msh`` of version 2 or 4, a legacy ``.vtk`` of an unstructured grid or polygons, or a ``.vtu``, each
+        as text or binary.
 
     Raises
     ------
-    ImportError
-        When meshlane is not installed.
     MeshFileError
-        When the file cannot be read, has cells with area other than three-node triangles, no triangles, or
-        is not planar.
+        When the file is another, cannot be read, has cells with area other than three-node triangles, no
+        triangles, or is not planar.
     """
-    meshlane = _meshlane()
     source = Path(path)
     try:
-        # The library prints blank lines as it goes.
-        with contextlib.redirect_stdout(StringIO()):
-            content = meshlane.read(source)
-    except (Exception, SystemExit) as error:
-        # The library's readers raise what they come across, and some of them end the program.
-        raise MeshFileError(path, f"cannot be read: {str(error) or type(error).__name__}") from error
-    other = sorted({block.type for block in content.cells} - {"triangle", *_LOWER})
-    if other:
+        data = source.read_bytes()
+    except OSError as error:
+        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
+    return _mesh(source, data)
+
+
+def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str]) -> None:
+    """Say early whether a mesh could be written.
+
+    Raises
+    ------
+    MeshFileError
+        When the suffix is not that of the source: converting would lose data.
+    OutputError
+        When the file cannot be written.
+    """
+    there, here = Path(path).suffix.lower(), Path(source).suffix.lower()
+    if here in _READERS and there != here:
         raise MeshFileError(
-            path, f"has cells of the kind {', '.join(other)}", remedy="three-node triangles are needed: split them"
+            path,
+            f"a {here} file is written as {here}, in which only positions change; written as "
+            f"{there or 'a file without suffix'}, it could lose groups, data or times",
+            remedy="convert the written file if you need another format",
         )
-    blocks = [np.asarray(block.data, dtype=np.int64) for block in content.cells if block.type == "triangle"]
-    if not blocks:
-        raise MeshFileError(path, "has no triangles")
-    points = np.asarray(content.points, dtype=np.float64)
-    F = np.concatenate(blocks)
-    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if lost.size:
-        raise MeshFileError(path, f"not finite at {named('point', 'points', lost)} (0-based)")
-    if points.shape[1] == 3 and (points[F, 2] != points[F[0, 0], 2]).any():
-        raise MeshFileError(path, "is not planar", remedy="a mesh in the plane z = constant is needed")
-    return FemMesh(points[:, :2].copy(), F, source, content)
+    check_writable(path)
 
 
 def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) -> None:
-    """Write a mesh that was read, with other positions in the plane.
+    """Write a mesh that was read, with other positions in the plane and every other byte as it was.
 
     Parameters
     ----------
     path : str or path-like
-        Replaced as a whole once the file is complete. With the suffix that was read, the file gets the
-        version and encoding of the one that was read.
+        With the suffix that was read. Replaced as a whole once the file is complete.
     mesh : FemMesh
     points : (n, 2) array
+        Rounded to single precision where that is what the file has.
 
     Raises
     ------
     ValueError
         When ``points`` has another shape or is not finite.
-    MeshFileError
-        When the format cannot be written.
-    OutputError
-        When the file cannot be written.
+    MeshFileError, OutputError
+        As for `check_fem_output`; or when positions are too large for the file's precision.
     """
-    meshlane = _meshlane()
     points = np.asarray(points, dtype=np.float64)
     if points.shape != mesh.points.shape or not np.isfinite(points).all():
         raise ValueError(f"points must be {mesh.points.shape} finite numbers")
-    check_writable(path)
-    content = mesh.content.copy()
-    content.points = np.array(content.points, dtype=np.float64)
-    content.points[:, :2] = points
-    with tempfile.TemporaryDirectory() as folder:
-        part = Path(folder) / Path(path).name
-        try:
-            with contextlib.redirect_stdout(StringIO()):
-                meshlane.write(part, content, **_like(mesh.source, part.suffix))
-        except (Exception, SystemExit) as error:
-            raise MeshFileError(path, f"cannot be written: {str(error) or type(error).__name__}") from error
-        with open(part, "rb") as whole:
-            write_whole(path, lambda file: shutil.copyfileobj(whole, file))
+    check_fem_output(path, mesh.source)
+    with np.errstate(over="ignore"):
+        expected = points.astype(mesh.parts.precision).astype(np.float64)
+    if not np.isfinite(expected).all():
+        raise MeshFileError(path, "positions are too large for single precision, which the file has")
+    data = mesh.parts.replaced(points)
+    written = _mesh(mesh.source, data)
+    if not (
+        np.array_equal(written.points, expected)
+        and np.array_equal(written.F, mesh.F)
+        and np.array_equal(written.parts.points[:, 2], mesh.parts.points[:, 2])
+    ):
+        raise MeshFileError(path, "what would be written does not read back as it should, so it is not")
+    write_whole(path, data)
 
 
-def _like(source: Path, suffix: str) -> dict[str, Any]:
-    """Options to write a Gmsh file in the version and encoding of another; nothing for other formats."""
-    if not source.suffix.lower() == suffix.lower() == ".msh":
-        return {}
-    with open(source, "rb") as file:
-        head = file.read(4096).partition(b"$MeshFormat")[2].split()
-    version, binary = head[0].decode(), head[1] == b"1"
-    return {"file_format": _MSH.get(version, _MSH.get(version[0], "gmsh")), "binary": binary}
-
-
-def _meshlane() -> Any:
+def _mesh(source: Path, data: bytes) -> FemMesh:
+    """Take a file apart and check it."""
+    reader = _READERS.get(source.suffix.lower())
+    if reader is None:
+        raise MeshFileError(
+            source,
+            f"{source.suffix or 'files without suffix'} cannot be read",
+            remedy="convert it to .msh, .vtk or .vtu",
+        )
     try:
-        import meshlane
-    except ImportError as error:
-        raise ImportError("meshes of finite elements need meshlane: pip install 'quasiharmonic[fem]'") from error
-    return meshlane
+        with np.errstate(invalid="ignore"):
+            parts = reader(data)
+    except _DAMAGE as error:
+        what = str(error) if isinstance(error, ValueError) else f"something is missing in it ({error})"
+        raise MeshFileError(source, f"cannot be read: {what}") from error
+    points, F = parts.points, parts.F
+    if not F.size:
+        raise MeshFileError(source, "has no triangles")
+    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if lost.size:
+        raise MeshFileError(source, f"not finite at {named('point', 'points', lost)} (0-based)")
+    used = points[np.unique(F)]
+    if not is_planar(used):
+        raise MeshFileError(
+            source,
+            f"is not planar: z goes from {used[:, 2].min():.6g} to {used[:, 2].max():.6g}",
+            remedy="a mesh in the plane z = constant is needed",
+        )
+    return FemMesh(points[:, :2].copy(), F, source, parts)

@@ -148,21 +148,9 @@ def map_of(mesh: MeshData) -> FloatArray:
         When the mesh has no map, has it on some faces only, or has seams, that is, vertices with
         several places; the message names the first of them.
     """
+    check_mapped(mesh)
     if mesh.FT is None:
-        if np.any(mesh.V[:, 2] != mesh.V[0, 2]):
-            raise MeshFileError(
-                mesh.source,
-                "there is no map: the mesh has no texture coordinates and is not planar",
-                remedy="write it with uv coordinates",
-            )
         return mesh.V[:, :2].copy()
-    bare = np.flatnonzero((mesh.FT < 0).any(axis=1))
-    if bare.size:
-        raise MeshFileError(
-            mesh.source,
-            f"{named('face', 'faces', bare)} (0-based) without texture coordinates, which others have",
-            remedy="map the whole mesh, or remove these faces",
-        )
     uv, seam = vertex_places(mesh)
     if seam.any():
         torn = named("vertex", "vertices", np.flatnonzero(seam))
@@ -172,6 +160,31 @@ def map_of(mesh: MeshData) -> FloatArray:
             remedy="a map with seams needs its vertices split along them",
         )
     return uv
+
+
+def is_planar(points: FloatArray) -> bool:
+    """Whether points (n, 3) lie in a plane z = constant, up to what rounding to single precision leaves."""
+    extent = np.ptp(points, axis=0)
+    return bool(extent[2] <= 1e-6 * extent[:2].max())
+
+
+def check_mapped(mesh: MeshData) -> None:
+    """Raise `MeshFileError` when a mesh has no map, or has it on some faces only."""
+    if mesh.FT is None:
+        if not is_planar(mesh.V):
+            raise MeshFileError(
+                mesh.source,
+                "there is no map: the mesh has no texture coordinates and is not planar",
+                remedy="write it with uv coordinates",
+            )
+        return
+    bare = np.flatnonzero((mesh.FT < 0).any(axis=1))
+    if bare.size:
+        raise MeshFileError(
+            mesh.source,
+            f"{named('face', 'faces', bare)} (0-based) without texture coordinates, which others have",
+            remedy="map the whole mesh, or remove these faces",
+        )
 
 
 def _check_finite(name: str, rows: FloatArray) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.plot.canvas import as_mesh, finite, new_figure, not_positive, paint_map, verdict
+from quasiharmonic.plot.canvas import as_map, as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.plot.shading import view
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _figures(
     color = view(rest, F).color
     window: tuple[tuple[float, float], tuple[float, float]] | None = None
     for name, uv in frames:
-        place = finite(uv, name)
+        place = as_map(uv, rest, name)
         figure = new_figure((6, 6))
         ax = figure.add_axes((0.02, 0.02, 0.96, 0.88))
         inverted = not_positive(F, place)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.plot.shading import View, edge_style, least_heights
+from quasiharmonic.plot.shading import View, drawable, edge_style, least_heights
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,8 +27,11 @@ _INSIDE = np.array((0.80, 0.82, 0.86))
 
 def new_figure(inches: tuple[float, float]) -> Figure:
     """A white figure of 100 pixels an inch, known to nobody but its owner."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(f"pictures need matplotlib ({error}): pip install 'matplotlib>=3.8'") from error
 
     figure = Figure(figsize=inches, dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
@@ -90,6 +93,7 @@ def paint_map(
     ax: Axes, F: IntArray, uv: FloatArray, color: FloatArray, inverted: IntArray, fixed: ArrayLike | None = None
 ) -> None:
     """Paint a map in the given colours (f, 3), inverted triangles in red over all others."""
+    uv = drawable(uv)
     scale = fit(ax, uv)
     color = color.copy()
     color[inverted] = RED
@@ -117,18 +121,34 @@ def outline(ax: Axes, F: IntArray, uv: FloatArray) -> None:
 
 def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
     """Triangles whose area, in floating point, is not positive."""
+    uv = drawable(uv)
     a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
     return np.flatnonzero(~(a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0]))
 
 
 def as_mesh(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
-    """Positions, checked to be finite, and triangles, as arrays."""
-    return finite(V, "V"), np.asarray(F, dtype=np.int64)
+    """Positions, checked to be finite, and triangles, checked to refer to them, as arrays."""
+    rest, triangles = finite(V, "V"), np.asarray(F, dtype=np.int64)
+    if triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ValueError(f"F must have shape (f, 3), not {triangles.shape}")
+    if triangles.size and (triangles.min() < 0 or triangles.max() >= len(rest)):
+        raise ValueError(f"F refers to vertices outside 0 … {len(rest) - 1}")
+    return rest, triangles
+
+
+def as_map(uv: ArrayLike, rest: FloatArray, name: str = "uv") -> FloatArray:
+    """A map of a surface's vertices, checked to be one and finite, as an array."""
+    array = np.asarray(uv, dtype=np.float64)
+    if array.shape != (len(rest), 2):
+        raise ValueError(f"{name} must have shape ({len(rest)}, 2), a row for each vertex, not {array.shape}")
+    return finite(array, name)
 
 
 def finite(points: ArrayLike, name: str) -> FloatArray:
     """Points as an array, or `ValueError` naming the first that has no finite place."""
     array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f"{name} must have shape (n, 2) or (n, 3), not {array.shape}")
     good = np.isfinite(array).all(axis=1)
     if not good.all():
         raise ValueError(f"{name} has no finite place for vertex {int(np.argmin(good))}")

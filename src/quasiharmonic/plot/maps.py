@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.plot.canvas import (
+    as_map,
     as_mesh,
     caption,
-    finite,
     new_figure,
     not_positive,
     paint_map,
@@ -87,7 +87,7 @@ def plot_map(
     rest, F = as_mesh(V, F)
     if ax is None:
         ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9))
-    _draw_map(ax, view(rest, F), F, finite(uv, "uv"), flipped, fixed)
+    _draw_map(ax, view(rest, F), F, as_map(uv, rest), flipped, fixed)
     return ax
 
 
@@ -121,7 +121,7 @@ def plot_before_after(
     rest, F = as_mesh(V, F)
     figure, seen = new_figure((9, 4.8)), view(rest, F)
     for ax, uv, name in zip(panels(figure, 2), (before, after), ("before", "after"), strict=True):
-        verdict(ax, name, _draw_map(ax, seen, F, finite(uv, name), None, fixed))
+        verdict(ax, name, _draw_map(ax, seen, F, as_map(uv, rest, name), None, fixed))
     return figure
 
 
@@ -166,8 +166,8 @@ def save_map_figure(
     plot_surface(rest, F, axes[0])
     caption(axes[0], f"surface: {len(F):,} triangles")
     if before is not None:
-        verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, finite(before, "before"), None, fixed))
-    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, finite(uv, "uv"), flipped, fixed))
+        verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, as_map(before, rest, "before"), None, fixed))
+    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, as_map(uv, rest), flipped, fixed))
     write_whole(path, lambda file: figure.savefig(file, format="png"))
 
 

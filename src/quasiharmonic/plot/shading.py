@@ -57,6 +57,7 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     -------
     View
     """
+    V = drawable(V)
     if V.shape[1] == 2:
         V = np.column_stack([V, np.zeros(len(V))])
     normals = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
@@ -81,6 +82,12 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
         light=light,
         color=lit(hue, light),
     )
+
+
+def drawable(points: FloatArray) -> FloatArray:
+    """Points in a unit in which squares of lengths neither overflow nor vanish: their own, if it will do."""
+    exponent = int(np.frexp(np.abs(points).max(initial=0.0))[1])
+    return np.ldexp(points, -exponent) if abs(exponent) > 300 else points
 
 
 def edge_style(color: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.plot.canvas import RED, as_mesh, caption, finite, new_figure, not_positive, outline, panels, verdict
-from quasiharmonic.plot.shading import lit, view
+from quasiharmonic.plot.canvas import RED, as_map, as_mesh, caption, new_figure, not_positive, outline, panels, verdict
+from quasiharmonic.plot.shading import drawable, lit, view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ IntArray = NDArray[np.int64]
 _LIGHT, _DARK = np.array((0.93, 0.93, 0.90)), np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel
 _SAMPLES = 2  # per pixel and direction
-_CHUNK = 1 << 22  # samples looked at together
+_CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
 
 
 def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24) -> Figure:
@@ -51,7 +51,7 @@ def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
         When there are no triangles, a vertex is not finite, or ``squares`` is less than 1.
     """
     rest, F = as_mesh(V, F)
-    uv = finite(uv, "uv")
+    uv = drawable(as_map(uv, rest))
     if not F.size:
         raise ValueError("the mesh has no triangles")
     if squares < 1:
