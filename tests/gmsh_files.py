@@ -16,6 +16,15 @@ def _gmsh():
     return gmsh
 
 
+def missing():
+    """Why Gmsh cannot be had here, if it cannot: it is not installed, or some library of the system is not."""
+    try:
+        _gmsh()
+    except (ImportError, OSError) as error:
+        return str(error)
+    return None
+
+
 def content(path):
     """All that Gmsh finds in a file, positions apart from the rest."""
     gmsh = _gmsh()

@@ -30,9 +30,9 @@ def shifted(mesh):
 @pytest.fixture(scope="module")
 def gmsh():
     """Calls functions of `gmsh_files` in a process of its own."""
-    if find_spec("gmsh") is None:
-        pytest.skip("gmsh is not installed")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        if reason := process.submit(gmsh_files.missing).result():
+            pytest.skip(f"no gmsh: {reason}")
         yield lambda function, *arguments, **options: process.submit(function, *arguments, **options).result()
 
 
@@ -382,8 +382,7 @@ def test_no_damage_surprises(tmp_path, name, whole):
     assert refused > 100
 
 
-@pytest.mark.skipif(find_spec("gmsh") is None, reason="gmsh is not installed")
-def test_gmsh_and_the_solver_in_one_process():
+def test_gmsh_and_the_solver_in_one_process(gmsh):
     script = """
 import gmsh
 from quasiharmonic import morph, surfaces
