@@ -84,10 +84,10 @@ def cat(triangles: int, character: str) -> Arrays:
     return V, F, loop, arc_length(V[loop], letter(character)[0])
 
 
-def problems(sizes: list[int], folders: list[Path]) -> Iterator[tuple[str, Arrays]]:
+def problems(sizes: list[int], letters: str, folders: list[Path]) -> Iterator[tuple[str, Arrays]]:
     """Names and arrays, one problem at a time, the small ones first."""
     for size in sizes:
-        for character in LETTERS:
+        for character in letters:
             yield f"cat on {character}", cat(size, character)
     for folder in folders:
         for path in sorted(folder.rglob("input.obj")):
@@ -295,6 +295,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path, help="problem folders")
     parser.add_argument("--triangles", nargs="*", type=int, default=list(SIZES), help="sizes of the made problems")
+    parser.add_argument("--letters", default=LETTERS, help="their targets (%(default)s)")
     parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), help="what to compare with")
     parser.add_argument("--strategy", default="speed", help="speed or quality (%(default)s)")
     parser.add_argument("--fine", action="store_true", help="VectorAdam alone, on the mesh itself")
@@ -310,7 +311,7 @@ def main() -> None:
     tools = warm_up([OURS, *options.peers])
     strategy: Strategy = [Descent()] if options.fine else options.strategy
     records: list[Record] = []
-    for name, arrays in problems(options.triangles, options.folders):
+    for name, arrays in problems(options.triangles, options.letters, options.folders):
         slow = {
             record.tool for record in records if record.median > options.limit and len(arrays[1]) > record.triangles
         }

@@ -33,6 +33,9 @@ Generator = np.random.Generator
 # Rings around an inverted triangle, and sizes of the random ξ; one of them is drawn.
 _RINGS = 2, 3, 4, 6, 8, 12
 _SPREADS = 0.0, 0.5, 1.5
+# V₃ over the target's area below which a problem is worth more tries. Of ten thousand generated ones, those that have no
+# solution end above 1e-4, and those that have one and need many tries below 1e-6.
+_NEXT_TO_NOTHING, _DILIGENCE = 1e-5, 10
 # Placed vertices lie this much of the way from a corner of the intersection to its middle, in powers of ten.
 _DEPTHS = -3.5, 0.0
 
@@ -57,7 +60,7 @@ def shaking(
     visit : callable
         Called after every patch that left fewer inverted triangles; raises `Stop` to end.
     iterations : int
-        So many patches in a row may be of no use.
+        So many patches in a row may be of no use; ten times as many where next to nothing is left to be righted.
     """
     problem, solver = objective.problem, objective.laplacian.solver.name
     rng = np.random.default_rng(0)
@@ -67,8 +70,10 @@ def shaking(
         for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
             visit(iterate_of(objective, w))
         left = flipped_triangles(problem.F, problem.positions(w))
-    in_vain = 0
-    while 0 < left.size <= MOST_FLIPS and in_vain < iterations:
+    in_vain, patience = 0, iterations
+    if 0 < left.size <= MOST_FLIPS and iterate_of(objective, w).energy < _NEXT_TO_NOTHING:
+        patience *= _DILIGENCE
+    while 0 < left.size <= MOST_FLIPS and in_vain < patience:
         in_vain += 1
         patch = patch_around(objective, int(rng.choice(left)), int(rng.choice(_RINGS)), MOST_TRIANGLES)
         if patch is None:
