@@ -613,6 +613,33 @@ def test_limits_to_the_number_of_threads_are_respected(way):
         assert threads(MKL_NUM_THREADS="2", MKL_DYNAMIC="FALSE") > 1, "the count sees nothing"
 
 
+_CHANGES = """
+import numpy as np
+from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve import mkl
+from quasiharmonic.surfaces import grid
+library = mkl.load_mkl()
+V, F = grid(250, 250)
+rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))
+rng = np.random.default_rng(0)
+for round in range(4):
+    laplacian = Laplacian(F, len(V), rim, "pardiso", V)
+    for _ in range(8):
+        library.MKL_Set_Num_Threads_Local(int(rng.choice([1, 2], p=[0.2, 0.8])))
+        laplacian.factor(-np.exp(0.3 * rng.standard_normal((3, len(F)))))
+        library.MKL_Set_Num_Threads_Local(int(rng.choice([1, 2])))
+        laplacian.solver.solve(rng.standard_normal((laplacian.free.size, rng.integers(1, 4))))
+"""
+
+
+@needs_mkl
+def test_pardiso_survives_changes_of_threads_between_its_phases():
+    """Many factorisations, single and several right-hand sides; every solution's residual is examined."""
+    environment = os.environ | {"MKL_NUM_THREADS": "2", "MKL_DYNAMIC": "FALSE"}
+    run = subprocess.run([sys.executable, "-c", _CHANGES], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr[-2000:]
+
+
 @needs_mkl
 def test_pardiso_leaves_the_number_of_threads_alone():
     library = mkl.load_mkl()

@@ -66,12 +66,25 @@ class Pardiso(LinearSolver):
             values = np.ones(indices.size)
         self._entries = values[: self.nnz]
         sequential = self.n < _SEQUENTIAL_BELOW
-        self._handle = _Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
-        self._release_once = weakref.finalize(self, self._handle.release)
-        self._handle.check(_ANALYSE)
-        self._ones = np.ones((self._size, 1), order="F")
+        self._handle = self._begun(indptr, indices, values, sequential)
+        # With several threads and any ordering but METIS's, the improved two-level algorithm's solution of a single
+        # right-hand side is wrong, of two or more right; and a solution on one thread spoils the next factorisation on
+        # several, or crashes it (MKL 2026.2). So it never gets fewer than two.
+        self._fewest = 1 if sequential or not self._handle.improved else 2
+        self._ones = np.ones((self._size, self._fewest), order="F")
+
+    def _begun(self, indptr: Ints, indices: Ints, values: Floats, sequential: bool) -> _Handle:
+        """A pattern analysed, by as many threads as there may be now."""
+        handle = _Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
+        self._release_once = weakref.finalize(self, handle.release)
+        handle.check(_ANALYSE)
+        return handle
 
     def _factor(self) -> None:
+        if self._handle.threads != self._handle.threads_now:
+            # An instance that is made to work with fewer or more threads than before crashes (MKL 2026.2).
+            self._release_once()
+            self._handle = self._begun(*self._handle.pattern, self._handle.sequential)
         if self._size > self.n:
             self._entries[:] = self._values
         self._handle.check(_FACTOR)
@@ -86,9 +99,12 @@ class Pardiso(LinearSolver):
     def _solve(self, b: Floats) -> Floats:
         if self._size > self.n:
             b = np.asfortranarray(np.concatenate([b, np.zeros((self._size - self.n, b.shape[1]))]))
+        columns = b.shape[1]
+        if columns < self._fewest:
+            b = np.asfortranarray(np.repeat(b, self._fewest, axis=1))
         x = np.empty_like(b, order="F")
         self._handle.check(_SOLVE, b, x)
-        return np.asfortranarray(x[: self.n])
+        return np.asfortranarray(x[: self.n, :columns])
 
     def _release(self) -> None:
         self._release_once()
@@ -103,9 +119,11 @@ class _Handle:
 
     def __init__(self, indptr: Ints, indices: Ints, values: Floats, *, sequential: bool, ordered: bool) -> None:
         self.sequential = sequential
+        self.pattern = indptr, indices, values
         order = np.arange(len(indptr) - 1, dtype=np.int32) if ordered else None
         self._library = load_mkl()
-        self._arrays = (indptr, indices, values, order)
+        self.threads = self.threads_now
+        self._order = order
         self._memory = np.zeros(64, dtype=np.int64)
         self._iparm = np.zeros(64, dtype=np.int32)
         self._iparm[0] = 1  # take nothing from the defaults
@@ -139,6 +157,11 @@ class _Handle:
             ctypes.byref(ctypes.c_int(0)),  # print nothing
         )
 
+    @property
+    def threads_now(self) -> int:
+        """How many threads the caller allows at this moment, by the environment, threadpoolctl or MKL itself."""
+        return 1 if self.sequential else int(self._library.MKL_Get_Max_Threads())
+
     def check(self, phase: int, b: Floats | None = None, x: Floats | None = None) -> None:
         """Run one phase and turn its error code into an exception."""
         code = self._call(phase, b, x)
@@ -158,15 +181,11 @@ class _Handle:
         self._columns.value = 1 if b is None else b.shape[1]
         self._error.value = 0
         # The setting is local to the calling thread and overrides the environment's; zero takes it back.
-        # With several threads and any ordering but METIS's, the improved two-level algorithm's solution of single
-        # right-hand sides is wrong (MKL 2026.2), of two or more right.
-        alone = self.sequential or (self.improved and b is not None and b.shape[1] == 1)
-        before = self._library.MKL_Set_Num_Threads_Local(1) if alone else 0
+        before = self._library.MKL_Set_Num_Threads_Local(self.threads)
         try:
             self._library.pardiso(*self._head, _address(b), _address(x), ctypes.byref(self._error))
         finally:
-            if alone:
-                self._library.MKL_Set_Num_Threads_Local(before)
+            self._library.MKL_Set_Num_Threads_Local(before)
         return self._error.value
 
 
