@@ -5,6 +5,7 @@
     python benchmarks/speed.py --triangles 500000 1000000 3500000 --peers igl.harmonic --memory
     python benchmarks/speed.py FOLDER … --triangles             # problem folders only
     python benchmarks/speed.py --animation                      # 100 frames of a moving boundary besides
+    python benchmarks/speed.py --triangles --join a.csv b.csv   # one table and picture of earlier runs
     python benchmarks/speed.py --fine                           # every iteration on the mesh itself, never a coarse one
 
 A made problem maps the head of a cat onto the letters C, R and S. A folder is a problem (``input.obj`` +
@@ -47,6 +48,7 @@ YARDSTICK = "igl.harmonic"
 LETTERS = "CRS"
 SIZES = (1_000, 4_000, 16_000, 64_000, 130_000)
 FRAMES = 100
+_MOVING = f"{FRAMES} frames"
 # What an iteration does besides factoring and solving.
 _REST = "assembly", "gradient", "optimiser"
 
@@ -176,8 +178,8 @@ def animation(triangles: int) -> list[Record]:
         return (radius + 0.5 - strip[:, 1])[:, None] * np.stack([np.sin(turn), -np.cos(turn)], axis=1)
 
     angles = np.linspace(0.05, 5.8, FRAMES)
-    afresh = Record("100 frames, each afresh", len(F), OURS, injective=True, iterations=0)
-    onwards = Record("100 frames, each from the last", len(F), OURS, injective=True, iterations=0)
+    afresh = Record(f"{_MOVING}, each afresh", len(F), OURS, injective=True, iterations=0)
+    onwards = Record(f"{_MOVING}, each from the last", len(F), OURS, injective=True, iterations=0)
     problem, last = Problem(V, F, loop, bent(angles[0])), None
     for angle in angles:
         for record in (afresh, onwards):
@@ -269,6 +271,22 @@ def write_csv(records: list[Record], path: Path) -> None:
             out.writerow(["" if fact is None else fact for fact in facts] + timed)
 
 
+def read_csv(path: Path) -> list[Record]:
+    """What `write_csv` wrote, medians for seconds."""
+    records = []
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            record = Record(row["problem"], int(row["triangles"]), row["tool"])
+            record.seconds = [] if row["seconds"] == "nan" else [float(row["seconds"])]
+            record.injective = {"True": True, "False": False}.get(row["injective"])
+            record.iterations = int(row["iterations"]) if row["iterations"] else None
+            record.megabytes = float(row["megabytes"]) if row["megabytes"] else None
+            if row[phases.NAMES[0]]:
+                record.phases = [{name: float(row[name]) for name in phases.NAMES}]
+            records.append(record)
+    return records
+
+
 def draw(records: list[Record], path: Path) -> None:
     """Seconds over triangles, both logarithmic: every problem a dot, every tool a line through its medians."""
     import matplotlib as mpl
@@ -279,8 +297,9 @@ def draw(records: list[Record], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
     for tool in dict.fromkeys(record.tool for record in records):
         done = [record for record in records if record.tool == tool and record.seconds]
-        sizes = sorted({record.triangles for record in done})
-        medians = [np.median([r.median for r in done if r.triangles == size]) for size in sizes]
+        # Meshes that differ by a triangle or two are one size.
+        sizes = sorted({float(f"{record.triangles:.2g}") for record in done})
+        medians = [np.median([r.median for r in done if float(f"{r.triangles:.2g}") == size]) for size in sizes]
         (line,) = axes.loglog(sizes, medians, label=tool, linewidth=2 if tool == OURS else 1.2)
         axes.loglog([r.triangles for r in done], [r.median for r in done], ".", color=line.get_color())
     axes.set(xlabel="triangles", ylabel="seconds")
@@ -303,6 +322,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=30, help="seconds, past which a tool gets no larger problem")
     parser.add_argument("--memory", action="store_true", help="peak memory too")
     parser.add_argument("--animation", action="store_true", help="a moving boundary, 20 000 triangles, too")
+    parser.add_argument("--join", nargs="*", type=Path, default=[], metavar="CSV", help="records of earlier runs")
     parser.add_argument("-o", "--output", type=Path, default=Path("figures"))
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -310,7 +330,9 @@ def main() -> None:
         return print_peak(options.peak[0], Path(options.peak[1]))
     tools = warm_up([OURS, *options.peers])
     strategy: Strategy = [Descent()] if options.fine else options.strategy
-    records: list[Record] = []
+    records = [record for path in options.join for record in read_csv(path)]
+    frames = [record for record in records if record.problem.startswith(_MOVING)]
+    records = [record for record in records if record not in frames]
     for name, arrays in problems(options.triangles, options.letters, options.folders):
         slow = {
             record.tool for record in records if record.median > options.limit and len(arrays[1]) > record.triangles
@@ -321,7 +343,7 @@ def main() -> None:
         records += found
         times = ", ".join(f"{record.tool} {_time(record)}" for record in found)
         print(f"{name}, {found[0].triangles} triangles, {found[0].iterations} iterations: {times}", flush=True)
-    frames = animation(20_000) if options.animation else []
+    frames += animation(20_000) if options.animation else []
     text = f"{machine()}\n"
     if records:
         text += f"\n{table(records)}\nOur time by phase, in percent:\n\n{phase_table(records)}"
