@@ -225,6 +225,7 @@ def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
         (lambda d: d.replace(b"4.1 0 8", b"3.0 0 8"), "version 3.0 is not known"),
         (lambda d: d.replace(b"4.1 0 8", b"4.1 0 4"), "4 bytes"),
         (lambda d: d[: d.index(b"$EndNodes")], "Nodes does not end"),
+        (lambda d: d.replace(b"Nodes", b"ParametricNodes"), "save it as 4.1, or without them"),
         (lambda d: d.replace(b"$Nodes", b"$Knots").replace(b"$EndNodes", b"$EndKnots"), r"no section \$Nodes"),
         (lambda d: b"solid x\n", "does not begin as an MSH file"),
         (lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 3 \1\n", d), "quadrangle: three-node triangles"),

@@ -135,7 +135,7 @@ def test_pictures_of_what_is_no_map(tmp_path, monkeypatch, capsys, arguments):
     mesh = tmp_path / "mesh.obj"
     io.write_obj(mesh, io.MeshData([[0, 0, 0], [1, 0, 0], [0, 1, 1.0]], [[0, 1, 2]]))
     assert main([*arguments, str(mesh)]) == 2
-    assert "there is no map" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith(f"qhm {arguments[0]}: {mesh}: there is no map")
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.obj"]
 
 

@@ -207,6 +207,7 @@ def test_positions_from_a_table(plate, tmp_path):
         ("0,nan,0", "line 1 is not"),
         ("0,0,0,0", "line 1 is not"),
         ("", "moves no vertex"),
+        ("3,0,0\n4,0,0\n3,1,0", "to.csv: names vertex 3 a second time at line 3"),
     ],
 )
 def test_tables_that_cannot_be_read(plate, tmp_path, capsys, text, message):
@@ -215,6 +216,12 @@ def test_tables_that_cannot_be_read(plate, tmp_path, capsys, text, message):
     assert main(["morph", str(path), "-o", str(out), "--positions", str(table)]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_table_that_is_not_there(plate, tmp_path, capsys):
+    out, table = tmp_path / "out.vtu", tmp_path / "none.csv"
+    assert main(["morph", str(plate("grid.vtu")), "-o", str(out), "--positions", str(table)]) == 2
+    assert capsys.readouterr().err.strip() == f"qhm morph: {table}: cannot be read: No such file or directory"
 
 
 def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):

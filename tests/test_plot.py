@@ -318,6 +318,8 @@ def test_animation_says_what_is_wrong(planar, tmp_path):
     for rows, message in ((V[:-1], r"second must have shape \(\d+, 2\)"), (V[:, :1], "second must have shape")):
         with pytest.raises(ValueError, match=message):
             save_animation(tmp_path / "a.gif", V, F, [("first", V), ("second", rows)])
+    with pytest.raises(ValueError, match=f"fixed refers to vertex {len(V)}, but"):
+        save_animation(tmp_path / "a.gif", V, F, [("one", V)], fixed=[0, len(V)])
     assert not list(tmp_path.iterdir())
 
 

@@ -461,6 +461,17 @@ class TestCommand:
         assert (io.map_of(io.read_obj(out)) != start).any(axis=1).sum() == len(inner_rows(F))
         capsys.readouterr()
 
+    def test_one_is_not_many(self, tmp_path, capsys):
+        V, F = disk(3)
+        start = V.copy()
+        start[0] = [0.4, 0.1]
+        path, out = tmp_path / "map.obj", tmp_path / "out.obj"
+        io.write_obj(path, io.MeshData(lift(V), F).with_map(start))
+        assert run("repair", path, "-o", out) == 0
+        first, island = capsys.readouterr().out.splitlines()
+        assert first.endswith(" triangles inverted before, 0 now; 1 vertex moved")
+        assert island.endswith(" inverted before, 0 now; 1 vertex moved")
+
     def test_status_1_where_something_is_left(self, tmp_path, capsys):
         V, F = grid(4, 4)
         path, out = tmp_path / "map.obj", tmp_path / "out.obj"

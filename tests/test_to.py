@@ -752,6 +752,26 @@ def test_closed_surfaces(qhm):
     assert np.allclose(io.read_mesh(qhm.out).V[: len(V)], V)
 
 
+def test_what_is_no_surface_is_said(qhm):
+    """A strip with half a twist has one boundary, which comes by every vertex; what is wrong is its winding."""
+    i, V = np.arange(0, 20, 2), np.random.default_rng(0).normal(size=(20, 3))
+    a, b, c, d = i, i + 1, (i + 2) % 20, (i + 3) % 20
+    c[-1], d[-1] = 1, 0
+    F = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
+    for onto in ("disk", "letter:A"):
+        status, _, said = qhm((V, F), "--to", onto)
+        assert status == 2
+        assert "mixed winding: edge (0, 1) traversed" in said
+
+
+def test_flat_triangles_are_told_of_which_file(qhm):
+    V, F = surfaces.disk(3)
+    V[3] = V[0]
+    status, _, said = qhm((V, F), "--to", "disk")
+    assert status == 2
+    assert "in.obj: triangle" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -771,6 +791,7 @@ def test_closed_surfaces(qhm):
         (["--to", "disk", "--corners", "1:2,1:3"], "vertex 1 is named more than once"),
         (["--to", "disk", "--corners", "1,1"], "vertex 1 is named more than once"),
         (["--corner-angle", "0"], "--corner-angle says how"),
+        ([], "in.obj: no face refers to texture coordinates (vt), which would say where the boundary goes: "),
     ],
 )
 def test_wrong_calls(qhm, options, message):

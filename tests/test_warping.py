@@ -43,7 +43,7 @@ def test_no_landmark_moved_is_the_same_picture():
         warped = warp_by_landmarks(image, points, points)
         assert warped.image.dtype == image.dtype
         assert warped.image == pytest.approx(image, abs=1e-5)
-        empty = warp_by_landmarks(image, np.empty((0, 2)), np.empty((0, 2)))
+        empty = warp_by_landmarks(image, [], np.empty((0, 2)))
         assert empty.image == pytest.approx(image, abs=1e-5)
 
 
@@ -68,6 +68,15 @@ def test_another_shape():
     assert drawn.shape == (5, 7)
     assert np.array_equal(drawn[1:, 2:6], image)
     assert drawn[0].sum() == drawn[:, :2].sum() == drawn[:, 6].sum() == 0
+
+
+@pytest.mark.parametrize("shape", [(30, 1000), (1000, 30)])
+def test_narrow_pictures_leave_a_way(shape):
+    size = np.array(shape[::-1]) - 1.0
+    along = np.where(size > 100, 0.2, 0.1)
+    warped = warp_by_landmarks(np.zeros(shape, np.uint8), [0.5 * size], [(0.5 + along) * size])
+    assert warped.result.certificate.bijective
+    assert warped.moved[-1] == pytest.approx((0.5 + along) * size)
 
 
 def test_landmarks_on_the_border_take_it_along():

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import check_range, index_array, real_array
 from quasiharmonic.certificate import Certificate, certify, is_injective
 from quasiharmonic.deformation_energy import DeformationEnergy
 from quasiharmonic.energies import ARAP, AreaBarrier, Combination
@@ -103,12 +104,12 @@ class AirMesh:
         gap: float | None = None,
         air_weight: float = 1e-3,
     ) -> None:
-        self._rest = np.array(points, dtype=np.float64)
-        self._F = np.array(F, dtype=np.int64)
+        self._rest, self._F = real_array("points", points), index_array("F", F)
         if self._rest.ndim != 2 or self._rest.shape[1] != 2 or not np.isfinite(self._rest).all():
             raise ValueError(f"points must be finite, of shape (n, 2), not {self._rest.shape}")
         if self._F.ndim != 2 or self._F.shape[1] != 3 or not self._F.size:
             raise ValueError(f"F must have shape (f, 3) with f > 0, not {self._F.shape}")
+        check_range("F", self._F, len(self._rest))
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
         if idle.size:
             raise ValueError(f"{named('vertex', 'vertices', idle)} in no triangle")
@@ -123,7 +124,9 @@ class AirMesh:
         if not 0 < self._gap < np.inf:
             raise ValueError(f"gap must be positive, not {gap}")
         self._loops = boundary_loops(self._F, len(self._rest))
-        self._sizes = [len(np.asarray(loop)) for loop in frame]
+        self._sizes = [np.asarray(loop).size // 2 for loop in frame]
+        if min(self._sizes, default=3) < 3:
+            raise ValueError(f"loops of the frame have at least 3 points, not {self._sizes}")
         self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(frame)]))
         if not self.moment.certificate.bijective:
             raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")

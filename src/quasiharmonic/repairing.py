@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.certificate import certify
 from quasiharmonic.diagnosis import Diagnosis
 from quasiharmonic.island_repair import IslandRepair
-from quasiharmonic.mesh.topology import named
+from quasiharmonic.mesh.topology import counted, named
 from quasiharmonic.result import Step
 from quasiharmonic.seams import Island, islands
 from quasiharmonic.strategy import whole_number
@@ -59,13 +59,13 @@ class RepairedIsland:
 
     def summary(self) -> str:
         """Say in a sentence what was done."""
-        size = f"{len(self.triangles)} {'triangle' if len(self.triangles) == 1 else 'triangles'}"
-        where = f"island at triangle {self.triangles[0]} ({size})"
+        where = f"island at triangle {self.triangles[0]} ({counted('triangle', 'triangles', len(self.triangles))})"
         overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
         if not self.inverted_before.size:
             return f"{where}: nothing to repair{overlap}"
         done = (
-            f"{len(self.inverted_before)} inverted before, {len(self.inverted)} now; {len(self.moved)} vertices moved"
+            f"{len(self.inverted_before)} inverted before, {len(self.inverted)} now; "
+            f"{counted('vertex', 'vertices', len(self.moved))} moved"
         )
         left = f"; {named('triangle', 'triangles', self.inverted)} left. {self.reason}" if self.inverted.size else ""
         return f"{where}: {done}{overlap}{left}"
@@ -116,11 +116,11 @@ class Repaired:
 
     def summary(self) -> str:
         """What was done, in all and for each island that needed it."""
-        count = len(self.islands)
         before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
         lines = [
-            f"{count} {'island' if count == 1 else 'islands'}: {before} triangles inverted before, {now} now; "
-            f"{len(self.moved)} vertices moved"
+            f"{counted('island', 'islands', len(self.islands))}: "
+            f"{counted('triangle', 'triangles', before)} inverted before, {now} now; "
+            f"{counted('vertex', 'vertices', len(self.moved))} moved"
         ]
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size])
 

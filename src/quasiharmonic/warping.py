@@ -17,8 +17,8 @@ from quasiharmonic.result import MapResult
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Vertices along the longer side of a picture.
-_ALONG = 48
+# Cells along the longer side of a picture, and at least along the shorter, so that there is a way past landmarks.
+_ALONG, _ACROSS = 48, 6
 # Pixels drawn at a time: what is in work stays in the cache.
 _PIXELS = 1 << 15
 # Triangles with more pixels than this on average are filled one by one.
@@ -238,6 +238,8 @@ def _drawable(kind: np.dtype[Any]) -> np.dtype[Any]:
 def _landmarks(points: ArrayLike, name: str) -> FloatArray:
     """Landmarks, checked to be points apart."""
     array = np.asarray(points, dtype=np.float64)
+    if array.shape == (0,):
+        array = array.reshape(0, 2)
     if array.ndim != 2 or array.shape[1] != 2:
         raise ValueError(f"{name} must have shape (k, 2), a row (x, y) for each, not {array.shape}")
     lost = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -285,10 +287,9 @@ def _mesh(landmarks: FloatArray, width: int, height: int) -> tuple[FloatArray, I
     from scipy.spatial import Delaunay, cKDTree
 
     spacing = max(width - 1, height - 1) / _ALONG
-    x = np.linspace(0, width - 1, max(2, round((width - 1) / spacing) + 1))
-    y = np.linspace(0, height - 1, max(2, round((height - 1) / spacing) + 1))
-    grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     size = (width - 1, height - 1)
+    x, y = (np.linspace(0, side, max(_ACROSS, round(side / spacing)) + 1) for side in size)
+    grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     sides, landmark_sides = ((p == 0) | (p == size) for p in (grid, landmarks))
     near = np.zeros(len(grid), dtype=bool)
     if len(landmarks):

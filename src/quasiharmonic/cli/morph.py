@@ -126,12 +126,14 @@ def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float6
 
     from quasiharmonic.io.errors import MeshFileError
 
-    vertices, places = [], []
+    places: dict[int, tuple[float, float]] = {}
     try:
         # Spreadsheets put a mark before the first line, and semicolons where a comma is the decimal point.
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise MeshFileError(path, "is not a text file") from error
+    except OSError as error:
+        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
     for number, line in enumerate(lines, start=1):
         words = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
         if not words or (number == 1 and words[0].lower() == "vertex"):
@@ -144,8 +146,9 @@ def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float6
             raise MeshFileError(
                 path, f"line {number} is not 'vertex,x,y' with a vertex from 0 to {n - 1}: {line[:60]!r}"
             )
-        vertices.append(vertex)
-        places.append(place)
-    if not vertices:
+        if vertex in places:
+            raise MeshFileError(path, f"names vertex {vertex} a second time", number)
+        places[vertex] = place
+    if not places:
         raise MeshFileError(path, "moves no vertex")
-    return np.array(vertices, dtype=np.int64), np.array(places)
+    return np.array(list(places), dtype=np.int64), np.array(list(places.values()))

@@ -133,9 +133,13 @@ def _same(path: Path, other: Path) -> bool:
 
 @contextmanager
 def about(source: Path | str) -> Iterator[None]:
-    """Tell of which file a message about a mesh speaks, and how it counts."""
+    """Tell of which file a message about a mesh speaks, and how it counts; messages about files say so themselves."""
+    from quasiharmonic.io.errors import MeshFileError
+
     try:
         yield
+    except MeshFileError:
+        raise
     except ValueError as error:
         raise ValueError(f"{source}: {error} (counting from 0)") from error
 

@@ -98,6 +98,11 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
             if value is not None and value is not False:
                 option = name.replace("_", "-")
                 raise ValueError(f"--{option} says how the boundary goes to an outline: name one by --to")
+        if mesh.FT is None and fixed is None:
+            raise ValueError(
+                f"{mesh.source}: no face refers to texture coordinates (vt), which would say where the boundary goes: "
+                "write some, or name an outline, as --to disk"
+            )
         with report.about(mesh.source):
             posed = Posed(mesh, Problem(*io.problem_arrays(mesh, fixed), reference=options.reference))
     else:
@@ -119,7 +124,7 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
 
 def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[NDArray[np.float64]]) -> Posed:
     """Lay the boundary along an outline."""
-    from quasiharmonic.mesh.topology import boundary_loops
+    from quasiharmonic.mesh.topology import boundary_loops, counted
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets import boundary_to, filled
 
@@ -133,13 +138,17 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[ND
         with report.about(mesh.source):
             opened = cut_open(mesh.V, mesh.F)
         facts["copied_vertices"] = copies = len(opened.V) - len(mesh.V)
-        notes.append(f"cut open: {copies} vertices along the cut have a copy at the end of the list")
+        which = counted("vertex along the cut has", "vertices along the cut have", copies)
+        notes.append(f"cut open: {which} a copy at the end of the list")
         extra = None if mesh.extra is None else mesh.extra[opened.origin]
         mesh = replace(mesh, V=opened.V, F=opened.F, extra=extra)
     whole = filled(contours)
     holes = len(contours) - len(whole)
-    with report.about(mesh.source):
+    try:
         loops = len(boundary_loops(mesh.F, len(mesh.V)))
+    except ValueError:
+        # What has no loops is no surface; below it is said why.
+        loops = 0
     if holes and loops == 1:
         facts["filled_holes"] = holes
         which = "the hole" if holes == 1 else f"the {holes} holes"
@@ -149,7 +158,8 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[ND
     angle = 20.0 if options.corner_angle is None else options.corner_angle
     with report.about(f"{mesh.source} --to {options.to}"):
         places = boundary_to(mesh.V, mesh.F, contours, corners=corners, corner_angle=angle)
-    return Posed(mesh, Problem(mesh.V, mesh.F, *places, reference=options.reference), facts, notes)
+    with report.about(mesh.source):
+        return Posed(mesh, Problem(mesh.V, mesh.F, *places, reference=options.reference), facts, notes)
 
 
 def _check_room(problem: Problem, to: str) -> None:

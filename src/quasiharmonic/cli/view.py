@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.screenshot is not None:
         report.check_picture("--screenshot", options.screenshot, inputs=(options.input,))
-    mesh = io.read_mesh(options.input)
+    V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
     with report.about(options.input):
-        show(*io.without_idle(*io.cut_at_seams(mesh)), screenshot=options.screenshot)
+        show(V, F, uv, screenshot=options.screenshot)
     return 0

@@ -50,6 +50,8 @@ def read_gmsh(data: bytes) -> MeshParts:
     for name, begin, end in _sections(data, position):
         if name == b"Nodes":
             nodes.append(_nodes(data, begin, end, version, order))
+        elif name == b"ParametricNodes":
+            raise ValueError("nodes with parameters are not known in version 2: save it as 4.1, or without them")
         elif name == b"Elements":
             elements.append(_elements(data, begin, end, version, order))
         elif name == b"NodeData":

@@ -88,12 +88,36 @@ def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> I
 
 
 def boundary_edges(F: NDArray[np.integer], n: int) -> IntArray:
-    """Half-edges ``i → j`` on the boundary, their triangle to the left; (k, 2) int64."""
+    """Half-edges ``i → j`` on the boundary, their triangle to the left.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    (k, 2) int64
+    """
     return edges(F, n).boundary
 
 
 def boundary_loops(F: NDArray[np.integer], n: int) -> list[IntArray]:
-    """Boundary vertices, loop by loop; see `trace_loops`."""
+    """Boundary vertices, loop by loop, the surface to the left.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+        Triangles, consistently oriented.
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    list of (k,) int64
+        Each loop once around, in the order of `trace_loops`.
+    """
     return trace_loops(boundary_edges(F, n))
 
 
@@ -139,9 +163,18 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
 
 
 def components(F: NDArray[np.integer], n: int) -> IntArray:
-    """Label of the connected component of every vertex, (n,) int64: its smallest vertex.
+    """Label of the connected component of every vertex.
 
-    A vertex without triangle is a component of its own.
+    Parameters
+    ----------
+    F : (f, 3) array of int
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    (n,) int64
+        The smallest vertex of the component. A vertex without triangle is a component of its own.
     """
     # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
     # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
@@ -161,6 +194,11 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
             return label
         tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
         np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
+
+
+def counted(one: str, many: str, count: int) -> str:
+    """Say how many of some elements there are: ``1 vertex``, ``7 vertices``."""
+    return f"{count} {one if count == 1 else many}"
 
 
 def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:

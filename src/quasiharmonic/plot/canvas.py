@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import check_range, index_array
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.plot.shading import View, drawable, edge_style, least_heights
 
@@ -106,7 +107,9 @@ def paint_map(
     ax.plot(*uv[F[tiny]].mean(axis=1).T, ".", markersize=3, markeredgewidth=0, color=RED, zorder=3)
     outline(ax, F, uv)
     if fixed is not None:
-        pins = np.setdiff1d(np.asarray(fixed, dtype=np.int64), boundary_edges(F, len(uv)))
+        held = index_array("fixed", fixed)
+        check_range("fixed", held, len(uv))
+        pins = np.setdiff1d(held, boundary_edges(F, len(uv)))
         ax.plot(*uv[pins].T, "o", markersize=5, color="white", mec=INK, mew=1.4, zorder=5)
 
 
