@@ -36,6 +36,7 @@ import phases
 from peers import PEERS
 from quasiharmonic import Descent, Problem, inject, io, is_injective, solve, surfaces
 from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 
 Floats = NDArray[np.float64]
@@ -225,7 +226,7 @@ def table(records: list[Record]) -> str:
         row = {r.tool: r for r in records if (r.problem, r.triangles) == (name, triangles)}
         yardstick = row.get(YARDSTICK)
         cells = [name, f"{triangles:,}", *(_time(row.get(tool)) for tool in tools)]
-        cells.append(f"{row[OURS].median / yardstick.median:.2f}" if yardstick else "")
+        cells.append(f"{row[OURS].median / yardstick.median:.2f}" if yardstick and OURS in row else "")
         found = [row[tool].megabytes if tool in row else None for tool in tools if measured]
         rows.append(cells + ["" if megabytes is None else f"{megabytes:.0f}" for megabytes in found])
     return f"{_markdown(heads, rows)}\n×: has inverted triangles.\n"
@@ -236,7 +237,9 @@ def phase_table(records: list[Record]) -> str:
     heads = ["problem", "triangles", "iterations", *phases.NAMES, "an iteration's rest / factor + solve"]
     rows = []
     for name, triangles in _rows(records):
-        ours = next(r for r in records if (r.problem, r.triangles, r.tool) == (name, triangles, OURS))
+        ours = next((r for r in records if (r.problem, r.triangles, r.tool) == (name, triangles, OURS)), None)
+        if ours is None:
+            continue  # it took too long with a smaller problem
         shares = [f"{100 * ours.phase(phase) / ours.median:.0f}" for phase in phases.NAMES]
         rest, solving = (sum(map(ours.phase, names)) for names in (_REST, ("factor", "solve")))
         rows.append([name, f"{triangles:,}", str(ours.iterations), *shares, f"{rest / solving:.2f}"])
@@ -309,28 +312,52 @@ def draw(records: list[Record], path: Path) -> None:
     plt.close(figure)
 
 
-def main() -> None:
+def _count(text: str) -> int:
+    """A whole number of at least one, of an argument."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is less than 1")
+    return number
+
+
+def _records(path: str) -> list[Record]:
+    """The records of an earlier run, of an argument."""
+    try:
+        return read_csv(Path(path))
+    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"{path} holds no records of this benchmark: {error}") from error
+
+
+def _folder(path: str) -> Path:
+    """A folder with a problem in it, of an argument."""
+    folder = Path(path)
+    if next(folder.rglob("input.obj"), None) is None:
+        raise argparse.ArgumentTypeError(f"there is no input.obj in {path}, nor in a folder of it")
+    return folder
+
+
+def main(arguments: list[str] | None = None) -> None:
     """Measure, print a table as it grows, write the files."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", type=Path, help="problem folders")
-    parser.add_argument("--triangles", nargs="*", type=int, default=list(SIZES), help="sizes of the made problems")
+    parser.add_argument("folders", nargs="*", type=_folder, help="problem folders")
+    parser.add_argument("--triangles", nargs="*", type=_count, default=list(SIZES), help="sizes of the made problems")
     parser.add_argument("--letters", default=LETTERS, help="their targets (%(default)s)")
     parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), help="what to compare with")
-    parser.add_argument("--strategy", default="speed", help="speed or quality (%(default)s)")
+    parser.add_argument("--strategy", choices=STRATEGIES, default="speed", help="%(choices)s (%(default)s)")
     parser.add_argument("--fine", action="store_true", help="VectorAdam alone, on the mesh itself")
-    parser.add_argument("-r", "--runs", type=int, default=5, help="turns of every tool")
+    parser.add_argument("-r", "--runs", type=_count, default=5, help="turns of every tool")
     parser.add_argument("--limit", type=float, default=30, help="seconds, past which a tool gets no larger problem")
     parser.add_argument("--memory", action="store_true", help="peak memory too")
     parser.add_argument("--animation", action="store_true", help="a moving boundary, 20 000 triangles, too")
-    parser.add_argument("--join", nargs="*", type=Path, default=[], metavar="CSV", help="records of earlier runs")
+    parser.add_argument("--join", nargs="*", type=_records, default=[], metavar="CSV", help="records of earlier runs")
     parser.add_argument("-o", "--output", type=Path, default=Path("figures"))
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if options.peak:
         return print_peak(options.peak[0], Path(options.peak[1]))
     tools = warm_up([OURS, *options.peers])
     strategy: Strategy = [Descent()] if options.fine else options.strategy
-    records = [record for path in options.join for record in read_csv(path)]
+    records = [record for joined in options.join for record in joined]
     frames = [record for record in records if record.problem.startswith(_MOVING)]
     records = [record for record in records if record not in frames]
     for name, arrays in problems(options.triangles, options.letters, options.folders):
@@ -341,8 +368,8 @@ def main() -> None:
         for record in found if options.memory else ():
             record.megabytes = peak_megabytes(arrays, record.tool)
         records += found
-        times = ", ".join(f"{record.tool} {_time(record)}" for record in found)
-        print(f"{name}, {found[0].triangles} triangles, {found[0].iterations} iterations: {times}", flush=True)
+        times = ", ".join(f"{record.tool} {_time(record)}" for record in found) or "every tool has exceeded the limit"
+        print(f"{name}, {len(arrays[1])} triangles: {times}", flush=True)
     frames += animation(20_000) if options.animation else []
     text = f"{machine()}\n"
     if records:

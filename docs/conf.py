@@ -62,7 +62,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "remove_config_comments": True,
-    "within_subsection_order": "FileNameSortKey",
+    "within_subsection_order": "order.by_kind",
     "notebook_images": False,
     "first_notebook_cell": "# Run this in the folder examples/ of a checkout, where what the scripts share is.",
 }

@@ -2,10 +2,10 @@
 ==============================
 
 The paper's first picture maps Lucy onto the letter G: tanh and Adam find an injective map in tens of gradient steps
-and 3.1 s of MATLAB, the fastest rival of the time in 300 times as long.
+and 3.1 s of MATLAB; SBP (Garanzha et al. 2021), in C++ on all cores, takes 300 times as long.
 
 Here it is an angel of our own, 25,074 triangles of which Tutte's embedding inverts 2,278. tanh takes 16 iterations,
-and with everything included about six times as long as Tutte's embedding alone: half a second on one core. The rival
+and with everything included three to six times as long as Tutte's embedding alone, less than a second on one core. SBP
 is another program and not run here; ``qhm report --against`` draws a comparison from anybody's records.
 """
 

@@ -9,12 +9,12 @@ What breaks first is existence, and that is proven: on the three rings with but 
 the diagnosis names vertices that cannot see all their fixed neighbours from any point of the target, so no map
 exists. With a layer or two more there is one. Where nothing forbids a map,
 
-- V₃ never fails: tanh takes 64 to 290 iterations, si-log 220 to 482, down to a strip of 1/40 of the width;
-- V₂ never fails with si-log (246 to 491) and does on five of eleven rings with tanh;
-- V₁ fails with si-log on the narrowest strip alone (2 of 7,800 triangles), with tanh on four;
+- V₃ never fails with si-log (232 to 499 iterations), down to a strip of 1/40 of the width; with tanh (64 to 188) it
+  does on that one alone, where 10 of 7,800 triangles stay inverted, which `solve` rights with its later stages;
+- V₂ and V₁ fail with si-log on that one alone (2 and 8 triangles), with tanh on five and four of eleven rings;
 - V₄ fails on six with tanh and on seven with si-log, for the reason that Figure 6 has; Newton's method saves the rest.
 
-Refinement is no difficulty: 6 and 12 layers take 108 and 112 iterations.
+Refinement is no difficulty: 6 and 12 layers take 108 and 113 iterations.
 
 By default every combination runs on the first ring and those with a chance on the others; ``--full`` runs
 all on all, ``--size 14`` adds the two narrowest rings.

@@ -4,7 +4,7 @@
 The paper shows V₃, V₄ and V₁, all of them injective at last: V₃ opens a hole in the middle, V₁ moves the singularity
 to a corner first, V₄ turns the whole domain and takes the fewest iterations.
 
-Here V₃ takes 220 iterations, V₂ 246, V₁ 509, and all three go the same way: nothing much for about 90 iterations,
+Here V₃ takes 232 iterations, V₂ 242, V₁ 497, and all three go the same way: nothing much for about 90 iterations,
 then a hole opens in the middle and within ten iterations fills the inner square. V₁'s detour by a corner does not
 occur: the mesh is its own image under half a turn and the start is undisturbed, so the middle stays the middle.
 

@@ -2,7 +2,8 @@
 ===============================================================================================
 
 The paper compares si-log, which keeps the largest σ₁/σ₂ small, with a map of least MIPS energy (tanh + MIPS), which
-concentrates it in a spike at the point. So it is here: si-log takes 3 iterations and its largest ratio is 2.9; the map
+concentrates it in a spike at the point, and with Bounded Distortion Mapping (Lipman 2012), another program and not run
+here. So it is here: si-log takes 3 iterations and its largest ratio is 2.9; the map
 of least MIPS has less than half its energy (0.25 against 0.57) and a largest ratio of 35.
 
 The paper descends MIPS along with V₃ from tanh; here the si-log map is polished. tanh alone takes 218 iterations to

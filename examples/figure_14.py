@@ -6,9 +6,9 @@ for each of its meshes beside that of SBP: 0.01 to 5 s for most, where SBP takes
 
 Here are the first 80 problems of a set that is generated (``benchmarks/dataset.py``), or with ``--data FOLDER`` those
 of the benchmark itself. All are solved: by the paper's strategy, ``quality``, with si-log first and tanh where that
-does not get through, in 0.08 s (median; 23 s at most), and by ``speed``, with tanh first, in 0.04 s (1.1 s). Half of
-the meshes have fewer than 200 triangles and a boundary made to be hard; on them si-log keeps angles no better, median
-MIPS 15 against 12, as it does on smooth surfaces (Figures 5 and 8). Polished for least MIPS it is 4.7.
+does not get through, in 0.03 s (median; 7 s at most), and by ``speed``, with tanh first, in 0.01 s (0.3 s). Half of the
+meshes have fewer than 200 triangles and a boundary made to be hard; on them si-log does not keep angles better, as it
+does on smooth surfaces (Figures 5 and 8): median MIPS is 15 against 12. Polished for least MIPS it is 4.7.
 
 TLC and SBP are other programs; ``qhm report --against`` draws both figures against records of theirs.
 """

@@ -6,7 +6,7 @@ to the letter's; R is mapped onto from a surface without one, so the letter's is
 boundary vertex goes where, how the letter stands and how its hole is turned are found from the shapes.
 
 The command writes a mesh file and judges it as a reader gets it. At the default size, 2,400 triangles each, every map
-is bijective after 6 to 28 iterations, where Tutte's embedding inverts 18 to 705 triangles.
+is bijective after 19 to 37 iterations, polish included, where Tutte's embedding inverts 18 to 705 triangles.
 """
 
 from __future__ import annotations

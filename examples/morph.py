@@ -1,5 +1,5 @@
 """The boundary of a finite-element mesh has moved: a flap turned in its channel
-============================================================================
+=============================================================================
 
 A mesh around a flap, which is then turned by up to 75°, while the walls stay. What is commonly done is to spread the
 displacement of the boundary over the interior by Laplace's equation; that inverts triangles in the end. ``morph``

@@ -9,7 +9,7 @@ SBP is another program. Its energy, MIPS with 1/128 of an area term, is `polish`
 injective map where SBP has to find one: its column is what that energy comes to, and not SBP's path to it.
 
 =============== ============ ====== =========== ====================
-                SBP's energy si-log tanh + MIPS the paper's three
+map             SBP's energy si-log tanh + MIPS the paper's three
 =============== ============ ====== =========== ====================
 angel onto G    3.39         6.72   1.76        2.24, 2.24, 0.60
 angel onto S    3.12         5.64   1.47        2.37, 1.82, 0.511

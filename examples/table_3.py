@@ -4,8 +4,8 @@
 The paper has 1.2 to 5.2 s for tanh and 3.6 to 10 s for si-log, both in MATLAB, and 63 to 929 s for SBP, a C++ program
 on all cores; the ratio is 38 to 300.
 
-Here, on surfaces of our own with 14,000 to 33,000 triangles and one core, tanh takes 3 to 35 iterations and 0.2 to
-1.1 s, si-log 7 to 129 and 0.4 to 5 s. Beside them is one Tutte embedding of the same mesh: tanh costs 2.5 to 9 of
+Here, on surfaces of our own with 14,000 to 33,000 triangles and one core, tanh takes 3 to 35 iterations and 0.1 to
+0.5 s, si-log 7 to 129 and 0.2 to 2.5 s. Beside them is one Tutte embedding of the same mesh: tanh costs 2 to 10 of
 those. SBP is another program and not run here.
 """
 

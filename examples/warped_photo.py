@@ -2,7 +2,7 @@
 =======================================================================================================================
 
 Try it on your own photo: give the file, and a text file with a line ``x y x' y'`` for each landmark, in pixels from
-the upper left corner, where it is and where it is to go:
+the upper left corner, where it is and where it is to go::
 
     python examples/warped_photo.py --photo me.jpg --landmarks points.txt
 

@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import campaign
 import problems
+import speed
 
 FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"]
 
@@ -232,3 +233,41 @@ def test_summary_counts_what_each_fallback_adds():
     assert table[1].split() == ["family", "of", "vector-adam", "patches"]
     assert table[2].split() == ["jam", "4", "1", "3"]
     assert table[3].split() == ["all", "4", "1", "3"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--strategy", "fast"], "invalid choice"),
+        (["--triangles", "0"], "0 is less than 1"),
+        (["-r", "0"], "0 is less than 1"),
+        (["nowhere"], "no input.obj in nowhere"),
+        (["--join", "nowhere.csv"], "nowhere.csv holds no records"),
+        (["--join", "other.csv"], "other.csv holds no records"),
+    ],
+)
+def test_wrong_calls_of_the_speed_benchmark_are_refused(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("other.csv").write_text("name,value\na,1\n")
+    with pytest.raises(SystemExit) as ended:
+        speed.main(arguments)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
+
+
+def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
+    """A tool past the limit gets no larger problem, ours as well."""
+    once = ["--peers", "-r", "1", "--letters", "C", "-o", str(tmp_path)]
+    speed.main([*once, "--triangles", "100", "300", "--limit", "1e-9"])
+    assert "cat on C, 294 triangles: every tool has exceeded the limit" in capsys.readouterr().out
+    (first,) = speed.read_csv(tmp_path / "speed.csv")
+    assert first.injective
+    assert 0.5 * first.median < sum(first.phases[0].values()) <= first.median
+    assert "cat on C | 96 |" in (tmp_path / "speed.md").read_text()
+    other = speed.Record("cat on C", 294, speed.YARDSTICK, [0.5], injective=False)
+    speed.write_csv([first, other], tmp_path / "both.csv")
+    speed.main([*once, "--triangles", "--join", str(tmp_path / "both.csv")])
+    text = (tmp_path / "speed.md").read_text()
+    assert "| cat on C | 294 |  | 0.5 × |  |" in text
+    assert (tmp_path / "speed.png").stat().st_size > 0

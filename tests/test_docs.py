@@ -11,6 +11,7 @@ FOLDER = Path(__file__).parent.parent
 PAGES = (
     FOLDER / "README.md",
     FOLDER / "docs" / "index.md",
+    FOLDER / "docs" / "existence.md",
     FOLDER / "docs" / "howto.md",
     FOLDER / "docs" / "method.md",
     FOLDER / "docs" / "tutorial.md",

@@ -57,14 +57,19 @@ def test_factorisations(counted, rings, character, most):
     assert result.injective
     # Other orders of summation on other machines may take a few more.
     most = most + 2 + most // 5
-    evening = 11  # factorisations of another matrix, where a coarse map is polished before it is carried on
     fine = problem.n - problem.fixed.size
-    for (kind, size), times in counted.items():
-        assert times <= (1 if kind == "analyse" else max(most, evening)), (kind, size)
+    sizes = sorted({size for _, size in counted})
+    bounds = {sizes[0]: most + 1}
     if rings == 50:
-        assert max(size for _, size in counted) < 0.5 * fine
+        assert sizes[0] < 0.1 * fine
+        # Positions in both directions, where a coarse map is polished before it is carried on.
+        bounds[2 * sizes[0]] = 11
     else:
+        assert sizes == [fine]
         assert counted["factor", fine] == counted["solve", fine] == result.iterations + 1
+    assert sizes == sorted(bounds)
+    for (kind, size), times in counted.items():
+        assert times <= (1 if kind == "analyse" else bounds[size]), (kind, size)
 
 
 def test_a_moved_target_is_not_analysed_again_and_starts_near_its_solution(counted):

@@ -640,6 +640,39 @@ def test_pardiso_survives_changes_of_threads_between_its_phases():
     assert run.returncode == 0, run.stderr[-2000:]
 
 
+_TEAM = """
+import numpy as np
+from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.surfaces import grid
+V, F = grid(200, 200)
+rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))
+laplacian = Laplacian(F, len(V), rim, "pardiso", V)
+laplacian.factor(np.full((3, len(F)), -1.0))
+laplacian.extend(V @ [1, 1j])
+print(laplacian.solver._handle.threads)
+"""
+
+
+@needs_mkl
+@pytest.mark.parametrize(
+    ("name", "value", "threads"),
+    [
+        ("OMP_THREAD_LIMIT", "1", "1"),
+        ("OMP_THREAD_LIMIT", "2", "2"),
+        ("KMP_DEVICE_THREAD_LIMIT", "1", "1"),
+        ("OMP_DYNAMIC", "TRUE", "1"),
+        ("OMP_DYNAMIC", "false", "2"),
+        ("OMP_MAX_ACTIVE_LEVELS", "0", "1"),
+    ],
+)
+def test_pardiso_does_not_wait_for_threads_that_openmp_refuses(name, value, threads):
+    environment = os.environ | {"MKL_NUM_THREADS": "2", "MKL_DYNAMIC": "FALSE", name: value}
+    run = subprocess.run(
+        [sys.executable, "-c", _TEAM], env=environment, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert run.stdout.split() == [threads]
+
+
 @needs_mkl
 def test_pardiso_leaves_the_number_of_threads_alone():
     library = mkl.load_mkl()

@@ -21,4 +21,5 @@ def picture_scraper(block: Any, block_vars: dict[str, Any], gallery_conf: dict[s
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(picture, place)
         found.append(str(place))
-    return figure_rst(found, gallery_conf["src_dir"])
+    # One below the other: side by side, pictures of different shapes become too small to read.
+    return "\n".join(figure_rst([picture], gallery_conf["src_dir"]) for picture in found)

@@ -208,7 +208,22 @@ def certify(
 def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     """Whether there are triangles and every one is strictly positive, decided exactly.
 
-    The predicate to the locator `flipped_triangles`; parameters and errors as in `certify`.
+    The predicate to the locator `flipped_triangles`.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+    uv : (n, 2) array
+        Taken as they are stored, integers and float32 too, as in `certify`.
+
+    Returns
+    -------
+    bool
+
+    Raises
+    ------
+    ValueError
+        When shapes are wrong or an index is out of range, as in `certify`.
     """
     F, uv = _checked(F, uv)
     return len(F) > 0 and bool(np.all(_signs(F, uv)[0] > 0))
@@ -217,13 +232,22 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
 def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
     """Find the triangles that keep a map from being injective, exactly.
 
-    Parameters and errors as in `certify`.
+    Parameters
+    ----------
+    F : (f, 3) array of int
+    uv : (n, 2) array
+        Taken as they are stored, integers and float32 too, as in `certify`.
 
     Returns
     -------
     (k,) int64
         Ascending indices of *all* triangles that are not strictly positive: clockwise, without area
         or not finite. `certify` tells them apart.
+
+    Raises
+    ------
+    ValueError
+        When shapes are wrong or an index is out of range, as in `certify`.
     """
     return np.flatnonzero(_signs(*_checked(F, uv))[0] <= 0)
 

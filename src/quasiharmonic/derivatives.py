@@ -145,7 +145,19 @@ def check_energy(energy: Energy, d: Deformation | None = None) -> EnergyCheck:
 
 
 def random_deformation(f: int, seed: int = 0) -> Deformation:
-    """Draw ``f`` triangles' worth of Jacobians with positive determinants, singular values around 1."""
+    """Draw Jacobians with positive determinants, singular values around 1.
+
+    Parameters
+    ----------
+    f : int
+        How many triangles.
+    seed : int
+        The same seed, the same Jacobians.
+
+    Returns
+    -------
+    Deformation
+    """
     rng = np.random.default_rng(seed)
     turns = np.exp(2j * np.pi * rng.random((2, f)))
     p = np.exp(0.4 * rng.standard_normal(f))

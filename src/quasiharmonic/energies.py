@@ -136,11 +136,32 @@ class Energy(ABC):
 
     @abstractmethod
     def density(self, d: Deformation) -> FloatArray:
-        """The energy (f,) float64; ``inf`` outside of its domain."""
+        """The energy per unit of rest area.
+
+        Parameters
+        ----------
+        d : Deformation
+            Jacobians of f triangles, as p = ∂w/∂z and q = ∂w/∂z̄.
+
+        Returns
+        -------
+        (f,) float64
+            Without unit, as the Jacobians are; ``inf`` outside of its domain.
+        """
 
     @abstractmethod
     def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives by p and q, (f,) complex128: ``∂/∂Re + i ∂/∂Im`` of each."""
+        """Derivatives of the density by p and q.
+
+        Parameters
+        ----------
+        d : Deformation
+
+        Returns
+        -------
+        by_p, by_q : (f,) complex128
+            ``∂/∂Re + i ∂/∂Im`` of each.
+        """
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative as a quadratic form in (dp, dq).
@@ -152,6 +173,11 @@ class Energy(ABC):
             What becomes of negative eigenvalues: they are multiplied by this. 0 clamps them, which makes
             the form positive semidefinite; -1 takes absolute values, a more careful choice while the energy
             is far from quadratic; 1 leaves the second derivative as it is.
+
+        Returns
+        -------
+        QuadraticForm
+            One for each triangle.
 
         Raises
         ------
@@ -375,6 +401,15 @@ def conformal_area_blend(theta: float = 1 / 128) -> Combination:
     """``(1 − θ) MIPS + θ E_a``: the energy of Garanzha et al. (§10.2), with their θ unless another is given.
 
     A little of the area term keeps the map's scale from varying without bounds, which MIPS alone allows.
+
+    Parameters
+    ----------
+    theta : float
+        Share θ of the area term ``E_a = D + 1/D − 2``, from 0 to 1.
+
+    Returns
+    -------
+    Combination
 
     Raises
     ------

@@ -60,11 +60,31 @@ class Functional(ABC):
 
     @abstractmethod
     def value(self, at: QuasiHarmonicMap) -> float:
-        """V at a tensor field and its map."""
+        """V at a tensor field and its map.
+
+        Parameters
+        ----------
+        at : QuasiHarmonicMap
+
+        Returns
+        -------
+        float
+            In the units of area of the problem's frame; that of V₁ depends on the mesh.
+        """
 
     @abstractmethod
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """``∂V/∂Re ξ + i ∂V/∂Im ξ`` there; (f,) complex128."""
+        """Gradient of V by ξ there, of map and tensors together.
+
+        Parameters
+        ----------
+        at : QuasiHarmonicMap
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂V/∂Re ξ + i ∂V/∂Im ξ``.
+        """
 
 
 class QuasiHarmonicMap(Protocol):
@@ -181,12 +201,30 @@ FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev
 
 
 def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
-    """V₃ of any map, ``Σ 2m |q − μp|² / (1 − |μ|²)``: its A-Dirichlet energy less its signed area."""
+    """V₃ of any map, its A-Dirichlet energy less its signed area (eq. 27).
+
+    Parameters
+    ----------
+    mesh : ReferenceMesh
+    field : TensorField
+    dw : Derivatives
+        Of the map, as `ReferenceMesh.derivatives` has them.
+
+    Returns
+    -------
+    float
+        ``Σ 2m |q − μp|² / (1 − |μ|²)``, in the target's units of area; never negative.
+    """
     return beltrami_gradient(mesh, field, dw)[0]
 
 
 def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[float, ComplexArray]:
     """V₃ of any map and its gradient in μ with the map held; at the quasi-harmonic map that is all of it.
+
+    Parameters
+    ----------
+    mesh, field, dw
+        As of `beltrami_energy`.
 
     Returns
     -------
@@ -231,7 +269,19 @@ def work(force: ComplexArray, displacement: ComplexArray) -> float:
 
 
 def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
-    """``R (g_u + i g_v)`` with ``g_u = C b_v`` and ``g_v = −C b_u`` (Theorem 6.4); (n,) complex128."""
+    """Neumann data that the target asks for, ``R (g_u + i g_v)``: ``g_u = C b_v``, ``g_v = −C b_u`` (Theorem 6.4).
+
+    Parameters
+    ----------
+    problem : Problem
+    w : (n,) complex128
+        A map; only its values at the boundary count.
+
+    Returns
+    -------
+    (n,) complex128
+        Zero but at the boundary.
+    """
     g = np.zeros(problem.n, dtype=np.complex128)
     for loop in problem.loops:
         b = w[loop]
@@ -240,6 +290,20 @@ def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
 
 
 def neumann_residual(problem: Problem, laplacian: Laplacian, w: ComplexArray) -> ComplexArray:
-    """``L w − R g`` at the fixed vertices, zero elsewhere; (n,) complex128."""
+    """What the Neumann data of a map lack, ``L w − R g`` (eq. 24).
+
+    Parameters
+    ----------
+    problem : Problem
+    laplacian : Laplacian
+        Assembled for the tensors in question.
+    w : (n,) complex128
+        Their quasi-harmonic map.
+
+    Returns
+    -------
+    (n,) complex128
+        Zero but at the fixed vertices.
+    """
     # A boundary vertex is fixed, so both terms are zero at free vertices.
     return laplacian.flux(w) - neumann_target(problem, w)

@@ -232,6 +232,11 @@ def edge_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Refe
     reference : {"rest", "equilateral", "corrected"}
         The triangles in which A is meant, unless the problem itself names them.
 
+    Returns
+    -------
+    Conormal
+        One row for each boundary edge.
+
     Raises
     ------
     ValueError
@@ -259,7 +264,20 @@ def vertex_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Re
     Where the map is quasi-harmonic and ``det A = 1``, ``flux = normal`` everywhere makes it injective (Theorem
     6.4). ``s > 0`` alone does not: at a vertex positive triangles make up for inverted ones.
 
-    Parameters and errors are those of `edge_conormal`.
+    Parameters
+    ----------
+    problem, A, uv, reference
+        As of `edge_conormal`.
+
+    Returns
+    -------
+    Conormal
+        One row for each boundary vertex.
+
+    Raises
+    ------
+    ValueError
+        When A has another shape or is not elliptic.
     """
     w = _complex(uv)
     flux = _stiffness(problem, _elliptic(A, len(problem.F)), reference) @ w

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -139,7 +140,7 @@ def harmonise(
     lenient: Reference = reference if energy is None else "equilateral"
     problem = Problem(V, F, fixed, np.zeros((np.size(fixed), 2)), reference=lenient)
     problem.reference = None
-    return harmonise_map(
+    result = harmonise_map(
         problem,
         uv,
         energy=energy,
@@ -151,8 +152,8 @@ def harmonise(
         reference=reference,
         linear_solver=linear_solver,
         callback=callback,
-        _began=began,
     )
+    return replace(result, seconds=time.perf_counter() - began)
 
 
 def harmonise_map(
@@ -168,13 +169,12 @@ def harmonise_map(
     reference: Reference = "rest",
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    _began: float | None = None,
 ) -> MapResult:
     """Harmonise a map of a `Problem` at hand; the rest as `harmonise` has it.
 
     The problem's ``fixed`` vertices stay where they are in ``uv``; its ``target`` is not looked at.
     """
-    began = time.perf_counter() if _began is None else _began
+    began = time.perf_counter()
     chosen = _energy(energy, problem)
     barrier = chosen is not None and chosen.barrier
     schedule = _schedule(eta, barrier)

@@ -109,7 +109,7 @@ def injective_map(
     """
     began = time.perf_counter()
     problem = Problem(V, F, fixed, target, reference=reference)
-    return solve(
+    result = solve(
         problem,
         strategy=strategy,
         polish=polish,
@@ -118,8 +118,8 @@ def injective_map(
         linear_solver=linear_solver,
         callback=callback,
         record=record,
-        _began=began,
     )
+    return replace(result, seconds=time.perf_counter() - began)
 
 
 def solve(
@@ -132,10 +132,29 @@ def solve(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     record: int = 0,
-    _began: float | None = None,
 ) -> MapResult:
-    """Solve a problem at hand; parameters and result as `injective_map` has them."""
-    began = time.perf_counter() if _began is None else _began
+    """Solve a problem at hand.
+
+    Parameters
+    ----------
+    problem : Problem
+        It has the kind of reference triangles too, and is not changed but for what it keeps to be solved again sooner.
+    strategy, polish, start, max_iterations, linear_solver, callback, record
+        As of `injective_map`.
+
+    Returns
+    -------
+    MapResult
+        As of `injective_map`.
+
+    Raises
+    ------
+    ValueError
+        When an option is none that there is, or ``start`` has another shape than (n, 2) or a place that is not finite.
+    ImportError
+        When the linear solver named is not installed.
+    """
+    began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=1)
     whole_number("record", record, least=0)
     lower = None if polish is None else energy_named(polish)
@@ -170,7 +189,7 @@ def quasi_harmonic_map(
     reference: Reference = "equilateral",
     linear_solver: str = "auto",
 ) -> FloatArray:
-    """The map of a tensor field (eq. 12): Tutte's embedding where no field is given.
+    """The quasi-harmonic map of a tensor field, or Tutte's embedding where no field is given (equation 12).
 
     Parameters
     ----------

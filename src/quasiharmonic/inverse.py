@@ -138,6 +138,11 @@ class InverseMap:
         -------
         SurfacePoints
             Triangle -1 outside of the map's image, and for places that are not finite.
+
+        Raises
+        ------
+        ValueError
+            When the last axis is not of length 2.
         """
         places = np.asarray(points, dtype=np.float64)
         if places.ndim < 1 or places.shape[-1] != 2:
@@ -160,9 +165,19 @@ class InverseMap:
         return SurfacePoints(triangle, barycentric)
 
     def plane(self, at: SurfacePoints) -> FloatArray:
-        """Where points of the surface lie in the plane: the map itself; (..., 2) float64.
+        """Where points of the surface lie in the plane: the map itself.
 
         Rounding does not take a point beyond its triangle's box, so it stays on a side along an axis.
+
+        Parameters
+        ----------
+        at : SurfacePoints
+            Of any shape.
+
+        Returns
+        -------
+        (..., 2) float64
+            NaN where there is no triangle.
 
         Raises
         ------
@@ -174,13 +189,39 @@ class InverseMap:
         return np.clip(places, corners.min(axis=-2), corners.max(axis=-2))
 
     def surface(self, at: SurfacePoints) -> FloatArray:
-        """Positions in space, or in the plane where ``V`` is planar; (..., 2) or (..., 3) float64."""
+        """Positions of points of the surface.
+
+        Parameters
+        ----------
+        at : SurfacePoints
+            Of any shape.
+
+        Returns
+        -------
+        (..., 3) float64
+            In space, in the units of ``V``; (..., 2) where ``V`` is planar. NaN where there is no triangle.
+
+        Raises
+        ------
+        ValueError
+            When ``at`` names a triangle that is not there.
+        """
         return self.values(at, self.V)
 
     def normals(self, at: SurfacePoints) -> FloatArray:
-        """Unit normals of the triangles, on the side from which they are counterclockwise; (..., 3) float64.
+        """Unit normals of the triangles, on the side from which they are counterclockwise.
 
         For smooth normals, interpolate those of the vertices with `values`.
+
+        Parameters
+        ----------
+        at : SurfacePoints
+            Of any shape.
+
+        Returns
+        -------
+        (..., 3) float64
+            NaN where there is no triangle.
 
         Raises
         ------
@@ -256,6 +297,11 @@ class InverseMap:
         v : (rows,) float64
         at : SurfacePoints
             Of shape (columns, rows): ``at.triangle[i, j]`` is at ``(u[i], v[j])``.
+
+        Raises
+        ------
+        ValueError
+            When there are fewer than 2 points along an axis.
         """
         if columns < 2 or rows < 2:
             raise ValueError(f"a grid has at least 2 points along each axis, not {columns} by {rows}")

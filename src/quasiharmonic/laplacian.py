@@ -1,4 +1,4 @@
-"""The anisotropic Laplacian ``Gᵀ A G`` and the map it determines: A ↦ (u, v) (§6.2, eq. 12).
+"""The anisotropic Laplacian ``Gᵀ A G`` and the map it determines, A ↦ (u, v): §6.2, equation 12.
 
 The pattern of ``Sᵀ Gᵀ A G S`` is that of the mesh's edges and never changes, so it is found and
 analysed once. An assembly is then one gather of the triangles' edge stiffnesses into the values that

@@ -118,7 +118,7 @@ def polish(
     began = time.perf_counter()
     # Where the fixed vertices are does not matter to the checks; where they are is where ``uv`` has them.
     problem = Problem(V, F, fixed, np.zeros((np.size(fixed), 2)), reference="equilateral")
-    return polish_map(
+    result = polish_map(
         problem,
         uv,
         energy=energy,
@@ -127,8 +127,8 @@ def polish(
         tolerance=tolerance,
         linear_solver=linear_solver,
         callback=callback,
-        _began=began,
     )
+    return replace(result, seconds=time.perf_counter() - began)
 
 
 def polish_map(
@@ -141,13 +141,12 @@ def polish_map(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    _began: float | None = None,
 ) -> MapResult:
     """Polish a map of a `Problem` at hand; the rest as `polish` has it.
 
     The problem's ``fixed`` vertices stay where they are in ``uv``; its ``target`` is not looked at.
     """
-    began = time.perf_counter() if _began is None else _began
+    began = time.perf_counter()
     chosen = energy_named(energy)
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)

@@ -123,6 +123,16 @@ class Problem:
         ----------
         target : (k, 2) array
             New positions of ``fixed``.
+
+        Returns
+        -------
+        Problem
+            A new one; this one stays as it is.
+
+        Raises
+        ------
+        ValueError
+            When there are not as many places as fixed vertices, or one is not finite.
         """
         other = object.__new__(Problem)
         other.__dict__.update(self.__dict__)
@@ -133,7 +143,25 @@ class Problem:
         return other
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
-        """The Laplacian of this mesh and these fixed vertices, analysed once and kept."""
+        """The Laplacian of this mesh and these fixed vertices, analysed once and kept (§6.2, eq. 12).
+
+        Parameters
+        ----------
+        linear_solver : str
+            ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+
+        Returns
+        -------
+        Laplacian
+            Shared by all problems that `moved` made of this one.
+
+        Raises
+        ------
+        ValueError
+            When there is no such solver.
+        ImportError
+            When its library is not installed.
+        """
         if linear_solver not in self._laplacians:
             made = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
             # "auto" and the name it stands for share one analysis.
@@ -141,8 +169,18 @@ class Problem:
         return self._laplacians[linear_solver]
 
     def mesh(self, kind: Reference) -> ReferenceMesh:
-        """The mesh with reference triangles of some kind, built once and kept.
+        """The mesh with reference triangles of some kind, built once and kept (§9.3).
 
+        Parameters
+        ----------
+        kind : {"equilateral", "rest", "corrected"}
+
+        Returns
+        -------
+        ReferenceMesh
+
+        Notes
+        -----
         In units near the rest mesh's size, a power of two, so that no area leaves the numbers' range; the
         functionals have no scale.
         """
@@ -157,7 +195,18 @@ class Problem:
         return Frame(self.target)
 
     def positions(self, w: ComplexArray) -> FloatArray:
-        """A map of the frame (n,) complex128 as the caller gets it, (n, 2), the fixed vertices to the last bit."""
+        """A map of the frame as the caller gets it, the fixed vertices to the last bit.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+            Places u + iv in the frame that is solved in.
+
+        Returns
+        -------
+        (n, 2) float64
+            In the target's units.
+        """
         uv = self.frame.outward(w)
         uv[self.fixed] = self.target
         return uv

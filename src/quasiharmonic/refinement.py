@@ -57,6 +57,11 @@ class Refined:
         Returns
         -------
         (n + s, …) float64
+
+        Raises
+        ------
+        ValueError
+            When there are not as many rows as old vertices.
         """
         old = np.asarray(values, dtype=np.float64)
         if not old.ndim or len(old) != len(self.V) - len(self.parents):

@@ -1,4 +1,4 @@
-"""Regularisers: functions of the tensor field alone, descended along with an injectivity functional (eq. 10, 35)."""
+"""Regularisers: functions of the tensor field alone, descended along with an injectivity functional (§11.1.4)."""
 
 from __future__ import annotations
 
@@ -33,17 +33,48 @@ class Conformal:
         self.share = share
 
     def value(self, field: TensorField) -> float:
-        """R₁ of a tensor field."""
+        """R₁ of a tensor field.
+
+        Parameters
+        ----------
+        field : TensorField
+
+        Returns
+        -------
+        float
+            The mean over the rest area, without unit.
+        """
         square = field.mu.real**2 + field.mu.imag**2
         return 4.0 * float(np.sum(self.share * square / field.defect))
 
     def of_map(self, dw: Derivatives) -> float:
-        """R₁ at the own tensors of a map, where V₃ vanishes: its MIPS energy, ``inf`` if a triangle is inverted."""
+        """R₁ at the own tensors of a map, where V₃ vanishes: its MIPS energy.
+
+        Parameters
+        ----------
+        dw : Derivatives
+            Of the map.
+
+        Returns
+        -------
+        float
+            ``inf`` if a triangle is inverted.
+        """
         p, q = np.abs(dw.p), np.abs(dw.q)
         if not np.all(q < p):
             return np.inf
         return 4.0 * float(np.sum(self.share * q * q / ((p - q) * (p + q))))
 
     def gradient(self, field: TensorField) -> ComplexArray:
-        """``∂R₁/∂Re ξ + i ∂R₁/∂Im ξ``; (f,) complex128."""
+        """Gradient of R₁ by ξ.
+
+        Parameters
+        ----------
+        field : TensorField
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂R₁/∂Re ξ + i ∂R₁/∂Im ξ``.
+        """
         return field.pull(8.0 * (self.share / field.defect**2) * field.mu)

@@ -133,6 +133,15 @@ def speed(problem: Problem) -> list[Descent]:
     which moving vertices rights sooner than moving tensors does; or else the map is far from any solution in
     parts, and Newton's method brings it nearer. All of this is tried on a coarse mesh first if the mesh is large,
     and soon if it is not.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    list of Descent
+        In the order in which they are run.
     """
     if problem.pins.size:
         first, newton = Descent(parameterization="si-log", iterations=400), Descent("newton", "si-log", iterations=60)
@@ -152,7 +161,16 @@ def speed(problem: Problem) -> list[Descent]:
 
 
 def quality(problem: Problem) -> list[Descent]:
-    """The stages that keep angles: si-log on the rest mesh's own triangles, then whatever finds a map (§10.1)."""
+    """The stages that keep angles: si-log on the rest mesh's own triangles, then whatever finds a map (§10.1).
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    list of Descent
+    """
     return [
         Descent(parameterization="si-log", reference="corrected", iterations=1000),
         Descent("newton", "si-log", reference="corrected", iterations=60, resume=True),

@@ -47,11 +47,30 @@ class Parameterization:
     bend: Callable[[FloatArray], FloatArray]
 
     def field(self, xi: ComplexArray) -> TensorField:
-        """The tensor field of ``xi`` (f,) complex128."""
+        """The tensor field of some ξ.
+
+        Parameters
+        ----------
+        xi : (f,) complex128
+
+        Returns
+        -------
+        TensorField
+        """
         return TensorField(xi, self)
 
     def invert(self, mu: ComplexArray) -> ComplexArray:
-        """The ξ of Beltrami coefficients, clipped where ``|μ| ≥ 1`` or ξ would exceed the bound; (f,) complex128."""
+        """The ξ of Beltrami coefficients.
+
+        Parameters
+        ----------
+        mu : (f,) complex128
+
+        Returns
+        -------
+        (f,) complex128
+            Clipped where ``|μ| ≥ 1`` or ξ would exceed the bound.
+        """
         modulus = np.sqrt(mu.real**2 + mu.imag**2)
         safe = np.where(modulus > 0, modulus, 1.0)
         rho = self.inverse(np.minimum(modulus, np.nextafter(1.0, 0.0)))
@@ -106,7 +125,13 @@ class TensorField:
         return self.ratio * self.xi
 
     def entries(self) -> FloatArray:
-        """Rows a11, a12, a22 of 𝒜 (eq. 33), without the area factor; (3, f) float64."""
+        """The tensors themselves (eq. 33), without the area factor.
+
+        Returns
+        -------
+        (3, f) float64
+            Rows a11, a12, a22.
+        """
         a = np.empty((3, self.mu.size))
         double = 2.0 / self.defect
         real = double * self.mu.real
@@ -136,7 +161,18 @@ class TensorField:
         return double * (by_w + double * inner * self.mu)
 
     def pull(self, grad: ComplexArray) -> ComplexArray:
-        """Gradient in ξ from the gradient in μ: the transpose of dμ/dξ, which is symmetric."""
+        """Gradient in ξ from the gradient in μ: the transpose of dμ/dξ, which is symmetric.
+
+        Parameters
+        ----------
+        grad : (f,) complex128
+            ``∂/∂Re μ + i ∂/∂Im μ``.
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂/∂Re ξ + i ∂/∂Im ξ``.
+        """
         # ρ² that vanishes needs no care but in the division: the term it divides vanishes with it.
         radial = (self.slope - self.ratio) / np.maximum(self._square, _TINY)
         radial *= (self.xi.conj() * grad).real

@@ -53,6 +53,15 @@ class Settings:
         How it is solved are these settings, the version, and the package's sources, which change without a new version
         while somebody works on them. Other packages do not count.
 
+        Parameters
+        ----------
+        files : ProblemFiles
+
+        Returns
+        -------
+        str
+            Hexadecimal.
+
         Raises
         ------
         OSError

@@ -107,7 +107,15 @@ def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> No
 
 
 def check_output(path: str | os.PathLike[str]) -> None:
-    """Say early whether `write_map` could write to ``path``; raises what it would."""
+    """Say early whether `write_map` could write to ``path``.
+
+    Raises
+    ------
+    MeshFileError
+        When the format is not supported.
+    OutputError
+        When it cannot be written.
+    """
     _suffix(path, "written")
     check_writable(path)
 

@@ -72,7 +72,21 @@ def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] |
 def problem_files(
     source: str | os.PathLike[str], fixed: str | os.PathLike[str] | None = None
 ) -> tuple[Path, Path | None]:
-    """Tell the files of a problem: of the mesh, and of the vertices to hold where there is one."""
+    """Tell the files of a problem: of the mesh, and of the vertices to hold where there is one.
+
+    Parameters
+    ----------
+    source : path
+        An OBJ file, or a folder with ``input.obj`` and perhaps ``handles.txt``.
+    fixed : path, optional
+        A list of vertices, whatever the folder has.
+
+    Returns
+    -------
+    mesh : Path
+    fixed : Path or None
+        Neither need exist: reading them says so.
+    """
     mesh_path = Path(source)
     if mesh_path.is_dir():
         folder, mesh_path = mesh_path, mesh_path / "input.obj"

@@ -88,6 +88,10 @@ class MeshData:
         uv : (n, 2) float
             Place of every vertex in the plane.
 
+        Returns
+        -------
+        MeshData
+
         Raises
         ------
         ValueError
@@ -96,7 +100,23 @@ class MeshData:
         return replace(self, vt=self._one_each(uv), FT=self.F)
 
     def as_plane(self, uv: ArrayLike) -> MeshData:
-        """Return the map alone: a mesh in the plane z = 0 with the same faces; takes what `with_map` does."""
+        """Return the map alone: a mesh in the plane z = 0 with the same faces.
+
+        Parameters
+        ----------
+        uv : (n, 2) float
+            Place of every vertex in the plane.
+
+        Returns
+        -------
+        MeshData
+            Positions and faces, and nothing else of this one.
+
+        Raises
+        ------
+        ValueError
+            When the shape is another, or a place is not finite.
+        """
         return MeshData(self._one_each(uv), self.F, source=self.source)
 
     def _one_each(self, uv: ArrayLike) -> FloatArray:
@@ -109,6 +129,10 @@ class MeshData:
 
 def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Gather the texture coordinates of every vertex.
+
+    Parameters
+    ----------
+    mesh : MeshData
 
     Returns
     -------

@@ -61,6 +61,11 @@ def without_idle(V: FloatArray, F: IntArray, uv: FloatArray) -> tuple[FloatArray
     ----------
     V, F, uv
         As `cut_at_seams` returns them.
+
+    Returns
+    -------
+    V, F, uv
+        Of the same shapes but for the vertices left out.
     """
     used = np.unique(F)
     return V[used], np.searchsorted(used, F), uv[used]

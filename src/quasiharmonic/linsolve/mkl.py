@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import re
 import site
@@ -84,6 +85,7 @@ class Pardiso(LinearSolver):
         if self._handle.threads != self._handle.threads_now:
             # An instance that is made to work with fewer or more threads than before crashes (MKL 2026.2).
             self._release_once()
+            self._handle.threads = 0  # should memory run out now, it is begun anew the next time
             self._handle = self._begun(*self._handle.pattern, self._handle.sequential)
         if self._size > self.n:
             self._entries[:] = self._values
@@ -160,7 +162,7 @@ class _Handle:
     @property
     def threads_now(self) -> int:
         """How many threads the caller allows at this moment, by the environment, threadpoolctl or MKL itself."""
-        return 1 if self.sequential else int(self._library.MKL_Get_Max_Threads())
+        return 1 if self.sequential else min(int(self._library.MKL_Get_Max_Threads()), _largest_team())
 
     def check(self, phase: int, b: Floats | None = None, x: Floats | None = None) -> None:
         """Run one phase and turn its error code into an exception."""
@@ -191,6 +193,25 @@ class _Handle:
 
 def _address(array: Floats | Ints | np.ndarray[tuple[int, ...], np.dtype[np.int64]] | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
+
+
+# What in the environment lets OpenMP give fewer threads than are asked for, which MKL does not look at.
+_TEAM_LIMITS = "OMP_THREAD_LIMIT", "KMP_DEVICE_THREAD_LIMIT", "KMP_ALL_THREADS"
+_NO = "", "0", "false", ".false.", "f", ".f.", "no", "n", "off", "disabled"
+
+
+@cache
+def _largest_team() -> int:
+    """How many threads OpenMP is sure to give. With fewer than it asked for PARDISO hangs for ever (MKL 2026.2).
+
+    The environment is read once, as OpenMP reads it.
+    """
+    if os.environ.get("OMP_DYNAMIC", "").strip().lower() not in _NO:
+        return 1
+    if os.environ.get("OMP_MAX_ACTIVE_LEVELS", "").strip() == "0":
+        return 1
+    given = [os.environ.get(name, "").strip() for name in _TEAM_LIMITS]
+    return max(1, min((int(text) for text in given if text.isdecimal()), default=sys.maxsize))
 
 
 @cache

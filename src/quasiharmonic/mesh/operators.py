@@ -50,6 +50,10 @@ class Operators:
         ----------
         a : (f, 3) float64, optional
             Entries a11, a12, a22 of ``mⱼ⁻¹ A₍ⱼ₎`` by triangle.
+
+        Returns
+        -------
+        (n, n) csr_array of float64
         """
         if a is None:
             a = np.tile([1.0, 0.0, 1.0], (self.m.size, 1))
@@ -70,6 +74,10 @@ def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Refere
         Triangles, consistently oriented.
     reference : {"rest", "equilateral", "corrected"}
         The triangles in which gradients and areas are taken.
+
+    Returns
+    -------
+    Operators
     """
     F = np.asarray(F, dtype=np.int64)
     mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), F, reference)

@@ -156,7 +156,17 @@ class ReferenceMesh:
         return np.einsum("eaf,af->ef", self._edge_stiffness, a)
 
     def derivatives(self, w: ComplexArray) -> Derivatives:
-        """Differentiate a complex map ``w = u + i v`` (n,) complex128 on every triangle."""
+        """Differentiate a complex map on every triangle.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+            Places u + iv.
+
+        Returns
+        -------
+        Derivatives
+        """
         corners = w.take(self.F)
         d1, d2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         g1, g2 = self._half_gamma

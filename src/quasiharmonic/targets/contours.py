@@ -28,6 +28,10 @@ def signed_area(contour: ArrayLike) -> float:
     Parameters
     ----------
     contour : (k, 2) float
+
+    Returns
+    -------
+    float
     """
     contour = np.asarray(contour, dtype=np.float64)
     x, y = (contour - contour[0]).T

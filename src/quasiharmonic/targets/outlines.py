@@ -9,7 +9,24 @@ FloatArray = NDArray[np.float64]
 
 
 def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
-    """Outline of a disk around the origin, (points, 2) float64: an `ellipse` with equal axes."""
+    """Outline of a disk around the origin: an `ellipse` with equal axes.
+
+    Parameters
+    ----------
+    radius : float
+    points : int
+        How many, spread evenly.
+
+    Returns
+    -------
+    (points, 2) float64
+        Counterclockwise.
+
+    Raises
+    ------
+    ValueError
+        When the radius is not positive, or there are fewer than three points.
+    """
     _positive(radius=radius)
     return ellipse(radius, radius, points)
 
