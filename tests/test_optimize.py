@@ -18,10 +18,11 @@ from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize.alternating import alternating, own_tensor
 from quasiharmonic.optimize.lbfgs import lbfgs
 from quasiharmonic.optimize.newton import _gather, _Model, newton
-from quasiharmonic.optimize.patches import patches
+from quasiharmonic.optimize.patches import Patch, patches
 from quasiharmonic.optimize.shaking import _left_of, _nearest, shaking
 from quasiharmonic.optimize.untangling import GRADINGS, Regularized, iterate_of, untangled, untangling
 from quasiharmonic.optimize.vector_adam import vector_adam
+from quasiharmonic.optimize.weighing import weighed
 from quasiharmonic.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
 from quasiharmonic.tensor import PARAMETERIZATIONS, TANH
@@ -297,6 +298,50 @@ class TestShaking:
         seen = path(shaking, objective, iterations=3)
         assert seen[0].flipped > 50
         assert seen[-1].flipped < seen[0].flipped
+
+
+class TestWeighing:
+    def stuck(self):
+        """A problem in which several vertices must go around a fold together, in front of it."""
+        case = problems.make(*problems.parse("jam:418:0.838"))
+        problem = Problem(case.V, case.F, case.fixed, case.target)
+        objective = Objective(problem)
+        tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
+        *_, w = untangled(problem.F, tutte.w, problem.fixed, grading=0.0)
+        held = np.isin(np.arange(problem.n), problem.fixed)
+        return Patch(problem.F, np.arange(problem.n), held), w
+
+    def test_rights_what_the_same_number_of_plain_descents_does_not(self):
+        patch, start = self.stuck()
+        assert signed_areas(patch.F, start).min() < 0
+        w = start
+        for grading in 5 * GRADINGS:
+            *_, w = untangled(patch.F, w, np.flatnonzero(patch.held), grading=grading)
+            assert signed_areas(patch.F, w).min() < 0
+        ends = [weighed(np.random.default_rng(seed), patch, start, "auto") for seed in range(4)]
+        assert any(signed_areas(patch.F, end).min() > 0 for end in ends)
+        for end in ends:
+            np.testing.assert_array_equal(end[patch.held], start[patch.held])
+            assert np.sum(signed_areas(patch.F, end) <= 0) <= np.sum(signed_areas(patch.F, start) <= 0)
+
+    def test_gives_back_what_it_cannot_better(self):
+        """Hardly anything may move."""
+        patch, start = self.stuck()
+        tight = patch._replace(held=np.ones(len(start), dtype=bool))
+        tight.held[np.flatnonzero(~patch.held)[:1]] = False
+        end = weighed(np.random.default_rng(0), tight, start, "auto")
+        assert np.sum(signed_areas(patch.F, end) <= 0) <= np.sum(signed_areas(patch.F, start) <= 0)
+        np.testing.assert_array_equal(end[tight.held], start[tight.held])
+
+    def test_weights_decide_which_of_two_is_righted(self):
+        """A vertex that can be on the right side of one held edge or the other, not of both."""
+        F = np.array([[0, 1, 4], [2, 3, 4]])
+        w = np.array([0, 1, 1 + 0.2j, 0.2j, 0.5 + 0.1j]) + np.array([0.4j, 0.4j, 0, 0, 0.3j])
+        for heavy in (0, 1):
+            weights = np.where(np.arange(2) == heavy, 1e3, 1.0)
+            *_, end = untangled(F, w, np.arange(4), grading=0.0, weights=weights)
+            areas = signed_areas(F, end)
+            assert areas[heavy] > 0 > areas[1 - heavy]
 
 
 class TestStrategy:

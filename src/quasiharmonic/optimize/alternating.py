@@ -51,7 +51,18 @@ def alternating(
 
 
 def own_tensor(dw: Derivatives) -> ComplexArray:
-    """The μ that makes V₃ least with the map held; (f,) complex128, of modulus 1 where a triangle has no area."""
+    """The μ that makes V₃ least with the map held (eq. 39).
+
+    Parameters
+    ----------
+    dw : Derivatives
+        Of the map.
+
+    Returns
+    -------
+    (f,) complex128
+        Of modulus 1 where a triangle has no area.
+    """
     p, q, _ = dw
     inverted = np.abs(q) > np.abs(p)
     small, large = np.where(inverted, p.conj(), q), np.where(inverted, q.conj(), p)

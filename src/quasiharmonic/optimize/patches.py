@@ -18,6 +18,7 @@ from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize.untangling import iterate_of, untangled
 
+FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -102,9 +103,16 @@ def patch_around(objective: Objective, triangle: int, rings: int, most: int) -> 
     return None if len(F) > most or held.all() else Patch(renumbered, vertices, held)
 
 
-def last_untangled(patch: Patch, w: ComplexArray, held: BoolArray, grading: float, linear_solver: str) -> ComplexArray:
-    """Where untangling a map of a patch (v,) complex128 ends, some vertices (v,) bool held."""
-    last = w
-    for step in untangled(patch.F, w, np.flatnonzero(held), grading=grading, linear_solver=linear_solver):
+def last_untangled(
+    patch: Patch,
+    w: ComplexArray,
+    held: BoolArray,
+    grading: float,
+    linear_solver: str,
+    weights: FloatArray | None = None,
+) -> ComplexArray:
+    """Where untangling a map of a patch (v,) complex128 ends, some vertices (v,) bool held, triangles weighed (p,)."""
+    last, stay = w, np.flatnonzero(held)
+    for step in untangled(patch.F, w, stay, grading=grading, linear_solver=linear_solver, weights=weights):
         last = step
     return last

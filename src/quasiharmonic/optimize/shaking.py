@@ -5,8 +5,9 @@ half-planes. Where the target folds back that may be a wedge, a millionth as wid
 fold and opens away from it. A vertex on the near side of the fold misses it by next to nothing, and no descent leads
 around the fold. So a patch around an inverted triangle is started anew, again and again: from a quasi-harmonic map of
 random tensors, or with a vertex of that triangle put somewhere into its intersection and held there while the others
-make room. A patch is taken on if no more triangles are inverted than before; this lets the map drift until it falls
-into place.
+make room. Where it is not one vertex but a chain of them that must go around, its inverted triangles come to weigh
+more (`quasiharmonic.optimize.weighing`). A patch is taken on if no more triangles are inverted than before; this lets
+the map drift until it falls into place.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around
 from quasiharmonic.optimize.untangling import GRADINGS, iterate_of, untangled
+from quasiharmonic.optimize.weighing import weighed
 from quasiharmonic.tensor import TANH
 
 BoolArray = NDArray[np.bool_]
@@ -33,9 +35,11 @@ Generator = np.random.Generator
 # Rings around an inverted triangle, and sizes of the random ξ; one of them is drawn.
 _RINGS = 2, 3, 4, 6, 8, 12
 _SPREADS = 0.0, 0.5, 1.5
-# V₃ over the target's area below which a problem is worth more tries. Of ten thousand generated ones, those that have no
-# solution end above 1e-4, and those that have one and need many tries below 1e-6.
+# V₃ over the target's area below which a problem is worth more tries. Of ten thousand generated ones, those that have
+# no solution end above 1e-4, and those that have one and need many tries below 1e-6.
 _NEXT_TO_NOTHING, _DILIGENCE = 1e-5, 10
+# How many of the tries weigh triangles: these last several times as long as the others.
+_WEIGHED = 0.5
 # Placed vertices lie this much of the way from a corner of the intersection to its middle, in powers of ten.
 _DEPTHS = -3.5, 0.0
 
@@ -94,6 +98,8 @@ def shaking(
 def _shaken(rng: Generator, objective: Objective, patch: Patch, w: ComplexArray) -> ComplexArray:
     """Another map of a patch."""
     solver = objective.laplacian.solver.name
+    if rng.random() < _WEIGHED:
+        return weighed(rng, patch, w, solver)
     grading = float(rng.choice(GRADINGS))
     place = _place(rng, objective, patch, w) if rng.random() < 0.5 else None
     held = patch.held.copy()

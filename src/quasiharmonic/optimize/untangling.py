@@ -129,7 +129,13 @@ def iterate_of(objective: Objective, w: ComplexArray) -> Iterate:
 
 
 def untangled(
-    F: IntArray, w: ComplexArray, held: IntArray, *, grading: float, linear_solver: str = "auto"
+    F: IntArray,
+    w: ComplexArray,
+    held: IntArray,
+    *,
+    grading: float,
+    linear_solver: str = "auto",
+    weights: FloatArray | None = None,
 ) -> Iterator[ComplexArray]:
     """Newton steps down the regularised energy, ε falling.
 
@@ -145,6 +151,8 @@ def untangled(
         Power of the boundary edges' lengths.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
+    weights : (f,) float64, optional
+        How much triangles count; all alike by default.
 
     Yields
     ------
@@ -156,7 +164,7 @@ def untangled(
         return
     # Around what is computed, and not around a yield, which would carry the state to the caller.
     with np.errstate(all="ignore"):
-        descent = _Descent(F, w, held, sizes, linear_solver)
+        descent = _Descent(F, w, held, sizes, linear_solver, 1.0 if weights is None else weights)
     least = descent.least
     descent.energy.epsilon = np.hypot(1e-9, _FIRST * least)
     while not least > 0 and descent.energy.epsilon > _HOPELESS * max(abs(least), _FLAT):
@@ -208,12 +216,20 @@ def _sizes(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> 
 class _Descent:
     """A map, and steps down its energy at the present ε."""
 
-    def __init__(self, F: IntArray, w: ComplexArray, held: IntArray, sizes: FloatArray, linear_solver: str) -> None:
+    def __init__(
+        self,
+        F: IntArray,
+        w: ComplexArray,
+        held: IntArray,
+        sizes: FloatArray,
+        linear_solver: str,
+        weights: FloatArray | float,
+    ) -> None:
         self.energy = Regularized(1.0)
         corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
         rest = (sizes[:, None, None] * corners).reshape(-1, 2)
-        # All triangles count alike, however small.
-        weights = (sizes**2).mean() / sizes**2
+        # All triangles of one weight count alike, however small.
+        weights = weights * (sizes**2).mean() / sizes**2
         self._deformed = DeformationEnergy(
             rest, F, self.energy, weights=weights, rest_F=np.arange(3 * len(F)).reshape(-1, 3)
         )

@@ -1,0 +1,56 @@
+"""Untangling again and again, what stays inverted counting ever more.
+
+Untangling starts with a large ε, at which its energy has hardly more than one minimum: however a patch is started, it
+ends in the same few maps. What leads elsewhere is another energy. So triangles that stay inverted are given more
+weight, round after round, as constraints are in searches for satisfying assignments: they are righted at the expense
+of others, which become heavier in turn, until a map is found that has room for all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.deformation_energy import signed_areas
+from quasiharmonic.optimize.patches import Patch, last_untangled
+from quasiharmonic.optimize.untangling import GRADINGS
+
+ComplexArray = NDArray[np.complex128]
+Generator = np.random.Generator
+
+# What weights are multiplied by, one of them drawn; rounds; and how many more inverted triangles than at first end it:
+# what has gone wild stays so.
+_FACTORS, _ROUNDS, _WILD = (3.0, 10.0), 15, 15
+
+
+def weighed(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str) -> ComplexArray:
+    """Another map of a patch, by weighing its inverted triangles.
+
+    Parameters
+    ----------
+    rng : Generator
+        Draws the factor and every round's grading.
+    patch : Patch
+    w : (v,) complex128
+        Its map.
+    linear_solver : str
+        A name of `quasiharmonic.linsolve`, or ``"auto"``.
+
+    Returns
+    -------
+    (v,) complex128
+        The first map without inverted triangles, or else the last that has no more of them than ``w``.
+    """
+    factor = float(rng.choice(_FACTORS))
+    weights = np.ones(len(patch.F))
+    inverted = signed_areas(patch.F, w) <= 0
+    first, last = inverted.sum(), w
+    for _ in range(_ROUNDS):
+        weights[inverted] *= factor
+        w = last_untangled(patch, w, patch.held, float(rng.choice(GRADINGS)), linear_solver, weights)
+        inverted = signed_areas(patch.F, w) <= 0
+        if inverted.sum() <= first:
+            last = w
+        if not inverted.any() or inverted.sum() > first + _WILD:
+            break
+    return last
