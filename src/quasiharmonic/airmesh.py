@@ -25,6 +25,7 @@ from quasiharmonic.inject import injective_map
 from quasiharmonic.mesh.topology import boundary_loops, named
 from quasiharmonic.newton_descent import NewtonDescent, in_units
 from quasiharmonic.predicates import orientation
+from quasiharmonic.targets.contours import signed_area
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -280,9 +281,9 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
         [f"the shape's boundary through vertex {loop[0]}" for loop in loops]
         + ["the container", *(f"obstacle {k}" for k in range(len(obstacles)))],
     )
-    solid = [*(loop for loop in around if _area(loop) > 0), *obstacles]
+    solid = [*(loop for loop in around if signed_area(loop) > 0), *obstacles]
     # Spaces with air in them: the container, and the holes of shapes. A thing lies in the smallest one around it.
-    spaces = [container, *(loop for loop in around if _area(loop) < 0)]
+    spaces = [container, *(loop for loop in around if signed_area(loop) < 0)]
     rooms = [shapely.Polygon(space) for space in spaces]
     inside: list[list[FloatArray]] = [[] for _ in rooms]
     for thing in solid:
@@ -338,11 +339,6 @@ def thickened(corners: FloatArray, gap: float) -> FloatArray:
     laid[row, (first + 1) % 3, 0] = length
     laid[row, (first + 2) % 3] = np.stack([apex.real, np.maximum(apex.imag, gap)], axis=1)
     return laid
-
-
-def _area(loop: FloatArray) -> float:
-    x, y = loop.T
-    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def _shapely() -> Any:

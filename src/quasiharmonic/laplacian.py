@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.mesh.dissection import nested_dissection
+from quasiharmonic.mesh.topology import edge_keys
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -72,7 +73,7 @@ class Laplacian:
         # Entries above the diagonal: every half-edge between two free vertices, sorted by (row, column).
         size = self.free.size
         inner = np.flatnonzero((tail >= 0) & (head >= 0))
-        key = np.minimum(tail[inner], head[inner]) * np.int64(size) + np.maximum(tail[inner], head[inner])
+        key = edge_keys(tail[inner], head[inner], size)
         sorting = np.argsort(key)
         key = key[sorting]
         starts = np.ones(key.size, dtype=bool)

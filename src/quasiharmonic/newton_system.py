@@ -13,6 +13,7 @@ from scipy.sparse import csr_array, triu
 
 from quasiharmonic.energies import QuadraticForm
 from quasiharmonic.linsolve import make_solver
+from quasiharmonic.mesh.topology import edge_keys
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -73,7 +74,7 @@ class NewtonSystem:
         tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
         count = tail.size
         inner = np.flatnonzero((tail >= 0) & (head >= 0))
-        key = np.minimum(tail[inner], head[inner]) * size + np.maximum(tail[inner], head[inner])
+        key = edge_keys(tail[inner], head[inner], size)
         order = np.argsort(key, kind="stable")
         inner, key = inner[order], key[order]
         first = np.flatnonzero(np.diff(key, prepend=-1))

@@ -81,7 +81,8 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
 
 def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> IntArray:
     """One integer for each undirected edge between vertices below ``n``, whichever way it is given."""
-    keys: IntArray = np.minimum(tail, head)
+    # 64 bits even of 32-bit numbers, whose products they do not hold.
+    keys: IntArray = np.minimum(tail, head, dtype=np.int64)
     keys *= n
     keys += np.maximum(tail, head)
     return keys

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -37,6 +38,19 @@ def new_figure(inches: tuple[float, float]) -> Figure:
     figure = Figure(figsize=inches, dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
+
+
+def save_png(path: str | PathLike[str], figure: Figure) -> None:
+    """Write a figure as a PNG, replacing the file as a whole.
+
+    Raises
+    ------
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    from quasiharmonic.io.atomic import write_whole
+
+    write_whole(path, lambda file: figure.savefig(file, format="png"))
 
 
 def panels(figure: Figure, count: int) -> list[Axes]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.measures import Distortion, distortion
-from quasiharmonic.plot.canvas import INK, RED, as_map, as_mesh, caption, new_figure, paint_map, paint_surface
+from quasiharmonic.plot.canvas import INK, RED, as_map, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
 from quasiharmonic.plot.shading import lit, view
 
 if TYPE_CHECKING:
@@ -144,10 +144,7 @@ def save_distortion_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    from quasiharmonic.io.atomic import write_whole
-
-    figure = plot_distortion(V, F, uv, measure)
-    write_whole(path, lambda file: figure.savefig(file, format="png"))
+    save_png(path, plot_distortion(V, F, uv, measure))
 
 
 _LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.265, 0.74))

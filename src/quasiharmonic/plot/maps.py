@@ -17,6 +17,7 @@ from quasiharmonic.plot.canvas import (
     paint_map,
     paint_surface,
     panels,
+    save_png,
     verdict,
 )
 from quasiharmonic.plot.shading import View, view
@@ -156,8 +157,6 @@ def save_map_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    from quasiharmonic.io.atomic import write_whole
-
     rest, F = as_mesh(V, F)
     seen = view(rest, F)
     count = 2 if before is None else 3
@@ -168,7 +167,7 @@ def save_map_figure(
     if before is not None:
         verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, as_map(before, rest, "before"), None, fixed))
     verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, as_map(uv, rest), flipped, fixed))
-    write_whole(path, lambda file: figure.savefig(file, format="png"))
+    save_png(path, figure)
 
 
 def _draw_map(

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.plot.canvas import RED, as_map, as_mesh, caption, new_figure, not_positive, outline, panels, verdict
+from quasiharmonic.plot.canvas import (
+    RED,
+    as_map,
+    as_mesh,
+    caption,
+    new_figure,
+    not_positive,
+    outline,
+    panels,
+    save_png,
+    verdict,
+)
 from quasiharmonic.plot.shading import drawable, lit, view
 
 if TYPE_CHECKING:
@@ -89,10 +100,7 @@ def save_texture_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    from quasiharmonic.io.atomic import write_whole
-
-    figure = plot_texture(V, F, uv, squares=squares)
-    write_whole(path, lambda file: figure.savefig(file, format="png"))
+    save_png(path, plot_texture(V, F, uv, squares=squares))
 
 
 def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
