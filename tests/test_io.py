@@ -18,6 +18,7 @@ from hypothesis.extra.numpy import arrays
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
+from quasiharmonic.io.meshdata import is_planar
 from quasiharmonic.io.obj import _read_regular
 from quasiharmonic.io.objlines import read_obj_lines
 from quasiharmonic.io.textual import read_text
@@ -428,6 +429,14 @@ def test_every_double_survives(tmp_path_factory, V, uv):
         assert bits(io.map_of(again)) == bits(uv)
         if suffix == ".obj":
             assert bits(again.V) == bits(V)
+
+
+@pytest.mark.parametrize("size", [np.finfo(np.float64).max, 1.0, 5e-324])
+def test_planar_at_any_size(size):
+    flat = size * np.array([[-1.0, 0, 1], [1, 0, 1], [1, 1, 1]])
+    assert is_planar(flat)
+    # Turned onto its edge.
+    assert not is_planar(flat[:, [1, 2, 0]])
 
 
 def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):

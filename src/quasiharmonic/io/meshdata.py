@@ -188,7 +188,9 @@ def map_of(mesh: MeshData) -> FloatArray:
 
 def is_planar(points: FloatArray) -> bool:
     """Whether points (n, 3) lie in a plane z = constant, up to what rounding to single precision leaves."""
-    extent = np.ptp(points, axis=0)
+    # In units of their size, a power of two: a difference of the largest doubles is none.
+    exponent = int(np.frexp(np.abs(points).max())[1])
+    extent = np.ptp(np.ldexp(points, -exponent - 1), axis=0)
     return bool(extent[2] <= 1e-6 * extent[:2].max())
 
 
