@@ -84,7 +84,7 @@ class TestTroubles:
     def test_real_limits(self, tmp_path):
         """No trouble made up: a mesh that takes longer, and then more memory, than it may."""
         source = tmp_path / "set"
-        write_problem(source / "large", *star_of(100))
+        write_problem(source / "large", *star_of(160))
         write_problem(source / "small", *star_of(4))
         out = tmp_path / "out"
         assert batch.run(source, out, jobs=1, time_limit=0.4).outcomes == {"timeout": 1, "injective": 1}
