@@ -30,7 +30,7 @@ import numpy as np
 
 from problems import FAMILIES, Case, make, parse
 from quasiharmonic import Problem, solve
-from quasiharmonic.strategy import STRATEGIES
+from quasiharmonic.search.strategy import STRATEGIES
 
 Record = dict[str, Any]
 
@@ -84,8 +84,8 @@ def _solved(case: Case, strategy: str, max_iterations: int) -> Record:
         "iterations": result.iterations,
         "energy": energy if np.isfinite(energy) else None,
         "seconds": round(seconds, 4),
-        "loops": len(problem.loops),
-        "pins": len(problem.pins),
+        "loops": len(problem.domain.loops),
+        "pins": len(problem.domain.pins),
         "interior": problem.n - len(case.fixed),
         "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
     }

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic import Descent, MapResult, Problem, distortion, harmonise, polish, solve
+from quasiharmonic import MapResult, Problem, distortion, harmonise, polish, solve
+from quasiharmonic.descent import LBFGS, Alternating, Descent, Newton, VectorAdam
 from quasiharmonic.linsolve import available
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
@@ -81,7 +82,7 @@ def functionals(problems: list[Problem]) -> str:
         "V₄ `poisson`": "poisson",
     }
     choices = {
-        name: Descent(functional=word, parameterization="si-log", reference="corrected", iterations=LIMIT)
+        name: VectorAdam(functional=word, parameterization="si-log", reference="corrected", iterations=LIMIT)
         for name, word in names.items()
     }
     return table(["functional", *HEAD], compared(problems, choices))
@@ -90,7 +91,7 @@ def functionals(problems: list[Problem]) -> str:
 def parameterizations(problems: list[Problem]) -> str:
     """Both parameterisations, each on two kinds of triangles."""
     choices = {
-        f"`{word}`, {reference}": Descent(parameterization=word, reference=reference, iterations=LIMIT)
+        f"`{word}`, {reference}": VectorAdam(parameterization=word, reference=reference, iterations=LIMIT)
         for word in ("tanh", "si-log")
         for reference in ("equilateral", "corrected")
     }
@@ -102,16 +103,16 @@ def pins(_: list[Problem]) -> str:
     problem = swapped(40)
     rows = []
     for word in ("tanh", "si-log"):
-        result = solve(problem, strategy=[Descent(parameterization=word, iterations=LIMIT)], max_iterations=LIMIT)
+        result = solve(problem, strategy=[VectorAdam(parameterization=word, iterations=LIMIT)], max_iterations=LIMIT)
         rows.append([f"`{word}`", str(len(result.certificate.flipped)), str(result.iterations)])
     return table(["two points swapped", "inverted at last", "iterations"], rows)
 
 
-def optimizers(problems: list[Problem]) -> str:
+def methods(problems: list[Problem]) -> str:
     """The methods of descent, tanh on equilateral triangles, each from ξ = 0."""
-    names = "vector-adam", "l-bfgs", "newton", "alternating"
-    choices = {f"`{name}`": Descent(name, iterations=LIMIT) for name in names}
-    return table(["optimizer", *HEAD], compared(problems, choices))
+    methods = VectorAdam, LBFGS, Newton, Alternating
+    choices = {f"`{method.word}`": method(iterations=LIMIT) for method in methods}
+    return table(["method", *HEAD], compared(problems, choices))
 
 
 def strategies(problems: list[Problem]) -> str:
@@ -178,7 +179,7 @@ def solvers(problems: list[Problem]) -> str:
     return table(["linear solver", "time"], [[f"`{name}`", f"{seconds / unit:.1f}"] for seconds, name in sorted(rows)])
 
 
-TABLES = functionals, parameterizations, pins, optimizers, strategies, energies, solvers
+TABLES = functionals, parameterizations, pins, methods, strategies, energies, solvers
 
 
 def main() -> None:

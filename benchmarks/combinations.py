@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import Descent, Problem, io, solve
+from quasiharmonic import Problem, io, solve
+from quasiharmonic.descent import LBFGS, Descent, Newton, VectorAdam
 from quasiharmonic.measures import distortion
 
 FUNCTIONALS = "neumann", "sobolev", "dirichlet", "poisson"
 PARAMETERIZATIONS = "tanh", "si-log"
-OPTIMIZERS = "vector-adam", "l-bfgs"
+METHODS = {"vector-adam": VectorAdam, "l-bfgs": LBFGS}
 
 
 def main() -> None:
@@ -35,23 +36,30 @@ def main() -> None:
     options = parser.parse_args()
     table = csv.writer(options.output)
     table.writerow(
-        ["case", "triangles", "functional", "parameterization", "optimizer", "flips", "iterations", "seconds", "mips"]
+        ["case", "triangles", "functional", "parameterization", "method", "flips", "iterations", "seconds", "mips"]
     )
     folders = [path.parent for folder in options.folders for path in sorted(folder.rglob("input.obj"))]
     for folder in folders:
         problem = Problem(*io.read_problem(folder))
-        for functional, parameterization, optimizer in itertools.product(FUNCTIONALS, PARAMETERIZATIONS, OPTIMIZERS):
+        for functional, parameterization, method in itertools.product(FUNCTIONALS, PARAMETERIZATIONS, METHODS):
             reference = "equilateral" if parameterization == "tanh" else "corrected"
-            stage = Descent(optimizer, parameterization, functional, reference, options.iterations)
-            stages = [stage]
+            stage = METHODS[method](
+                parameterization=parameterization,
+                functional=functional,
+                reference=reference,
+                iterations=options.iterations,
+            )
+            stages: list[Descent] = [stage]
             if options.newton:
                 stages.append(
-                    Descent("newton", parameterization, reference=reference, iterations=options.newton, resume=True)
+                    Newton(
+                        parameterization=parameterization, reference=reference, iterations=options.newton, resume=True
+                    )
                 )
             result = solve(problem, strategy=stages)
             flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
             mips = distortion(problem.V, problem.F, result.uv).summary("mips").mean if result.injective else np.nan
-            row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterization, optimizer]
+            row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterization, method]
             table.writerow([*row, flips, result.iterations, f"{result.seconds:.3f}", f"{mips:.3f}"])
             options.output.flush()
 

@@ -22,23 +22,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic import Problem, distortion, io, solve, surfaces, targets
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.harmonising import harmonise_map
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.polishing import ENERGIES, polish_map
 
-FloatArray = NDArray[np.float64]
 Found = tuple[FloatArray, float]
 
 LETTERS = "GSRAPH"
 METHODS: dict[str, Callable[[Problem, FloatArray], FloatArray]] = {
-    "harmonised, MIPS": lambda problem, uv: harmonise_map(problem, uv, energy="mips").uv,
-    "polished, MIPS": lambda problem, uv: polish_map(problem, uv, energy="mips").uv,
-    "polished, blend": lambda problem, uv: polish_map(problem, uv, energy="blend").uv,
-    "polished, sym. Dirichlet": lambda problem, uv: polish_map(problem, uv, energy="symmetric-dirichlet").uv,
+    "harmonised, MIPS": lambda problem, uv: harmonise_map(problem.domain, uv, energy="mips").uv,
+    "polished, MIPS": lambda problem, uv: polish_map(problem.domain, uv, energy="mips").uv,
+    "polished, blend": lambda problem, uv: polish_map(problem.domain, uv, energy="blend").uv,
+    "polished, sym. Dirichlet": lambda problem, uv: polish_map(problem.domain, uv, energy="symmetric-dirichlet").uv,
 }
 STEPS = 5, 10, 20, 40
 
@@ -79,7 +78,7 @@ def forced(problem: Problem) -> float:
     rest = float(shapes.m.sum()) * shapes.unit**2
     w = np.zeros(problem.n, dtype=np.complex128)
     w[problem.fixed] = problem.target @ (1, 1j)
-    area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in problem.loops)
+    area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in problem.domain.loops)
     ratio *= np.sqrt(rest / area)
     return float(max(ratio.max(), 1 / ratio.min()))
 
@@ -127,7 +126,7 @@ def unasked(folders: list[Path]) -> None:
         for energy in ENERGIES:
             for steps in STEPS:
                 began = time.perf_counter()
-                uv = polish_map(problem, first[0], energy=energy, max_iterations=steps).uv
+                uv = polish_map(problem.domain, first[0], energy=energy, max_iterations=steps).uv
                 after = np.array([time.perf_counter() - began, *measured(problem, uv)])
                 gains.setdefault((energy, steps), []).append(tuple(after / before))
     print("| energy | steps | seconds | MIPS | worst in | max(σ₁, 1/σ₂) | worst in |\n" + "|---" * 7 + "|")

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic import InverseMap, SurfacePoints, injective_map, io
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import cat, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
 
-FloatArray = NDArray[np.float64]
 Map = tuple[str, FloatArray, NDArray[np.int64], FloatArray]
 
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planar import points, span
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.targets import arc_length, letter, star
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 Generator = np.random.Generator
 
 # Glyphs of one piece; marks and dots would be components of their own.

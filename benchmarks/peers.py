@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_loops
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
-
-def igl_harmonic(V: Floats, F: Ints, fixed: Ints, target: Floats) -> Floats:
+def igl_harmonic(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
     """The yardstick, libigl's harmonic map: it assembles, analyses, factors and solves once, and inverts triangles."""
     import igl
 
     return igl.harmonic(V, F, fixed, target, 1)
 
 
-def scipy_splu(V: Floats, F: Ints, fixed: Ints, target: Floats) -> Floats:
+def scipy_splu(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
     """The same map by SciPy's SuperLU, its symmetric mode, from libigl's cotangent Laplacian."""
     import igl
     from scipy.sparse.linalg import splu
@@ -34,7 +31,7 @@ def scipy_splu(V: Floats, F: Ints, fixed: Ints, target: Floats) -> Floats:
     return uv
 
 
-def mouette_untangle(V: Floats, F: Ints, fixed: Ints, target: Floats) -> Floats:
+def mouette_untangle(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
     """Mouette's foldover-free map with fixed boundary: from libigl's harmonic map until no triangle is inverted."""
     from mouette.processing.parametrization.winslow import untangle
 
@@ -48,7 +45,7 @@ def mouette_untangle(V: Floats, F: Ints, fixed: Ints, target: Floats) -> Floats:
     return points.reshape(-1, 2) / scale
 
 
-def igl_composite(V: Floats, F: Ints, fixed: Ints, target: Floats) -> Floats:
+def igl_composite(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
     """A composite of harmonic maps by libigl, from one into a disk; for one boundary loop without pins."""
     import igl
 

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
-from quasiharmonic import coarse_problem, inject, laplacian, problem, search
+from quasiharmonic import domain, laplacian
 from quasiharmonic.linsolve import base
 from quasiharmonic.mesh import reference
 from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.search import coarse, inject, stages
 
 NAMES = (
     "set-up",
@@ -32,22 +33,22 @@ NAMES = (
 _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (inject, "injective_map", "set-up"),
     (inject, "solve", "set-up"),
-    (problem.Problem, "__init__", "set-up"),
+    (domain.Domain, "__init__", "set-up"),
     (reference.ReferenceMesh, "__init__", "set-up"),
     (laplacian.Laplacian, "__init__", "set-up"),
-    (coarse_problem, "coarsen", "coarsening"),
-    (coarse_problem, "prolong", "prolongation"),
-    (search, "polish_map", "polish"),
+    (coarse, "coarsen", "coarsening"),
+    (coarse, "prolong", "prolongation"),
+    (stages, "polish_map", "polish"),
     (base.LinearSolver, "__init__", "analysis"),
     (Objective, "evaluate", "assembly"),
     (laplacian.Laplacian, "factor", "assembly"),
-    (laplacian.Laplacian, "extend", "assembly"),
+    (laplacian.FactoredLaplacian, "extend", "assembly"),
     (base.LinearSolver, "factor", "factor"),
     (base.LinearSolver, "solve", "solve"),
     (Iterate, "_sweep", "gradient"),
-    (search.Search, "run", "optimiser"),
+    (stages.Search, "run", "optimiser"),
     (inject, "certify", "certificate"),
-    (search, "flipped_triangles", "certificate"),
+    (stages, "flipped_triangles", "certificate"),
 )
 
 

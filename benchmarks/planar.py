@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from quasiharmonic import surfaces
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, components, edges
 from quasiharmonic.refinement import refine
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 Generator = np.random.Generator
 Plane = tuple[ComplexArray, IntArray]
 

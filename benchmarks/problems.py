@@ -24,11 +24,9 @@ import outlines
 import planar
 from planar import Mover, blank, flow, roughen, strongest
 from quasiharmonic import certify
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_loops
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 Generator = np.random.Generator
 
 

@@ -30,18 +30,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import phases
 from peers import PEERS
-from quasiharmonic import Descent, Problem, inject, io, is_injective, solve, surfaces
+from quasiharmonic import Problem, io, is_injective, solve, surfaces
+from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.descent import Descent, VectorAdam
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.strategy import STRATEGIES
+from quasiharmonic.search import inject
+from quasiharmonic.search.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Arrays = tuple[Floats, Ints, Ints, Floats]
+Arrays = tuple[FloatArray, IntArray, IntArray, FloatArray]
 Strategy = str | list[Descent]
 
 OURS = "quasiharmonic"
@@ -174,7 +174,7 @@ def animation(triangles: int) -> list[Record]:
     (loop,) = boundary_loops(F, len(V))
     strip = arc_length(V[loop], rectangle(8.0, 1.0))
 
-    def bent(angle: float) -> Floats:
+    def bent(angle: float) -> FloatArray:
         radius, turn = 8 / angle, (strip[:, 0] / 8 - 0.5) * angle
         return (radius + 0.5 - strip[:, 1])[:, None] * np.stack([np.sin(turn), -np.cos(turn)], axis=1)
 
@@ -356,7 +356,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.peak:
         return print_peak(options.peak[0], Path(options.peak[1]))
     tools = warm_up([OURS, *options.peers])
-    strategy: Strategy = [Descent()] if options.fine else options.strategy
+    strategy: Strategy = [VectorAdam()] if options.fine else options.strategy
     records = [record for joined in options.join for record in joined]
     frames = [record for record in records if record.problem.startswith(_MOVING)]
     records = [record for record in records if record not in frames]

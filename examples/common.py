@@ -18,11 +18,12 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from quasiharmonic import Descent, MapResult, Problem, flipped_triangles, solve, surfaces, targets
+from quasiharmonic import MapResult, Problem, flipped_triangles, solve, surfaces, targets
+from quasiharmonic.arrays import FloatArray
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.plot import plot_map
 
-FloatArray = NDArray[np.float64]
 BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 RED, INK = (0.89, 0.07, 0.17), (0.06, 0.12, 0.29)
 COLORS = {"tanh": (0.85, 0.45, 0.10), "si-log": (0.16, 0.38, 0.75)}
@@ -48,13 +49,13 @@ def onto(V: FloatArray, F: NDArray[np.int64], outline: FloatArray, start: int | 
 
 def first_map(problem: Problem, parameterization: str, iterations: int = 1000, **options: Any) -> MapResult:
     """The first injective map that one stage of VectorAdam on V₃ comes by, from the rest triangles."""
-    stage = Descent(parameterization=parameterization, reference="corrected", iterations=iterations)
+    stage = VectorAdam(parameterization=parameterization, reference="corrected", iterations=iterations)
     return solve(problem, strategy=[stage], max_iterations=iterations, **options)
 
 
 def ratios(problem: Problem, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
     """σ₁/σ₂ of every triangle from its rest shape, and its share of the rest area."""
-    mesh = problem.mesh("rest")
+    mesh = problem.domain.mesh("rest")
     p, q, _ = mesh.derivatives(uv @ (1, 1j))
     p, q = np.abs(p), np.abs(q)
     return (p + q) / np.abs(p - q), mesh.m / mesh.m.sum()
@@ -87,7 +88,7 @@ def colorbar(figure: Figure, drawn: PolyCollection, label: str = "σ₁/σ₂", 
 
 def inverted_area(problem: Problem, uv: FloatArray) -> float:
     """Area of the inverted triangles' images."""
-    area = problem.mesh("rest").derivatives(uv @ (1, 1j)).area
+    area = problem.domain.mesh("rest").derivatives(uv @ (1, 1j)).area
     return float(-area[area < 0].sum())
 
 

@@ -16,7 +16,8 @@ from time import perf_counter
 from typing import Any
 
 from common import mips, panels, run, save, show
-from quasiharmonic import Descent, Problem, injective_map, quasi_harmonic_map, solve
+from quasiharmonic import Problem, injective_map, quasi_harmonic_map, solve
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.plot import plot_surface
 from sculptures import seven
 
@@ -28,7 +29,7 @@ def main(output: Path, size: int = 96) -> dict[str, Any]:
     seconds, maps = {}, {}
     for name, found_by in {
         "Tutte": lambda: quasi_harmonic_map(Problem(*given)),
-        "tanh": lambda: solve(Problem(*given), strategy=[Descent()]),
+        "tanh": lambda: solve(Problem(*given), strategy=[VectorAdam()]),
         "injective_map": lambda: injective_map(*given),
     }.items():
         start = perf_counter()

@@ -29,7 +29,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
     problem = seven(size)["angel onto G"]
     runs = {name: first_map(problem, name) for name in ("tanh", "si-log")}
     maps = {name: result.uv for name, result in runs.items()}
-    maps["tanh + MIPS"] = harmonise_map(problem, maps["tanh"], energy="mips", conformal=0).uv
+    maps["tanh + MIPS"] = harmonise_map(problem.domain, maps["tanh"], energy="mips", conformal=0).uv
     colors = {**COLORS, "tanh + MIPS": (0.35, 0.55, 0.25)}
     figure, axes = panels(2, len(maps), (3.6, 3.9))
     numbers: dict[str, Any] = {"triangles": len(problem.F)}

@@ -29,7 +29,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from common import panels, ring, run, save, show
-from quasiharmonic import Descent, MapResult, Problem, Status, solve
+from quasiharmonic import MapResult, Problem, Status, solve
+from quasiharmonic.descent import Newton, VectorAdam
 
 Hole = tuple[float, float, float, float]
 
@@ -66,8 +67,8 @@ def search(problem: Problem, column: str) -> MapResult:
     """A functional's own descent, 100 iterations for tanh and 300 for si-log; then Newton's on V₃, with tanh."""
     name, parameterization = column.split()
     steps = 100 if parameterization == "tanh" else 300
-    first = Descent(functional=NAMES[name], parameterization=parameterization, iterations=steps)
-    return solve(problem, strategy=[first, Descent("newton", iterations=400, resume=True)])
+    first = VectorAdam(functional=NAMES[name], parameterization=parameterization, iterations=steps)
+    return solve(problem, strategy=[first, Newton(iterations=400, resume=True)])
 
 
 def outcome(result: MapResult) -> str:

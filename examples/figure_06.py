@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from common import frames, inverted_area, panels, ring, run, save, show
-from quasiharmonic import Descent, Problem, solve
+from quasiharmonic import Problem, solve
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.objective import Objective
-from quasiharmonic.optimize.alternating import own_tensor
 
 HOLE = (-0.25, -0.25, 0.25, 0.25)
 NAMES = {"dirichlet": "V₃", "neumann": "V₁", "sobolev": "V₂", "poisson": "V₄"}
@@ -35,7 +35,7 @@ SHOTS = 6
 def around_own_tensor(problem: Problem, uv: np.ndarray) -> dict[str, float]:
     """V₄ over the target's area at an injective map's own tensor, and the largest of twenty values close around it."""
     objective = Objective(problem, "poisson", "tanh")
-    xi = objective.parameterization.invert(own_tensor(objective.mesh.derivatives(problem.frame.inward(uv))))
+    xi = objective.near_map(problem.frame.inward(uv)).xi
     random = np.random.default_rng(0)
     near = [xi + 0.01 * (random.standard_normal((*xi.shape, 2)) @ (1, 1j)) for _ in range(20)]
     here, others = objective.evaluate(xi), [objective.evaluate(x).value for x in near]
@@ -49,7 +49,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     numbers: dict[str, Any] = {"triangles": len(problem.F)}
     maps = {}
     for row, (functional, name) in zip(axes, NAMES.items(), strict=True):
-        stage = Descent(parameterization="si-log", functional=functional)
+        stage = VectorAdam(parameterization="si-log", functional=functional)
         result = solve(problem, strategy=[stage], max_iterations=1000, record=1)
         # Nothing unfolds while V₄ falls: there any moment is as good as another.
         still = functional == "poisson"
@@ -63,7 +63,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
             "V₃ / area": float(f"{result.history[-1].energy:.2g}"),
         }
     numbers["V₄"] |= around_own_tensor(problem, maps["V₃"])
-    quarter = solve(ring(2 * size, HOLE, np.pi / 2), strategy=[Descent(functional="poisson", iterations=100)])
+    quarter = solve(ring(2 * size, HOLE, np.pi / 2), strategy=[VectorAdam(functional="poisson", iterations=100)])
     numbers["V₄ with tanh, turned by π/2"] = {
         "iterations": quarter.iterations,
         "flips": len(quarter.certificate.flipped),

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from common import mips, panels, run, save, show
-from quasiharmonic import Descent, solve
+from quasiharmonic import solve
+from quasiharmonic.descent import Newton, Patches, VectorAdam
 from quasiharmonic.plot import plot_surface
 from sculptures import seven
 
@@ -28,15 +29,15 @@ def main(output: Path, size: int = 40, rows: int = 7) -> dict[str, Any]:
     figure, axes = panels(len(problems), 5, (2.7, 3.1))
     numbers: dict[str, Any] = {}
     finish = [
-        Descent(optimizer, "si-log", reference="corrected", iterations=60, resume=True)
-        for optimizer in ("newton", "patches")
+        Newton(parameterization="si-log", reference="corrected", iterations=60, resume=True),
+        Patches(tries=60, resume=True),
     ]
     for row, (name, problem) in zip(axes, problems.items(), strict=True):
         plot_surface(problem.V, problem.F, row[0])
         row[0].set_title(f"{name}\n{len(problem.F):,} triangles", size=9)
         numbers[name] = {}
         for ax, (symbol, functional) in zip(row[1:], NAMES.items(), strict=True):
-            own = Descent("vector-adam", "si-log", functional, reference="corrected", iterations=200)
+            own = VectorAdam(parameterization="si-log", functional=functional, reference="corrected", iterations=200)
             result = solve(problem, strategy=[own, *finish])
             show(ax, problem, result.uv, f"{symbol}, {result.iterations} iterations", size=9)
             numbers[name][symbol] = {

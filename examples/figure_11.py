@@ -40,7 +40,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
     harmonic = quasi_harmonic_map(problem, reference="rest")
     runs = {name: first_map(problem, name) for name in ("si-log", "tanh")}
     maps = {f"{name}: {r.iterations} iterations": r.uv for name, r in runs.items()}
-    maps["si-log, then least MIPS"] = polish_map(problem, runs["si-log"].uv, energy="mips").uv
+    maps["si-log, then least MIPS"] = polish_map(problem.domain, runs["si-log"].uv, energy="mips").uv
     figure, axes = panels(2, 2, (5.4, 3.4))
     show(axes[0][0], problem, harmonic, "harmonic")
     numbers: dict[str, Any] = {"triangles": len(problem.F), "harmonic": flips(problem, harmonic)}
@@ -49,7 +49,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
         left = flips(problem, uv)
         title = f"{name}\n" + (f"{left} inverted" if left else f"σ₁/σ₂ up to {ratio.max():.1f}")
         drawn = show_ratios(ax, problem, uv, title, 20)
-        ax.plot(*uv[problem.pins].T, "o", color="white", mec="black", markersize=5)
+        ax.plot(*uv[problem.domain.pins].T, "o", color="white", mec="black", markersize=5)
         numbers[name.split(":")[0]] = {
             "flips": left,
             "MIPS": round(mips(problem, uv), 3),

@@ -38,7 +38,7 @@ def main(output: Path, size: int = 32) -> dict[str, Any]:
     problem = wedge(size)
     runs = {name: first_map(problem, name) for name in ("tanh", "si-log")}
     maps = {name: result.uv for name, result in runs.items()}
-    maps["least MIPS"] = polish_map(problem, maps["si-log"], energy="mips").uv
+    maps["least MIPS"] = polish_map(problem.domain, maps["si-log"], energy="mips").uv
     shear = 1 + SLOPE**2 / 2 + SLOPE * np.sqrt(1 + SLOPE**2 / 4)
     figure, axes = panels(2, 3, (3.6, 3.9))
     harmonic = quasi_harmonic_map(problem, reference="rest")

@@ -4,9 +4,9 @@
 The paper's si-log succeeds up to 140 × 140 cells and fails at 160 × 160. With larger steps and less momentum, and
 without being told which parameterisation to take, we get through at every size, and with ``--finest`` at 320 squared.
 From 80 squared on a coarse mesh is solved first: some 400 iterations, but cheap ones, and 0.6 s at 160 squared. On the
-mesh itself, with ``strategy=[Descent(parameterization="si-log")]``, it is 90, 132, 151 and 192 iterations at 20, 40, 80
-and 160 squared. That does grow, about as the logarithm of the size, since a point held in the plane is no boundary to a
-Laplacian.
+mesh itself, with ``strategy=[VectorAdam(parameterization="si-log")]``, it is 90, 132, 151 and 192 iterations at 20, 40,
+80 and 160 squared. That does grow, about as the logarithm of the size, since a point held in the plane is no boundary
+to a Laplacian.
 
 Disks of radius 0.055 in place of the points, as §10.3 suggests, make the iterations independent of the size: on the
 mesh itself 312, 194, 225 and 208. (On the coarsest grid a disk is five vertices and the gap between them tight.)
@@ -45,7 +45,7 @@ def swapped(cells: int, radius: float = 0.0) -> Problem:
 def draw(ax: Axes, problem: Problem, uv: FloatArray, title: str, radius: float) -> None:
     """A map with its two points, or circles around its two disks."""
     show(ax, problem, uv, title, pins=not radius)
-    for handle in np.split(problem.target[-len(problem.pins) :], 2) if radius else ():
+    for handle in np.split(problem.target[-len(problem.domain.pins) :], 2) if radius else ():
         ax.add_patch(Circle(tuple(handle.mean(axis=0)), radius, fill=False, color="white", lw=2, zorder=6))
 
 
@@ -60,7 +60,7 @@ def main(output: Path, size: int = 160, finest: bool = False) -> dict[str, Any]:
             problem = swapped(cells, radius)
             result = solve(problem)
             numbers[f"{what}, {cells} × {cells}"] = {
-                "held": len(problem.pins),
+                "held": len(problem.domain.pins),
                 "first guess": result.history[0].flipped,
                 "flips": len(result.certificate.flipped),
                 "iterations": result.iterations,

@@ -45,7 +45,7 @@ def winding_area(problem: Problem) -> float:
     x, y = (low[k] + (np.arange(400) + 0.5) / 400 * (high - low)[k] for k in range(2))
     points = (x[:, None] + 1j * y).ravel()
     turns = np.zeros(points.size)
-    for loop in problem.loops:
+    for loop in problem.domain.loops:
         b = np.array([place[i] for i in loop.tolist()])
         for start, end in zip(b, np.roll(b, -1), strict=True):
             turns += np.angle((end - points) / (start - points))
@@ -59,7 +59,7 @@ def main(output: Path, size: int = 16) -> dict[str, Any]:
     for above, below, (name, problem) in zip(*axes, cases.items(), strict=True):
         result = first_map(problem, "tanh", 3000, record=3000)
         deepest, uv = min(result.history, key=lambda step: step.energy), result.uv
-        area = problem.mesh("rest").derivatives(uv @ (1, 1j)).area
+        area = problem.domain.mesh("rest").derivatives(uv @ (1, 1j)).area
         signed, unsigned = float(area.sum()), float(np.abs(area).sum())
         show(above, problem, result.path[0].uv, f"{name}: first guess")
         show(below, problem, uv, f"{result.status.name.lower()} after {result.iterations} iterations")

@@ -30,9 +30,9 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
         problem = onto(V, F, targets.outlines.disk())
         first = solve(problem).uv
         maps = {
-            "area-preserving": harmonise_map(problem, first, energy="area", conformal=0).uv,
+            "area-preserving": harmonise_map(problem.domain, first, energy="area", conformal=0).uv,
             "si-log": first_map(problem, "si-log").uv,
-            "ARAP": harmonise_map(problem, first, energy="arap").uv,
+            "ARAP": harmonise_map(problem.domain, first, energy="arap").uv,
         }
         numbers[name] = {"triangles": len(F)}
         for ax, (title, uv) in zip(column, maps.items(), strict=True):

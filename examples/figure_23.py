@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from common import flips, panels, run, save, show
 from quasiharmonic import Problem, solve
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.harmonising import ENERGIES, harmonise_map
 from sculptures import seven
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS = "rabbit onto R", "bust onto A", "hand onto P", "gargoyle onto H"
 NAMES = {"arap": "ARAP", "springs": "springs", "area": "areas"}
@@ -57,7 +55,7 @@ def main(output: Path, size: int = 32) -> dict[str, Any]:
             energy = DeformationEnergy(problem.V, problem.F, ENERGIES[energy_name](problem.V, problem.F), area=area)
             maps = {
                 "alone": alone(problem, energy, first),
-                "and V₃": harmonise_map(problem, first, energy=energy_name).uv,
+                "and V₃": harmonise_map(problem.domain, first, energy=energy_name).uv,
             }
             for k, (how, uv) in enumerate(maps.items()):
                 show(axes[2 * i + k][j], problem, uv, f"{title} {how}")

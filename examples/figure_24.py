@@ -24,16 +24,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm
-from numpy.typing import NDArray
 
 from common import INK, RED, colorbar, first_map, flips, mips, panels, run, save
 from quasiharmonic import Problem, distortion, solve
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.energies import conformal_area_blend
 from quasiharmonic.harmonising import harmonise_map
 from quasiharmonic.polishing import polish_map
 from sculptures import seven
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS = "bust onto A", "rabbit onto R", "gargoyle onto H"
 
@@ -42,9 +40,9 @@ def maps_of(problem: Problem) -> dict[str, FloatArray]:
     """What is compared."""
     first = solve(problem).uv
     return {
-        "θ = 1: areas": polish_map(problem, first, energy=conformal_area_blend(1.0)).uv,
-        "(σ₁σ₂ − 1)² and V₃": harmonise_map(problem, first, energy="area").uv,
-        "θ = 0: angles": polish_map(problem, first, energy="mips").uv,
+        "θ = 1: areas": polish_map(problem.domain, first, energy=conformal_area_blend(1.0)).uv,
+        "(σ₁σ₂ − 1)² and V₃": harmonise_map(problem.domain, first, energy="area").uv,
+        "θ = 0: angles": polish_map(problem.domain, first, energy="mips").uv,
         "si-log's first": first_map(problem, "si-log").uv,
     }
 

@@ -76,7 +76,7 @@ def main(output: Path, size: int = 20) -> dict[str, Any]:
         show(axes[2][k], problem, uv, f"letter:{letter}", pins=False)
         numbers[f"{name} onto {letter}"] = {
             "triangles": len(F),
-            "loops": len(problem.loops),
+            "loops": len(problem.domain.loops),
             "exit status": status,
             "bijective": facts["bijective"],
             "iterations": facts["iterations"],

@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common import INK, RED, FloatArray, onto, panels, run, save
 from quasiharmonic import flipped_triangles, repair, solve, surfaces, targets
+from quasiharmonic.arrays import IntArray
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_map, plot_surface
-
-IntArray = NDArray[np.int64]
 
 
 def halves(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:

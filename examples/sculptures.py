@@ -12,15 +12,14 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from quasiharmonic import Problem, refine, targets
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, edges
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Field = Callable[[FloatArray], FloatArray]
 
 

@@ -47,9 +47,9 @@ def main(output: Path, size: int = 48) -> dict[str, Any]:
             zip(
                 COLUMNS,
                 (
-                    polish_map(problem, tanh, energy="blend").uv,
+                    polish_map(problem.domain, tanh, energy="blend").uv,
                     si_log,
-                    harmonise_map(problem, tanh, energy="mips", conformal=0).uv,
+                    harmonise_map(problem.domain, tanh, energy="mips", conformal=0).uv,
                 ),
                 strict=True,
             )

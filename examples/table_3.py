@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 
 from common import COLORS, panels, run, save
-from quasiharmonic import Descent, Problem, quasi_harmonic_map, solve
+from quasiharmonic import Problem, quasi_harmonic_map, solve
+from quasiharmonic.descent import VectorAdam
 from sculptures import seven
 
 STAGES = {
-    "tanh": Descent(iterations=1000),
-    "si-log": Descent(parameterization="si-log", reference="corrected", iterations=1000),
+    "tanh": VectorAdam(iterations=1000),
+    "si-log": VectorAdam(parameterization="si-log", reference="corrected", iterations=1000),
 }
 
 

@@ -35,7 +35,7 @@ def main(output: Path, size: int = 48) -> dict[str, Any]:
     for name, problem in seven(size).items():
         first = first_map(problem, "si-log")
         row: dict[str, Any] = {"triangles": len(problem.F), "iterations": first.iterations}
-        maps = [first.uv, *(polish_map(problem, first.uv, energy=e).uv for e in ("mips", "symmetric-dirichlet"))]
+        maps = [first.uv, *(polish_map(problem.domain, first.uv, energy=e).uv for e in ("mips", "symmetric-dirichlet"))]
         for column, uv in zip(COLUMNS, maps, strict=True):
             isometric = distortion(problem.V, problem.F, uv).summary("isometric")
             row[column] = {

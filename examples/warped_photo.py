@@ -21,12 +21,10 @@ from typing import Any
 import numpy as np
 from matplotlib.cbook import get_sample_data
 from matplotlib.image import imread
-from numpy.typing import NDArray
 
 from common import panels, save
 from quasiharmonic import warp_by_landmarks
-
-FloatArray = NDArray[np.float64]
+from quasiharmonic.arrays import FloatArray
 
 SMILE = np.array(
     [

@@ -228,7 +228,7 @@ def test_problem_and_diagnosis(arguments):
             (found.triangles, len(problem.F)),
         ):
             assert np.all((elements >= 0) & (elements < count))
-    interior = {tuple(edge) for edge in problem.edges.interior.tolist()}
+    interior = {tuple(edge) for edge in problem.domain.edges.interior.tolist()}
     assert {tuple(edge) for edge in diagnosis.split.tolist()} <= interior
     if more["reference"] == "equilateral":
         refined = refine_problem(problem, most_rounds=1)
@@ -295,7 +295,7 @@ def test_polish(data):
     V, F = data.draw(st.sampled_from(MESHES))
     n, fixed = len(V), boundary_of(F)
     arguments = [data.draw(positions(V, 12)), data.draw(indices(F, n, 12)), data.draw(positions(V, 12))]
-    energy = data.draw(st.sampled_from(["symmetric-dirichlet", "mips", "arap", "blend", "none", 1]))
+    energy = data.draw(st.sampled_from(["symmetric-dirichlet", "mips", "arap-barrier", "blend", "none", 1]))
     result = outcome(polish, *arguments, fixed=data.draw(indices(fixed, n, 12)), energy=energy, max_iterations=3)
     if result is not None:
         assert result.injective

@@ -9,7 +9,7 @@ import pytest
 
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.strategy import stages_of
+from quasiharmonic.search.strategy import stages_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -26,7 +26,7 @@ def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, 
     case = problems.make(family, 3, difficulty, triangles=150)
     problem = Problem(case.V, case.F, case.fixed, case.target)
     assert 20 <= len(case.F) <= 700
-    assert 1 <= len(problem.loops) <= 4
+    assert 1 <= len(problem.domain.loops) <= 4
     assert case.feasible == (family in FEASIBLE)
     if case.V.shape[1] == 2:
         assert certify(case.F, case.V).injective

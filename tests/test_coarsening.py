@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from meshes import boundary_of, lift, random_annulus, signed_areas
-from quasiharmonic import Descent, Problem, Status, distortion, flipped_triangles, is_injective, search, solve
-from quasiharmonic.coarse_problem import coarse_problem
+from quasiharmonic import Problem, Status, distortion, flipped_triangles, is_injective, solve
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.mesh.coarsening import coarsen, touching
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.prolongation import _places, prolong
-from quasiharmonic.strategy import speed
+from quasiharmonic.search import stages
+from quasiharmonic.search.coarse import coarse_mesh
+from quasiharmonic.search.stages import CoarseToFine
+from quasiharmonic.search.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
 
@@ -175,7 +178,7 @@ class TestSearch:
         result = solve(problem, callback=steps.append)
         assert result.injective
         assert [s.name.split(",")[0] for s in result.stages] == ["coarse-to-fine"]
-        assert problem._laplacians == {}
+        assert not problem.domain.analysed
         np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
         assert steps == result.history
         assert [s.iteration for s in steps] == list(range(len(steps)))
@@ -189,36 +192,35 @@ class TestSearch:
             d = distortion(posed.V, posed.F, uv)
             return float((d.mips * d.share).sum())
 
-        direct = solve(posed, strategy=[s for s in speed(posed) if s.optimizer != "coarse-to-fine"])
+        direct = solve(posed, strategy=[s for s in speed(posed) if not isinstance(s, CoarseToFine)])
         assert mean(solve(posed).uv) < 2 * mean(direct.uv)
 
     def test_is_repeated_for_a_moved_target(self, posed):
         shifted = posed.moved(2 * posed.target + 1)
-        assert coarse_problem(shifted)._coarsening is coarse_problem(posed)._coarsening
         first, second = solve(posed), solve(shifted)
         np.testing.assert_allclose(second.uv, 2 * first.uv + 1, atol=1e-9)
-        coarse = coarse_problem(posed).problem
-        assert coarse._laplacians
-        assert coarse_problem(shifted).problem._laplacians is coarse._laplacians
+        coarse = coarse_mesh(posed)
+        assert coarse is not None
+        assert coarse_mesh(shifted) is coarse
 
     def test_serves_pins_and_holes(self):
         V, F = random_annulus(4000, seed=3)
         fixed = np.append(boundary_of(F), [int(np.argmin(np.abs(V - (0, 0.7)).sum(axis=1)))])
         target = V[fixed] @ [[1, 0.4], [0, 1]]
         target[-1] += 0.02
-        strategy = [Descent("coarse-to-fine", "si-log", iterations=400)]
+        strategy = [CoarseToFine(VectorAdam(parameterization="si-log", iterations=400))]
         result = solve(Problem(lift(V), F, fixed, target), strategy=strategy)
         assert result.injective
-        assert result.stages[0].name.startswith("coarse-to-fine, si-log")
+        assert result.stages[0].name.startswith("coarse-to-fine, vector-adam, si-log")
 
     def test_goes_on_where_the_coarse_problem_fails(self, posed, monkeypatch):
         found = solve(posed)
 
         def fails(problem, stage, linear_solver, budget, callback):
-            result = solve(problem, strategy=[Descent(iterations=1)], callback=callback)
+            result = solve(problem, strategy=[VectorAdam(iterations=1)], callback=callback)
             return result.status, result.uv, result.linear_solver
 
-        monkeypatch.setattr(search, "_on_coarse", fails)
+        monkeypatch.setattr(stages, "_on_coarse", fails)
         result = solve(posed)
         assert result.injective
         assert [s.name.split(",")[0] for s in result.stages] == [
@@ -231,10 +233,10 @@ class TestSearch:
 
     def test_is_left_out_where_it_does_not_serve(self, posed):
         small = Problem(*on_letter("C", rings=12))
-        assert coarse_problem(small) is None
-        names = [s.optimizer for s in speed(small)]
+        assert coarse_mesh(small) is None
+        names = [s.name.split(",")[0] for s in speed(small)]
         assert names.index("coarse-to-fine") == 2
-        assert coarse_problem(Problem(posed.V, posed.F, posed.fixed, posed.target, reference="rest")) is None
+        assert coarse_mesh(Problem(posed.V, posed.F, posed.fixed, posed.target, reference="rest")) is None
         recorded = solve(Problem(*on_letter("C")), record=1)
         assert "coarse-to-fine" not in recorded.stages[0].name
 
@@ -254,7 +256,7 @@ class TestSearch:
         problem = Problem(V, F, boundary_of(F), V[boundary_of(F)] @ [[1, 0.3], [0, 1]])
         result = solve(problem)
         assert result.injective
-        coarse = coarse_problem(problem).problem
+        coarse = coarse_mesh(problem).domain
         edge = np.linalg.norm(coarse.V[coarse.F] - coarse.V[np.roll(coarse.F, 1, axis=1)], axis=2)
         assert np.isfinite(coarse.V).all()
         assert edge.min() > 0

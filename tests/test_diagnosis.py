@@ -9,9 +9,9 @@ import pytest
 
 from obstructed import HOUSE, OBSTRUCTED, circle, loose_wheel, moved, onto, two_wheels
 from quasiharmonic.diagnosis import Forbids, Kind, diagnose
-from quasiharmonic.inject import injective_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.refinement import refine
+from quasiharmonic.search.inject import injective_map
 from quasiharmonic.surfaces import disk
 
 

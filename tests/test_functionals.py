@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, random_xi, signed_areas, surfaces
-from quasiharmonic import Descent, solve
+from quasiharmonic import solve
+from quasiharmonic.descent import LBFGS, Newton
 from quasiharmonic.functionals import FUNCTIONALS, neumann_target
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.objective import Objective
@@ -131,7 +132,7 @@ class TestTheorems:
         inner = np.setdiff1d(np.arange(len(V)), problem.fixed)
         w[inner] += 0.02 * np.random.default_rng(4).standard_normal((inner.size, 2)).view(complex).ravel() * 0.2
         assert signed_areas(F, problem.frame.outward(w)).min() > 0
-        mu = inverse_field(problem.mesh("equilateral"), w)
+        mu = inverse_field(problem.domain.mesh("equilateral"), w)
         xi = np.arctanh(np.abs(mu)) * np.exp(1j * np.angle(mu))
         for functional in NAMES:
             iterate = Objective(problem, functional).evaluate(xi)
@@ -143,7 +144,7 @@ class TestTheorems:
         """Proposition A.1: GᵀAG + iD ⪰ 0 for determinant 1 and above; the A of an injective map is the tight case."""
         op = operators(V, F, "equilateral")
         problem = posed(V, F)
-        mu = inverse_field(problem.mesh("equilateral"), problem.frame.inward(bend(V[:, :2])))
+        mu = inverse_field(problem.domain.mesh("equilateral"), problem.frame.inward(bend(V[:, :2])))
         tight = np.arctanh(np.abs(mu)) * np.exp(1j * np.angle(mu))
         for xi, factor, holds in ((random_xi(F), 1, True), (tight, 1.3, True), (tight, 1, True), (tight, 0.9, False)):
             a = TANH.field(xi).entries()
@@ -159,13 +160,13 @@ class TestTheorems:
         """
         problem = posed(V, F)
         stages = [
-            Descent("l-bfgs", functional=functional, iterations=60),
-            Descent("newton", iterations=60, resume=True),
+            LBFGS(functional=functional, iterations=60),
+            Newton(iterations=60, resume=True),
         ]
         result = solve(problem, strategy=stages)
         assert result.injective
         start = Objective(problem, functional).evaluate(np.zeros(len(F), dtype=complex))
-        mu = inverse_field(problem.mesh("equilateral"), problem.frame.inward(result.uv))
+        mu = inverse_field(problem.domain.mesh("equilateral"), problem.frame.inward(result.uv))
         end = Objective(problem, functional).evaluate(TANH.invert(mu))
         assert end.value < 1e-10 * max(start.value, 1)
         assert end.flipped == 0

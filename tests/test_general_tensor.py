@@ -15,10 +15,10 @@ from quasiharmonic.general_tensor import (
     edge_conormal,
     vertex_conormal,
 )
-from quasiharmonic.inject import quasi_harmonic_map
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
+from quasiharmonic.search.inject import quasi_harmonic_map
 from quasiharmonic.surfaces import random_delaunay
 from quasiharmonic.tensor import TANH
 
@@ -255,7 +255,7 @@ class TestBoundaryCondition:
         areas = signed_areas(F, uv)
         sides = {(int(t[k]), int(t[k - 2])): area for t, area in zip(F, areas, strict=True) for k in range(3)}
         beside = np.array([sides[i, j] for i, j in found.at.tolist()])
-        assert len(found.at) == len(problem.edges.boundary)
+        assert len(found.at) == len(problem.domain.edges.boundary)
         assert 0.1 < np.mean(beside > 0) < 0.95
         np.testing.assert_array_equal(found.s > 0, beside > 0)
 

@@ -9,14 +9,14 @@ from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.derivatives import check_energy, derivative_error
+from quasiharmonic.descent import LBFGS
+from quasiharmonic.descent.base import Steps
 from quasiharmonic.energies import MIPS, AreaPreserving, Combination, Energy
 from quasiharmonic.harmonised import Harmonised
 from quasiharmonic.harmonising import ENERGIES, ETA, harmonise_map
 from quasiharmonic.measures import distortion
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.objective import Objective
-from quasiharmonic.optimize.alternating import own_tensor
-from quasiharmonic.optimize.scaled_lbfgs import scaled_lbfgs
 from quasiharmonic.regularizers import Conformal
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length
@@ -48,10 +48,9 @@ def objective_of(V, F, uv, fixed, energy, *, eta=0.3, conformal=0.2, weights=Non
     area = float(signed_areas(F, problem.frame.inward(uv)).sum())
     deformation = None if energy is None else DeformationEnergy(V, F, energy, area=area, weights=weights)
     regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
-    objective.functional = Harmonised(
-        problem, objective.mesh, objective.laplacian, area, deformation, regularizer, eta=eta, conformal=conformal
+    return objective.descending(
+        Harmonised(problem, objective.mesh, area, deformation, regularizer, eta=eta, conformal=conformal)
     )
-    return objective
 
 
 def energies_of(result):
@@ -67,8 +66,7 @@ class TestObjective:
         energy = None if name is None else ENERGIES[name](V, F)
         weights = None if name is None else np.random.default_rng(1).uniform(0, 3, len(F))
         objective = objective_of(V, F, uv, fixed, energy, weights=weights, reference=reference, sigmoid=sigmoid)
-        dw = objective.mesh.derivatives(objective.problem.frame.inward(uv))
-        xi = objective.parameterization.invert(own_tensor(dw)) + random_xi(F, 0.02)
+        xi = objective.near_map(objective.problem.frame.inward(uv)).xi + random_xi(F, 0.02)
         assert np.isfinite(objective.evaluate(xi).value)
 
         def along(x, d):
@@ -113,8 +111,7 @@ class TestObjective:
         """V₃ is zero there, and R₁ is MIPS: what eq. 35 is for."""
         V, F, uv, fixed = bowl()
         objective = objective_of(V, F, uv, fixed, None, eta=1.0, conformal=1.0)
-        dw = objective.mesh.derivatives(objective.problem.frame.inward(uv))
-        at = objective.evaluate(objective.parameterization.invert(own_tensor(dw)))
+        at = objective.near_map(objective.problem.frame.inward(uv))
         np.testing.assert_allclose(objective.problem.positions(at.w), uv, atol=1e-12)
         mips = distortion(V, F, uv).summary("mips").mean
         assert at.value == pytest.approx(mips, rel=1e-10)
@@ -128,37 +125,30 @@ class TestObjective:
         assert objective.functional.distortion_of_map(at) == np.inf
 
 
-class TestScaledLBFGS:
+class TestLBFGS:
     @pytest.mark.parametrize("name", [*ENERGIES, None])
     def test_falls_at_every_step(self, name):
         V, F, uv, fixed = bowl()
         energy = None if name is None else ENERGIES[name](V, F)
         objective = objective_of(V, F, uv, fixed, energy, conformal=1e-2)
-        dw = objective.mesh.derivatives(objective.problem.frame.inward(uv))
-        values = []
-        start = objective.evaluate(objective.parameterization.invert(own_tensor(dw)))
+        start = objective.near_map(objective.problem.frame.inward(uv))
         stiffness = np.abs(start.gradient) + 1e-3 * np.abs(start.gradient).mean()
         with np.errstate(all="ignore"):
-            scaled_lbfgs(objective, start, lambda at: values.append(at.value), iterations=100, stiffness=stiffness)
+            values = [at.value for at in LBFGS(iterations=100, stiffness=stiffness).iterates(objective, start)]
         assert len(values) > 30
         assert np.all(np.diff([start.value, *values]) < 0)
 
     def test_comes_to_rest_at_a_minimum(self):
         V, F, uv, fixed = bowl(40)
         objective = objective_of(V, F, uv, fixed, MIPS(), conformal=1e-2)
-        last = []
         start = objective.evaluate(np.zeros(len(F), dtype=complex))
         assert np.isfinite(start.value)
         with np.errstate(all="ignore"):
-            rest = scaled_lbfgs(
-                objective, start, last.append, iterations=5000, stiffness=np.ones(len(F)), tolerance=1e-13
-            )
-        assert rest
+            steps = Steps(LBFGS(iterations=5000, tolerance=1e-13).iterates(objective, start))
+            last = list(steps)
+        assert steps.at_rest
         assert len(last) < 4000
         assert np.abs(last[-1].gradient).max() < 1e-5 * np.abs(start.gradient).max()
-        nothing = []
-        assert scaled_lbfgs(objective, last[-1], nothing.append, iterations=0, stiffness=np.ones(len(F))) is False
-        assert nothing == []
 
     def test_stops_when_its_evaluations_are_spent(self):
         V, F, uv, fixed = bowl()
@@ -167,8 +157,9 @@ class TestScaledLBFGS:
         evaluate = objective.evaluate
         objective.evaluate = lambda xi: (calls.append(xi), evaluate(xi))[1]
         start = evaluate(np.zeros(len(F), dtype=complex))
-        rest = scaled_lbfgs(objective, start, lambda at: None, iterations=7, stiffness=np.ones(len(F)))
-        assert not rest
+        steps = Steps(LBFGS(iterations=7).iterates(objective, start))
+        assert list(steps)
+        assert not steps.at_rest
         assert len(calls) == 7
 
 
@@ -204,7 +195,7 @@ class TestHarmonise:
     def test_begins_anywhere(self, name):
         """Even at a folded map, if the energy is finite there."""
         problem, uv = folded()
-        result = harmonise_map(problem, uv, energy=name, conformal=1.0 if name is None else 1e-3)
+        result = harmonise_map(problem.domain, uv, energy=name, conformal=1.0 if name is None else 1e-3)
         assert result.injective
         assert result.certificate.bijective
         np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
@@ -213,7 +204,7 @@ class TestHarmonise:
     def test_as_the_paper_has_it(self):
         """One round of η = 1e-4, and nothing to keep triangles from collapsing."""
         problem, uv = folded()
-        result = harmonise_map(problem, uv, energy="arap", eta=1e-4, conformal=0, iterations=100)
+        result = harmonise_map(problem.domain, uv, energy="arap", eta=1e-4, conformal=0, iterations=100)
         assert result.injective
         assert result.stages[0].name == "harmonise, arap, η = 0.0001"
 
@@ -404,7 +395,7 @@ class TestHarmonise:
         target = V[loop].copy()
         target[[1, 5]] = target[[5, 1]]
         problem = Problem(V, F, loop, target)
-        result = harmonise_map(problem, quasi_harmonic_map(problem), energy="arap", iterations=5)
+        result = harmonise_map(problem.domain, quasi_harmonic_map(problem), energy="arap", iterations=5)
         assert not result.injective
         assert result.status is Status.IMPOSSIBLE
         assert result.diagnosis.forbids_injective

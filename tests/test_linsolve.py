@@ -581,8 +581,7 @@ V, F = grid(200, 200)
 rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))
 def solve():
     laplacian = Laplacian(F, len(V), rim, "pardiso", V)
-    laplacian.factor(np.full((3, len(F)), -1.0))
-    laplacian.extend(V @ [1, 1j])
+    laplacian.factor(np.full((3, len(F)), -1.0)).extend(V @ [1, 1j])
 if sys.argv[1] == "limit":
     from threadpoolctl import threadpool_limits
     with threadpool_limits(1):
@@ -647,8 +646,7 @@ from quasiharmonic.surfaces import grid
 V, F = grid(200, 200)
 rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))
 laplacian = Laplacian(F, len(V), rim, "pardiso", V)
-laplacian.factor(np.full((3, len(F)), -1.0))
-laplacian.extend(V @ [1, 1j])
+laplacian.factor(np.full((3, len(F)), -1.0)).extend(V @ [1, 1j])
 print(laplacian.solver._handle.threads)
 """
 

@@ -114,8 +114,8 @@ def test_any_dtype_and_layout_is_accepted_and_nothing_modified(dtype, index):
 def test_moved_shares_the_factorisation_and_checks_the_target():
     problem = posed()
     moved = problem.moved(2 * TARGET)
-    assert moved.laplacian() is problem.laplacian()
-    assert moved.mesh("rest") is problem.mesh("rest")
+    assert moved.domain.laplacian() is problem.domain.laplacian()
+    assert moved.domain.mesh("rest") is problem.domain.mesh("rest")
     np.testing.assert_array_equal(moved.target, 2 * TARGET)
     np.testing.assert_array_equal(problem.target, TARGET)
     with pytest.raises(ValueError, match="target is not finite"):
@@ -137,8 +137,8 @@ def test_pins_and_loops():
     rim = boundary_of(F)
     inner = np.setdiff1d(np.arange(len(V)), rim)
     problem = Problem(V, F, np.append(rim, inner[3]), np.vstack([V[rim], V[inner[3]]]))
-    np.testing.assert_array_equal(problem.pins, inner[3:4])
-    assert sorted(map(len, problem.loops)) == [12, 28]
+    np.testing.assert_array_equal(problem.domain.pins, inner[3:4])
+    assert sorted(map(len, problem.domain.loops)) == [12, 28]
 
 
 class TestTopology:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from meshes import boundary_of, signed_areas
-from quasiharmonic import Descent, Problem, injective_map, solve
+from quasiharmonic import Problem, injective_map, solve
+from quasiharmonic.descent import Newton, VectorAdam
 from quasiharmonic.surfaces import annulus
 
 
@@ -44,7 +45,7 @@ def test_recording_changes_nothing_and_is_off_by_default():
 
 
 def test_counts_on_through_the_stages():
-    stages = [Descent(iterations=4), Descent("newton", iterations=6, resume=True)]
+    stages = [VectorAdam(iterations=4), Newton(iterations=6, resume=True)]
     result = solve(Problem(*turned_ring()), strategy=stages, record=1)
     assert [s.iteration for s in result.path] == [s.iteration for s in result.history]
 

@@ -440,13 +440,13 @@ def test_holes_are_turned_for_the_least_energy():
     V, F = holed(150, (-0.45, 0.1, 0.2), (0.4, 0.2, 0.2), seed=1)
     fixed = np.concatenate(boundary_loops(F, len(V)))
     problem = Problem(V, F, fixed, V[fixed, :2])
-    outer = int(np.argmax([len(loop) for loop in problem.loops]))
+    outer = int(np.argmax([len(loop) for loop in problem.domain.loops]))
     inner = [i for i in range(3) if i != outer]
     square = targets.rectangle(0.4, 0.4)[::-1] - 0.2
-    given = {outer: targets.arc_length(V[problem.loops[outer]], targets.disk())}
+    given = {outer: targets.arc_length(V[problem.domain.loops[outer]], targets.disk())}
     choices = {}
     for i, x in zip(inner, (0.5, -0.4), strict=True):
-        s = arc(V[problem.loops[i]])
+        s = arc(V[problem.domain.loops[i]])
         starts = range(0, len(s), max(1, len(s) // 8))
         choices[i] = [
             at(square + np.array([x, 0.1]), places_along(s, square, [(k, 0.0)], corner_angle=20)) for k in starts

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from .airmesh import AirMesh, Moment
     from .certificate import Certificate, certify, flipped_triangles, is_injective
     from .cutting import Opened, cut_open
+    from .descent import Descent
     from .diagnosis import Diagnosis, diagnose
     from .energies import Energy
     from .harmonising import harmonise
-    from .inject import injective_map, quasi_harmonic_map, solve
     from .inverse import InverseMap, SurfacePoints
     from .measures import Distortion, distortion
     from .morphing import Morphed, morph
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .refinement import Refined, RefinedProblem, refine, refine_problem
     from .repairing import Repaired, RepairedIsland, repair
     from .result import MapResult, Snapshot, Stage, Status, Step
-    from .strategy import Descent
+    from .search.inject import injective_map, quasi_harmonic_map, solve
     from .transfer import SurfaceMap
     from .warping import Warped, warp_along, warp_by_landmarks
 
@@ -33,7 +33,7 @@ __version__ = "0.1.0"
 _HOME = {
     "AirMesh": "airmesh",
     "Certificate": "certificate",
-    "Descent": "strategy",
+    "Descent": "descent",
     "Diagnosis": "diagnosis",
     "Distortion": "measures",
     "Energy": "energies",
@@ -60,15 +60,15 @@ _HOME = {
     "distortion": "measures",
     "flipped_triangles": "certificate",
     "harmonise": "harmonising",
-    "injective_map": "inject",
+    "injective_map": "search.inject",
     "is_injective": "certificate",
     "morph": "morphing",
     "polish": "polishing",
-    "quasi_harmonic_map": "inject",
+    "quasi_harmonic_map": "search.inject",
     "refine": "refinement",
     "refine_problem": "refinement",
     "repair": "repairing",
-    "solve": "inject",
+    "solve": "search.inject",
     "warp_along": "warping",
     "warp_by_landmarks": "warping",
 }

@@ -15,20 +15,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import check_range, index_array, real_array
+from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array, named, real_array
 from quasiharmonic.certificate import Certificate, certify, is_injective
 from quasiharmonic.deformation_energy import DeformationEnergy
 from quasiharmonic.energies import ARAP, AreaBarrier, Combination
-from quasiharmonic.inject import injective_map
-from quasiharmonic.mesh.topology import boundary_loops, named
+from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.newton_descent import NewtonDescent, in_units
 from quasiharmonic.predicates import orientation
+from quasiharmonic.search.inject import injective_map
 from quasiharmonic.targets.contours import signed_area
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: ARAP, and what keeps triangles from collapsing.
 _ELASTIC = Combination((1.0, ARAP()), (0.1, AreaBarrier()))

@@ -1,16 +1,20 @@
-"""What callers hand over, as arrays of one type; refused by name where it is none."""
+"""Arrays: their types, what callers hand over as such, and how their elements are named in messages.
+
+One wording for each error: whoever takes ``V``, ``F`` or rows of coordinates takes them through here.
+"""
 
 from __future__ import annotations
 
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.mesh.topology import named
-
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 def real_array(name: str, values: ArrayLike) -> FloatArray:
@@ -46,6 +50,53 @@ def index_array(name: str, values: ArrayLike) -> IntArray:
     return np.array(array, dtype=np.int64, order="C")
 
 
+def vertex_array(V: ArrayLike, name: str = "V") -> FloatArray:
+    """Positions in the plane or in space, (n, 2) or (n, 3), finite, as float64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When they are not; names the first vertices that are not finite.
+    """
+    array = real_array(name, V)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f"{name} must have shape (n, 2) or (n, 3), not {array.shape}")
+    check_finite(name, "vertex", "vertices", array)
+    return array
+
+
+def triangle_array(F: ArrayLike, n: int) -> IntArray:
+    """Triangles (f, 3) among ``n`` vertices as int64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When there are none, they are no triangles, or refer to vertices that there are not.
+    """
+    array = index_array("F", F)
+    if array.size == 0:
+        raise ValueError("the mesh has no triangles")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"F must have shape (f, 3), triangles only, not {array.shape}")
+    check_range("F", array, n)
+    return array
+
+
+def map_array(name: str, uv: ArrayLike, n: int) -> FloatArray:
+    """Places in the plane, one for each of ``n`` vertices, finite, as (n, 2) float64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When they are not; names the first vertices that are not finite.
+    """
+    array = real_array(name, uv)
+    if array.shape != (n, 2):
+        raise ValueError(f"{name} must have shape ({n}, 2), a position for every vertex, not {array.shape}")
+    check_finite(name, "vertex", "vertices", array)
+    return array
+
+
 def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
     """Raise a ValueError that names the first rows, such as ``one`` vertex, with NaN or infinite numbers."""
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
@@ -66,3 +117,39 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
         return np.asarray(values)
     except ValueError as error:
         raise ValueError(f"{name} is not an array: its rows differ in length") from error
+
+
+def whole_number(name: str, value: Any, *, least: int) -> None:
+    """Raise a ValueError for what is not an integer of at least ``least``."""
+    if not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")
+
+
+def not_negative(name: str, value: Any) -> None:
+    """Raise a ValueError for what is not a finite number of at least zero."""
+    if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
+        raise ValueError(f"{name} must be a finite number of at least 0, not {value!r}")
+
+
+def work(force: ComplexArray, displacement: ComplexArray) -> float:
+    """Real inner product ``Re forceᴴ displacement``; not by BLAS, whose threads cost more to wake than this takes."""
+    return float((force.real * displacement.real + force.imag * displacement.imag).sum())
+
+
+def counted(one: str, many: str, count: int) -> str:
+    """Say how many of some elements there are: ``1 vertex``, ``7 vertices``."""
+    return f"{count} {one if count == 1 else many}"
+
+
+def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:
+    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``."""
+    listed = ", ".join(str(int(i)) for i in indices[:most])
+    rest = f", … ({len(indices)} in all)" if len(indices) > most else ""
+    return f"{one if len(indices) == 1 else many} {listed}{rest}"
+
+
+def named_edges(pairs: IntArray, most: int = 5) -> str:
+    """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
+    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
+    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
+    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"

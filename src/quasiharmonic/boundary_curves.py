@@ -13,11 +13,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.predicates import SegmentRelation, box_pairs, orientation, segment_relation
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 SignArray = NDArray[np.int8]
 
 # Pairs of boundary edges listed at most; a collapsed boundary has billions.

@@ -37,12 +37,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.boundary_curves import Obstacle, Reason, judge_loops, listed
-from quasiharmonic.mesh.topology import edges, named, trace_loops
+from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.predicates import orientation_or_nonfinite
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 SignArray = NDArray[np.int8]
 
 # Triangles judged at a time: bounds the memory, and is large enough for the overhead not to show.

@@ -6,13 +6,11 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.mesh.topology import Edges, edge_keys, edges
-from quasiharmonic.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import FloatArray, IntArray, triangle_array, vertex_array
+from quasiharmonic.mesh.surface import surface_edges
+from quasiharmonic.mesh.topology import edge_keys
 
 
 class Opened(NamedTuple):
@@ -63,9 +61,9 @@ def cut_open(V: ArrayLike, F: ArrayLike) -> Opened:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("cutting a surface needs libigl: pip install 'quasiharmonic[cut]'") from error
 
-    V = np.array(V, dtype=np.float64)
-    F = np.array(F, dtype=np.int64, order="C")
-    found = _checked(V, F)
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    found = surface_edges(F, len(V), closed=True)
     euler = len(V) - len(found.interior) - len(found.boundary) + len(F)
     if euler == 1:
         raise ValueError("the surface is a disk already: nothing to cut")
@@ -76,19 +74,6 @@ def cut_open(V: ArrayLike, F: ArrayLike) -> Opened:
     marked = np.isin(edge_keys(tail, head, len(V)), edge_keys(cut[:, 0], cut[:, 1], len(V)))
     opened = Opened(*igl.cut_mesh(V, F, marked))
     return Opened(opened.V, opened.F.astype(np.int64), opened.origin.astype(np.int64))
-
-
-def _checked(V: FloatArray, F: IntArray) -> Edges:
-    """The edges of a connected surface, closed or not; `ValueError` for anything else."""
-    n = len(V)
-    everywhere = np.arange(n), np.zeros((n, 2))
-    if F.ndim != 2 or not F.size or F.min() < 0 or F.max() >= n:
-        Problem(V, F, *everywhere, reference="equilateral")
-    found = edges(F, n)
-    # A closed surface less one triangle has a boundary, and is a surface if the whole is.
-    closed = not (found.boundary.size or found.inconsistent.size or found.nonmanifold.size)
-    Problem(V, F[:-1] if closed else F, *everywhere, reference="equilateral")
-    return found
 
 
 def _long_path(V: FloatArray, interior: IntArray) -> list[int]:

@@ -9,13 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, named, real_array
 from quasiharmonic.energies import Deformation, Energy, QuadraticForm
 from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import named
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class DeformationEnergy:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.energies import Deformation, Energy
 
-ComplexArray = NDArray[np.complex128]
 Array = NDArray[np.inexact]
 
 # Step widths, relative to the size of what is varied.

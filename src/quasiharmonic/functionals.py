@@ -27,15 +27,12 @@ from abc import ABC, abstractmethod
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.arrays import ComplexArray, FloatArray, work
+from quasiharmonic.laplacian import FactoredLaplacian, Laplacian
 from quasiharmonic.mesh.reference import Derivatives, ReferenceMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.tensor import TensorField
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class Functional(ABC):
@@ -45,18 +42,15 @@ class Functional(ABC):
     ----------
     problem : Problem
     mesh : ReferenceMesh
-    laplacian : Laplacian
-        Of the problem's free vertices, factored for the field in question.
     """
 
     name: str
     #: Whether a value of zero implies the given positions of pins and of every loop.
     sees_positions = True
 
-    def __init__(self, problem: Problem, mesh: ReferenceMesh, laplacian: Laplacian) -> None:
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
         self.problem = problem
         self.mesh = mesh
-        self.laplacian = laplacian
 
     @abstractmethod
     def value(self, at: QuasiHarmonicMap) -> float:
@@ -93,6 +87,8 @@ class QuasiHarmonicMap(Protocol):
     Attributes
     ----------
     field : TensorField
+    operator : FactoredLaplacian
+        Its Laplacian on the problem's free vertices.
     w : (n,) complex128
         The quasi-harmonic map of ``field``, in the problem's frame.
     dw : Derivatives
@@ -105,6 +101,8 @@ class QuasiHarmonicMap(Protocol):
 
     @property
     def field(self) -> TensorField: ...
+    @property
+    def operator(self) -> FactoredLaplacian: ...
     @property
     def w(self) -> ComplexArray: ...
     @property
@@ -141,12 +139,12 @@ class Neumann(Functional):
     name = "neumann"
 
     def value(self, at: QuasiHarmonicMap) -> float:
-        residual = neumann_residual(self.problem, self.laplacian, at.w)
+        residual = neumann_residual(self.problem, at.operator, at.w)
         return 0.5 * work(residual, residual)
 
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        residual = neumann_residual(self.problem, self.laplacian, at.w)
-        spread = self.mesh.derivatives(self.laplacian.extend(residual))
+        residual = neumann_residual(self.problem, at.operator, at.w)
+        spread = self.mesh.derivatives(at.operator.extend(residual))
         return at.field.pull(at.field.pull_twist(*twist(self.mesh, at.dw, spread)))
 
 
@@ -160,16 +158,19 @@ class Poisson(Functional):
     name = "poisson"
     sees_positions = False
 
-    def __init__(self, problem: Problem, mesh: ReferenceMesh, laplacian: Laplacian) -> None:
-        super().__init__(problem, mesh, laplacian)
-        self._held = Laplacian(problem.F, problem.n, problem.fixed[:1], laplacian.solver.name)
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
+        super().__init__(problem, mesh)
+        self._one_held: Laplacian | None = None
         self._known: tuple[TensorField, ComplexArray] | None = None
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
         """``L† g`` up to a constant: the map that the target's Neumann data alone would bring about."""
         if self._known is None or self._known[0] is not at.field:
-            self._held.factor(self.mesh.edge_stiffness(at.field.entries()))
-            self._known = at.field, self._held.respond(neumann_target(self.problem, at.w))
+            if self._one_held is None:
+                first, solver = self.problem.fixed[:1], at.operator.pattern.solver.name
+                self._one_held = Laplacian(self.problem.F, self.problem.n, first, solver)
+            held = self._one_held.factor(self.mesh.edge_stiffness(at.field.entries()))
+            self._known = at.field, held.respond(neumann_target(self.problem, at.w))
         return self._known[1]
 
     def value(self, at: QuasiHarmonicMap) -> float:
@@ -190,7 +191,7 @@ class Sobolev(Poisson):
     sees_positions = True
 
     def value(self, at: QuasiHarmonicMap) -> float:
-        residual = neumann_residual(self.problem, self.laplacian, at.w)
+        residual = neumann_residual(self.problem, at.operator, at.w)
         return 0.5 * work(residual, at.w - self.response(at))
 
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
@@ -263,11 +264,6 @@ def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatA
     return by_c, by_w
 
 
-def work(force: ComplexArray, displacement: ComplexArray) -> float:
-    """``Re forceᴴ displacement``. Not by BLAS, whose threads cost more to wake than this takes."""
-    return float((force.real * displacement.real + force.imag * displacement.imag).sum())
-
-
 def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
     """Neumann data that the target asks for, ``R (g_u + i g_v)``: ``g_u = C b_v``, ``g_v = −C b_u`` (Theorem 6.4).
 
@@ -283,20 +279,20 @@ def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
         Zero but at the boundary.
     """
     g = np.zeros(problem.n, dtype=np.complex128)
-    for loop in problem.loops:
+    for loop in problem.domain.loops:
         b = w[loop]
         g[loop] = -0.5j * (np.roll(b, -1) - np.roll(b, 1))
     return g
 
 
-def neumann_residual(problem: Problem, laplacian: Laplacian, w: ComplexArray) -> ComplexArray:
+def neumann_residual(problem: Problem, operator: FactoredLaplacian, w: ComplexArray) -> ComplexArray:
     """What the Neumann data of a map lack, ``L w − R g`` (eq. 24).
 
     Parameters
     ----------
     problem : Problem
-    laplacian : Laplacian
-        Assembled for the tensors in question.
+    operator : FactoredLaplacian
+        Of the tensors in question.
     w : (n,) complex128
         Their quasi-harmonic map.
 
@@ -306,4 +302,4 @@ def neumann_residual(problem: Problem, laplacian: Laplacian, w: ComplexArray) ->
         Zero but at the fixed vertices.
     """
     # A boundary vertex is fixed, so both terms are zero at free vertices.
-    return laplacian.flux(w) - neumann_target(problem, w)
+    return operator.flux(w) - neumann_target(problem, w)

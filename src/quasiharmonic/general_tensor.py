@@ -38,13 +38,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array, diags_array
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, named
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh
-from quasiharmonic.mesh.topology import named
 from quasiharmonic.problem import Problem
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:

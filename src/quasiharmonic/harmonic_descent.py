@@ -18,25 +18,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.certificate import flipped_triangles
-from quasiharmonic.functionals import Dirichlet
+from quasiharmonic.descent import LBFGS, Newton, Patches, VectorAdam
+from quasiharmonic.descent.base import Steps
 from quasiharmonic.harmonised import Harmonised
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.mesh.reference import Derivatives
 from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.optimize import Stop
-from quasiharmonic.optimize.alternating import own_tensor
-from quasiharmonic.optimize.newton import newton
-from quasiharmonic.optimize.patches import patches
-from quasiharmonic.optimize.scaled_lbfgs import scaled_lbfgs
-from quasiharmonic.optimize.vector_adam import vector_adam
-from quasiharmonic.result import Stage, Status, Step
-from quasiharmonic.tensor import TANH
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from quasiharmonic.result import Stage, Step
 
 # Of a round's evaluations, this part goes to VectorAdam; the length of its steps, halved where they leave the energy's
 # domain; and how much of its mean squares a gradient leaves.
@@ -47,24 +37,15 @@ _SOFTEST = 1e-3
 _RIGHTING = 40
 
 
-def own_xi(dw: Derivatives) -> ComplexArray:
-    """The ξ of a map's own tensors, at which V₃ is least with the map held; (f,) complex128."""
-    return TANH.invert(own_tensor(dw))
-
-
-class _Lost(Exception):  # noqa: N818 - a signal, not an error
-    """VectorAdam has stepped to where the objective is infinite."""
-
-
 class HarmonicDescent:
     """The map at hand, the best on the way, and how to get to the next.
 
     Parameters
     ----------
     objective : Objective
-        Of the problem with its fixed vertices where ``uv`` has them, in the tanh parameterisation.
-    q : Harmonised
-        What is descended; its η is that of the round.
+        V₃ of the problem with its fixed vertices where ``uv`` has them, in the tanh parameterisation.
+    energy : callable
+        From η to what a round descends.
     uv : (n, 2) float64
         The map to begin with.
     callback : callable or None
@@ -81,41 +62,51 @@ class HarmonicDescent:
     """
 
     def __init__(
-        self, objective: Objective, q: Harmonised, uv: FloatArray, callback: Callable[[Step], object] | None
+        self,
+        objective: Objective,
+        energy: Callable[[float], Harmonised],
+        uv: FloatArray,
+        callback: Callable[[Step], object] | None,
     ) -> None:
-        self.objective, self.q, self.uv = objective, q, uv
+        self.uv = uv
+        self._objective, self._energy = objective, energy
         self._problem, self._callback = objective.problem, callback
+        self._measure = energy(1.0)
         self.history: list[Step] = []
         self.stages: list[Stage] = []
         self._squares = np.zeros(len(self._problem.F))
         self.back()
         flipped = flipped_triangles(self._problem.F, uv).size
-        self.best = flipped, q.distortion(self._last) if flipped else q.distortion_of_map(self._last)
+        distortion = self._measure.distortion if flipped else self._measure.distortion_of_map
+        self.best = flipped, distortion(self._last)
         self._report(self.best)
 
     def back(self) -> None:
         """Go back to the best map."""
-        w = self._problem.frame.inward(self.uv)
-        self._last = Iterate(self.objective, TANH.field(own_xi(self.objective.mesh.derivatives(w))), w)
+        self._last = self._objective.of_map(self._problem.frame.inward(self.uv))
 
     def run(self, name: str, eta: float, iterations: int, tolerance: float) -> bool:
         """One round; whether it came to rest."""
-        self.q.eta, self.objective.functional = eta, self.q
+        objective = self._objective.descending(self._energy(eta))
         with self._stage(name):
-            start = self._restart()
+            start = self._restart(objective)
             if not np.isfinite(start.value):
                 return False
-            lowest, left = self._probe(start, iterations)
+            lowest, left = self._probe(objective, start, iterations)
             if not self._squares.any():
                 return True
             if not np.isfinite(self._squares).all():
                 return False  # gradients that leave the numbers' range give no units to go on in
             stiffness = np.sqrt(self._squares)
             stiffness += _SOFTEST * stiffness.mean()
-            self._last = self.objective.evaluate(lowest.xi)
-            return scaled_lbfgs(
-                self.objective, self._last, self._visit, iterations=left, stiffness=stiffness, tolerance=tolerance
-            )
+            self._last = lowest
+            if left < 1:
+                return False
+            method = LBFGS(iterations=left, stiffness=stiffness, tolerance=tolerance)
+            steps = Steps(method.iterates(objective, lowest))
+            for at in steps:
+                self._visit(at)
+            return steps.at_rest
         return False
 
     def right(self) -> bool:
@@ -125,15 +116,13 @@ class HarmonicDescent:
         """
         if self.history[-1].flipped == 0:
             return True
-        self.objective.functional = Dirichlet(self._problem, self.objective.mesh, self.objective.laplacian)
-        for name, method in (("newton", newton), ("patches", patches)):
-            try:
-                with self._stage(f"{name}, tanh"):
-                    self._last = self.objective.evaluate(self._last.xi)
-                    method(self.objective, self._last, self._visit_to_right, iterations=_RIGHTING)
-            except Stop as stop:
-                if stop.status is Status.INJECTIVE:
-                    return True
+        for method in (Newton(iterations=_RIGHTING), Patches(tries=_RIGHTING)):
+            with self._stage(f"{method.word}, tanh"):
+                self._last = self._objective.evaluate(self._last.xi)
+                for at in method.iterates(self._objective, self._last):
+                    self._visit(at)
+                    if self.history[-1].flipped == 0:
+                        return True
         return False
 
     @contextmanager
@@ -157,14 +146,14 @@ class HarmonicDescent:
                 )
             )
 
-    def _restart(self) -> Iterate:
+    def _restart(self, objective: Objective) -> Iterate:
         """The map at hand by its own tensors, or as it is where these have no factorisation."""
         try:
-            return self.objective.evaluate(self.objective.bounded(own_xi(self._last.dw)))
+            return objective.near_map(self._last.w)
         except NotPositiveDefinite:
-            return self.objective.evaluate(self._last.xi)
+            return objective.evaluate(self._last.xi)
 
-    def _probe(self, start: Iterate, iterations: int) -> tuple[Iterate, int]:
+    def _probe(self, objective: Objective, start: Iterate, iterations: int) -> tuple[Iterate, int]:
         """Learn each triangle's stiffness by VectorAdam, which moves all of them at one pace.
 
         Returns the lowest iterate and the evaluations left.
@@ -172,37 +161,30 @@ class HarmonicDescent:
         lowest = here = start
         count = left = int(np.ceil(_PROBING * iterations))
         length = _LENGTH
-
-        def learn(at: Iterate) -> None:
-            nonlocal lowest, here, left
-            left -= 1
-            if not np.isfinite(at.value):
-                raise _Lost
-            gradient = at.gradient
-            self._squares *= _MEMORY
-            self._squares += (1 - _MEMORY) * (gradient.real**2 + gradient.imag**2)
-            here = at
-            self._visit(at)
-            if at.value < lowest.value:
-                lowest = at
-
         while left > 0:
-            try:
-                vector_adam(self.objective, here, learn, iterations=left, schedule=((0, length),))
-            except _Lost:
-                here = self.objective.evaluate(here.xi)
-                length *= 0.5
+            for at in VectorAdam(iterations=left, schedule=((0, length),)).iterates(objective, here):
+                left -= 1
+                if not np.isfinite(at.value):
+                    length *= 0.5
+                    break
+                gradient = at.gradient
+                self._squares *= _MEMORY
+                self._squares += (1 - _MEMORY) * (gradient.real**2 + gradient.imag**2)
+                here = at
+                self._visit(at)
+                if at.value < lowest.value:
+                    lowest = at
         return lowest, iterations - count
 
     def _visit(self, at: Iterate) -> None:
         """Take note of a map."""
         self._last = at
-        flipped, distortion = at.flipped, self.q.distortion(at)
+        flipped, distortion = at.flipped, self._measure.distortion(at)
         if flipped == 0:
             # Decided on the coordinates that are handed back, not on the solver's own.
             uv = self._problem.positions(at.w)
             flipped = flipped_triangles(self._problem.F, uv).size
-            self._compare((flipped, self.q.distortion_of_map(at)), uv)
+            self._compare((flipped, self._measure.distortion_of_map(at)), uv)
         elif flipped <= self.best[0]:
             self._compare((flipped, distortion), self._problem.positions(at.w))
         self._report((flipped, distortion))
@@ -210,12 +192,6 @@ class HarmonicDescent:
     def _compare(self, state: tuple[int, float], uv: FloatArray) -> None:
         if state < self.best:
             self.best, self.uv = state, uv
-
-    def _visit_to_right(self, at: Iterate) -> None:
-        """Take note of a map, and stop at an injective one."""
-        self._visit(at)
-        if self.history[-1].flipped == 0:
-            raise Stop(Status.INJECTIVE)
 
     def _report(self, state: tuple[int, float]) -> None:
         self.history.append(Step(len(self.history), *state))

@@ -10,18 +10,13 @@ numbers, η means the same, and no map is scaled.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.deformation_energy import DeformationEnergy
 from quasiharmonic.energies import Deformation
 from quasiharmonic.functionals import Functional, QuasiHarmonicMap, twist
-from quasiharmonic.laplacian import Laplacian
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.regularizers import Conformal
-
-ComplexArray = NDArray[np.complex128]
 
 
 class Harmonised(Functional):
@@ -35,8 +30,6 @@ class Harmonised(Functional):
     ----------
     problem : Problem
     mesh : ReferenceMesh
-    laplacian : Laplacian
-        Of the problem's free vertices, factored for the field in question.
     area : float
         |Ω|, the area that the target encloses, in the problem's frame; positive.
     energy : DeformationEnergy or None
@@ -53,7 +46,6 @@ class Harmonised(Functional):
         self,
         problem: Problem,
         mesh: ReferenceMesh,
-        laplacian: Laplacian,
         area: float,
         energy: DeformationEnergy | None,
         regularizer: Conformal,
@@ -61,7 +53,7 @@ class Harmonised(Functional):
         eta: float,
         conformal: float,
     ) -> None:
-        super().__init__(problem, mesh, laplacian)
+        super().__init__(problem, mesh)
         self.area = area
         self.energy = energy
         self.regularizer = regularizer
@@ -76,7 +68,7 @@ class Harmonised(Functional):
         gradient = at.dirichlet_gradient / self.area
         if self.energy is not None:
             pull = self.energy.gradient_of(self._deformation(self.energy, at), at.w.size)
-            adjoint = self.mesh.derivatives(self.laplacian.respond(pull))
+            adjoint = self.mesh.derivatives(at.operator.respond(pull))
             by_mu = at.field.pull_twist(*twist(self.mesh, adjoint, at.dw))
             gradient = gradient - self.eta * at.field.pull(by_mu)
         return gradient + self.eta * self.conformal * self.regularizer.gradient(at.field)

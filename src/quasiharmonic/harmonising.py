@@ -8,28 +8,22 @@ from dataclasses import replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import real_array
+from quasiharmonic.arrays import FloatArray, IntArray, map_array, named, not_negative, real_array, whole_number
 from quasiharmonic.certificate import certify, flipped_triangles
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.diagnosis import diagnose
+from quasiharmonic.domain import Domain
 from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet
 from quasiharmonic.harmonic_descent import HarmonicDescent
 from quasiharmonic.harmonised import Harmonised
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.mesh.topology import named
 from quasiharmonic.objective import Objective
-from quasiharmonic.polishing import given_map, not_negative
 from quasiharmonic.problem import Problem
 from quasiharmonic.regularizers import Conformal
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.springs import MassSpring
-from quasiharmonic.strategy import whole_number
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 
 #: What can be lowered, by name: each makes its energy from the rest mesh.
 ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
@@ -135,13 +129,12 @@ def harmonise(
     (True, True)
     """
     began = time.perf_counter()
-    # Where the fixed vertices are does not matter to these checks; where they are is where ``uv`` has them.
-    # Nor do rest triangles without area if there is an energy, which has the better words for them.
-    lenient: Reference = reference if energy is None else "equilateral"
-    problem = Problem(V, F, fixed, np.zeros((np.size(fixed), 2)), reference=lenient)
-    problem.reference = None
+    domain = Domain(V, F, fixed)
+    domain.check_boundary_fixed()
+    if energy is None and reference == "rest":
+        domain.check_areas()
     result = harmonise_map(
-        problem,
+        domain,
         uv,
         energy=energy,
         eta=eta,
@@ -157,7 +150,7 @@ def harmonise(
 
 
 def harmonise_map(
-    problem: Problem,
+    domain: Domain,
     uv: ArrayLike,
     *,
     energy: str | Energy | None = "arap",
@@ -170,12 +163,12 @@ def harmonise_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
-    """Harmonise a map of a `Problem` at hand; the rest as `harmonise` has it.
+    """Harmonise a map of a `Domain` at hand; the rest as `harmonise` has it.
 
-    The problem's ``fixed`` vertices stay where they are in ``uv``; its ``target`` is not looked at.
+    The domain's ``fixed`` vertices stay where they are in ``uv``.
     """
     began = time.perf_counter()
-    chosen = _energy(energy, problem)
+    chosen = _energy(energy, domain)
     barrier = chosen is not None and chosen.barrier
     schedule = _schedule(eta, barrier)
     not_negative("conformal", conformal)
@@ -187,25 +180,27 @@ def harmonise_map(
         raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
     whole_number("iterations", iterations, least=1)
     not_negative("tolerance", tolerance)
-    start = given_map(problem, uv)
-    flipped = flipped_triangles(problem.F, start)
+    start = map_array("uv", uv, domain.n)
+    flipped = flipped_triangles(domain.F, start)
     if barrier and flipped.size:
         raise ValueError(
             f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area, where "
             "this energy is infinite; begin with an injective map, or lower R₁ (energy=None)"
         )
     name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
-    with problem.moved(start[problem.fixed]).exclusive() as own, np.errstate(all="ignore"):
+    problem = Problem.on(domain, start[domain.fixed])
+    with problem.exclusive() as own, np.errstate(all="ignore"):
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
         if not area > 0:
             raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
         deformation = None if chosen is None else DeformationEnergy(own.V, own.F, chosen, area=area, weights=weights)
         objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
         regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
-        q = Harmonised(
-            own, objective.mesh, objective.laplacian, area, deformation, regularizer, eta=1.0, conformal=conformal
-        )
-        descent = HarmonicDescent(objective, q, start, callback)
+
+        def descended(eta: float) -> Harmonised:
+            return Harmonised(own, objective.mesh, area, deformation, regularizer, eta=eta, conformal=conformal)
+
+        descent = HarmonicDescent(objective, descended, start, callback)
         first, status = descent.best, Status.STILL_FALLING
         try:
             for values in (schedule, len(schedule) * schedule[-1:]):
@@ -218,12 +213,12 @@ def harmonise_map(
                 descent.back()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
-    certificate = certify(problem.F, descent.uv)
+    certificate = certify(domain.F, descent.uv)
     diagnosis = None
     if status is not Status.INTERRUPTED:
         converged = status is Status.POLISHED and descent.history[-1].flipped == 0
         if not certificate.injective:
-            diagnosis = diagnose(problem.moved(start[problem.fixed]))
+            diagnosis = diagnose(problem)
             status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
         elif not (descent.best < first or converged):
             status = Status.UNIMPROVED
@@ -239,13 +234,13 @@ def harmonise_map(
     )
 
 
-def _energy(energy: str | Energy | None, problem: Problem) -> Energy | None:
+def _energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
     """The energy of a name, made for this mesh."""
     if energy is None or isinstance(energy, Energy):
         return energy
     if energy not in ENERGIES:
         raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {energy!r}")
-    return ENERGIES[energy](problem.V, problem.F)
+    return ENERGIES[energy](domain.V, domain.F)
 
 
 def _schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float, ...]:

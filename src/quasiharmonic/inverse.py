@@ -18,11 +18,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.certificate import Certificate, certify
 from quasiharmonic.point_location import PointLocator
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Points handled at a time: what is in work stays in the cache.
 _POINTS = 1 << 14

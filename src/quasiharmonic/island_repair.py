@@ -15,23 +15,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray, named, named_edges
 from quasiharmonic.certificate import certify, flipped_triangles
 from quasiharmonic.diagnosis import Diagnosis, diagnose
 from quasiharmonic.diagnosis.obstruction import Obstruction
-from quasiharmonic.inject import solve
 from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import boundary_edges, components, named, named_edges
+from quasiharmonic.mesh.topology import boundary_edges, components
 from quasiharmonic.polishing import polish_map
 from quasiharmonic.predicates import orientation
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.seams import Island, fans, renumbered
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from quasiharmonic.search.inject import solve
 
 # Rings of vertices around inverted triangles that may move, tried in turn ...
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32
@@ -213,7 +209,7 @@ class IslandRepair:
             problem, vertices, _ = self._patch(part)
             if not rest_shapes(problem.V, problem.F).flat.size:
                 polished = polish_map(
-                    problem, self.uv[vertices], linear_solver=self._linear_solver, callback=self._callback
+                    problem.domain, self.uv[vertices], linear_solver=self._linear_solver, callback=self._callback
                 )
                 self.uv[vertices] = _uninterrupted(polished).uv
 

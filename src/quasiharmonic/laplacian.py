@@ -10,13 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.mesh.dissection import nested_dissection
 from quasiharmonic.mesh.topology import edge_keys
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 
 # From this many unknowns on they are numbered by dissection. Minimum degree is as good for fewer (10k unknowns: 17 ms
 # to order and analyse, 7 to factor, for both), and there is nothing to do in parallel yet.
@@ -24,7 +21,7 @@ _DISSECT_FROM = 30_000
 
 
 class Laplacian:
-    """``Gᵀ A G`` restricted to the free vertices, for changing A.
+    """The pattern of ``Gᵀ A G`` restricted to the free vertices, analysed once for any number of tensor fields A.
 
     Parameters
     ----------
@@ -92,6 +89,7 @@ class Laplacian:
         indices[self._above] = self._column
         self._values = np.empty(indptr[-1])
         self.solver = make_solver(indptr, indices, name=linear_solver, ordered=order is not None)
+        self._factored: FactoredLaplacian | None = None
 
         # Half-edges between a free and a fixed vertex carry the boundary's positions into the right-hand side.
         self._border = np.flatnonzero((tail >= 0) != (head >= 0))
@@ -108,7 +106,7 @@ class Laplacian:
         tail = place[F.T]
         return tail, tail[(1, 2, 0), :]
 
-    def factor(self, stiffness: FloatArray) -> None:
+    def factor(self, stiffness: FloatArray) -> FactoredLaplacian:
         """Assemble and factor.
 
         Parameters
@@ -116,22 +114,63 @@ class Laplacian:
         stiffness : (3, f) float64
             Off-diagonal entries of every triangle's ``Gᵀ A G``, from `ReferenceMesh.edge_stiffness`.
 
+        Returns
+        -------
+        FactoredLaplacian
+            For these tensors, whatever is factored after them.
+
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
             When rounding leaves no positive definite matrix.
         """
-        self._stiffness = stiffness.ravel()
-        size = self.free.size
-        above = self._sum @ self._stiffness
+        made = FactoredLaplacian(self, stiffness.ravel())
+        self._refactor(made)
+        return made
+
+    def _refactor(self, operator: FactoredLaplacian) -> None:
+        """Make the solver's one factor that of an operator."""
+        self._factored = None
+        stiffness, size = operator.stiffness, self.free.size
+        above = self._sum @ stiffness
         # Rows of Gᵀ A G sum to zero, so each half-edge is taken off the diagonal at both of its ends.
         # Of nothing, which is where no two free vertices are neighbours, bincount makes integers.
         diagonal = np.bincount(self._row, above, size).astype(np.float64, copy=False)
         diagonal += np.bincount(self._column, above, size)
-        diagonal += np.bincount(self._border_row, self._stiffness[self._border], size)
+        diagonal += np.bincount(self._border_row, stiffness[self._border], size)
         self._values[self._diagonal] = -diagonal
         self._values[self._above] = above
         self.solver.factor(self._values)
+        self._factored = operator
+
+    def _solve(self, operator: FactoredLaplacian, load: ComplexArray) -> ComplexArray:
+        """One solve for both coordinates with an operator's factor; (n - k,) complex128."""
+        if self._factored is not operator:
+            self._refactor(operator)
+        rhs = np.empty((load.size, 2), order="F")
+        rhs[:, 0], rhs[:, 1] = load.real, load.imag
+        solution = self.solver.solve(rhs)
+        out = np.empty(load.size, dtype=np.complex128)
+        out.real, out.imag = solution[:, 0], solution[:, 1]
+        return out
+
+
+class FactoredLaplacian:
+    """``Gᵀ A G`` for one A, made by `Laplacian.factor`.
+
+    A solver holds one factor at a time. An operator whose factor has been overwritten by a later one's makes it anew
+    when it is asked to solve, which costs time and changes no answer.
+
+    Parameters
+    ----------
+    pattern : Laplacian
+    stiffness : (3 f,) float64
+        Off-diagonal entries of every triangle's ``Gᵀ A G``, half-edge by half-edge.
+    """
+
+    def __init__(self, pattern: Laplacian, stiffness: FloatArray) -> None:
+        self.pattern = pattern
+        self.stiffness = stiffness
 
     def extend(self, w: ComplexArray) -> ComplexArray:
         """The quasi-harmonic map with ``w``'s values at the fixed vertices (eq. 12).
@@ -146,11 +185,12 @@ class Laplacian:
         (n,) complex128
             Equal to ``w`` at the fixed vertices, to the last bit.
         """
-        pull = -self._stiffness[self._border] * w[self._border_fixed]
-        load = np.zeros(self.free.size, dtype=np.complex128)
-        np.add.at(load, self._border_row, pull)
+        of = self.pattern
+        pull = -self.stiffness[of._border] * w[of._border_fixed]
+        load = np.zeros(of.free.size, dtype=np.complex128)
+        np.add.at(load, of._border_row, pull)
         out = w.copy()
-        out[self.free] = self._solve(load)
+        out[of.free] = of._solve(self, load)
         return out
 
     def respond(self, load: ComplexArray) -> ComplexArray:
@@ -164,8 +204,9 @@ class Laplacian:
         -------
         (n,) complex128
         """
+        of = self.pattern
         out = np.zeros(load.shape, dtype=np.complex128)
-        out[self.free] = self._solve(load[self.free])
+        out[of.free] = of._solve(self, load[of.free])
         return out
 
     def flux(self, w: ComplexArray) -> ComplexArray:
@@ -179,22 +220,14 @@ class Laplacian:
         -------
         (n,) complex128
         """
-        tail, head = self._rim_tail, self._rim_head
+        of = self.pattern
+        tail, head = of._rim_tail, of._rim_head
         # Rows sum to zero, so an off-diagonal entry k of edge (i, j) adds k (wⱼ − wᵢ) to row i.
-        pull = self._stiffness[self._rim] * (w[head] - w[tail])
-        out = np.zeros(self.n, dtype=np.complex128)
+        pull = self.stiffness[of._rim] * (w[head] - w[tail])
+        out = np.zeros(of.n, dtype=np.complex128)
         np.add.at(out, tail, pull)
         np.subtract.at(out, head, pull)
-        out[self.free] = 0
-        return out
-
-    def _solve(self, load: ComplexArray) -> ComplexArray:
-        """One solve for both coordinates with the factor at hand; (n - k,) complex128."""
-        rhs = np.empty((load.size, 2), order="F")
-        rhs[:, 0], rhs[:, 1] = load.real, load.imag
-        solution = self.solver.solve(rhs)
-        out = np.empty(load.size, dtype=np.complex128)
-        out.real, out.imag = solution[:, 0], solution[:, 1]
+        out[of.free] = 0
         return out
 
 

@@ -6,16 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import check_finite, check_range, index_array, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite, check_range, index_array, real_array
 from quasiharmonic.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.predicates import orientation
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 
 #: Measures that `Distortion` has for every triangle, in the order in which reports list them.
 MEASURES = (

@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.energies import Energy
-from quasiharmonic.inject import solve
 from quasiharmonic.measures import mean_ratio
-from quasiharmonic.mesh.topology import boundary_edges, named
+from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Step
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.search.inject import solve
 
 
 @dataclass(frozen=True, eq=False)

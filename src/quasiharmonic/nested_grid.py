@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import FloatArray, IntArray
 
 # The finest cells have integer coordinates below 2 to this power; a cell ``s`` levels of halving up has them
 # shifted by ``s`` bits.

@@ -14,22 +14,17 @@ converges faster.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
 from quasiharmonic.certificate import is_injective
 from quasiharmonic.deformation_energy import DeformationEnergy
-from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.energies import Deformation
+from quasiharmonic.line_search import backtrack, extend
 from quasiharmonic.newton_system import NewtonSystem
 from quasiharmonic.result import Status
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
-
 # Of the step at which the first triangle would collapse.
 _FRACTION = 0.9
-# Of the decrease that the gradient promises (Armijo's condition).
-_SUFFICIENT = 1e-4
 # The step is halved, and then doubled, this often before the direction is given up.
 _HALVINGS = 30
 # Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
@@ -112,17 +107,11 @@ class NewtonDescent:
         or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
         """
         self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
-        for shift in _SHIFTS:
-            try:
-                self.system.factor(shift)
-                direction = self.system.solve(-gradient)
-            except NotPositiveDefinite:
-                continue
-            promise = -_dot(gradient, direction)
-            if promise >= 0:
-                return direction, promise, True
+        found = self.system.descent(gradient, _SHIFTS)
+        if found is not None:
+            return *found, True
         direction = self.system.solve_diagonal(-gradient)
-        return direction, -_dot(gradient, direction), False
+        return direction, -work(gradient, direction), False
 
     def _search(self, direction: ComplexArray, promise: float) -> bool:
         """Move along a direction, as far as is good; False where no step lowers the energy enough."""
@@ -132,30 +121,22 @@ class NewtonDescent:
         full[self.system.free] = direction
         limit = _FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
         start, before = self.w, self.value
-        longest = min(1.0, limit)
-        halved = longest * 0.5 ** np.arange(_HALVINGS)
-        # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
-        doubled = 2.0 ** np.arange(1, _HALVINGS)
-        for t in (*halved, *doubled[doubled <= limit]):
-            if self._accept(start + t * full, before - _SUFFICIENT * min(t, 1.0) * promise):
-                break
-        else:
+
+        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+            """Accept what is below the bound, and every triangle, exactly, positive."""
+            w = start + t * full
+            deformation = self.energy.deform(w)
+            value = self.energy.value_of(deformation)
+            accepted = value < bound and is_injective(self.energy.F, self.positions(w))
+            return value, (w, deformation) if accepted else None
+
+        taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=_HALVINGS)
+        if taken is None:
+            # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
+            doublings = int(np.count_nonzero(2.0 ** np.arange(1, _HALVINGS) <= limit))
+            taken = backtrack(trial, before, promise, longest=2.0, tries=doublings, factor=lambda t, value: 2.0)
+        if taken is None:
             return False
-        self._cut = t < 1
-        # Far from the minimum, barriers fall by powers and Newton's step is several times too short.
-        while t >= 1 and 2 * t <= limit and self._accept(start + 2 * t * full, self.value):
-            t *= 2
+        self._cut = taken.t < 1
+        _, self.value, (self.w, self._deformation) = extend(trial, taken, limit)
         return True
-
-    def _accept(self, w: ComplexArray, bound: float) -> bool:
-        """Go there if the energy is below a bound and every triangle, exactly, positive."""
-        deformation = self.energy.deform(w)
-        value = self.energy.value_of(deformation)
-        if not (value < bound and is_injective(self.energy.F, self.positions(w))):
-            return False
-        self.w, self._deformation, self.value = w, deformation, value
-        return True
-
-
-def _dot(a: ComplexArray, b: ComplexArray) -> float:
-    return float(np.sum(a.real * b.real + a.imag * b.imag))

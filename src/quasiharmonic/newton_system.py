@@ -7,17 +7,15 @@ values that the factorisation reads.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, triu
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
 from quasiharmonic.energies import QuadraticForm
-from quasiharmonic.linsolve import make_solver
+from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
 from quasiharmonic.mesh.topology import edge_keys
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 
 # Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
 _CHUNK = 8192
@@ -149,6 +147,34 @@ class NewtonSystem:
             When the solution has no correct digits.
         """
         return self.solver.solve(np.ascontiguousarray(load).view(np.float64)).view(np.complex128)
+
+    def descent(self, gradient: ComplexArray, shifts: Sequence[float]) -> tuple[ComplexArray, float] | None:
+        """Newton's direction by the assembled matrix, its diagonal raised as much as a factorisation needs.
+
+        Parameters
+        ----------
+        gradient : (n - k,) complex128
+            By the free vertices' positions.
+        shifts : sequence of float
+            Fractions by which the diagonal is raised, tried in turn.
+
+        Returns
+        -------
+        direction : (n - k,) complex128
+        promise : float
+            The rate at which the energy falls along it (the squared decrement); not negative. Instead of both, None
+            where no shift leaves a positive definite matrix.
+        """
+        for shift in shifts:
+            try:
+                self.factor(shift)
+                direction = self.solve(-gradient)
+            except NotPositiveDefinite:
+                continue
+            promise = -work(gradient, direction)
+            if promise >= 0:
+                return direction, promise
+        return None
 
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:
         """The load divided by the matrix's diagonal: what is left when no factorisation exists."""

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
 from functools import cached_property
 from typing import NamedTuple
+from weakref import ref
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.functionals import FUNCTIONALS, Functional, beltrami_gradient
+from quasiharmonic.laplacian import FactoredLaplacian
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.mesh.reference import Derivatives, Reference, blocks
 from quasiharmonic.problem import Problem
-from quasiharmonic.tensor import PARAMETERIZATIONS, TensorField
-
-ComplexArray = NDArray[np.complex128]
+from quasiharmonic.tensor import PARAMETERIZATIONS, TANH, TensorField, own_tensor
 
 
 class Objective:
@@ -32,6 +32,11 @@ class Objective:
         Shape of the triangles, unless the problem itself names one.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
+
+    Attributes
+    ----------
+    problem, mesh, laplacian, parameterization, functional
+        What it is made of; none of them changes.
     """
 
     def __init__(
@@ -43,12 +48,18 @@ class Objective:
         linear_solver: str = "auto",
     ) -> None:
         self.problem = problem
-        self.mesh = problem.mesh(problem.reference or reference)
+        self.mesh = problem.domain.mesh(problem.reference or reference)
         self.parameterization = PARAMETERIZATIONS[parameterization]
-        self.laplacian = problem.laplacian(linear_solver)
-        self.functional: Functional = FUNCTIONALS[functional](problem, self.mesh, self.laplacian)
+        self.laplacian = problem.domain.laplacian(linear_solver)
+        self.functional: Functional = FUNCTIONALS[functional](problem, self.mesh)
         self._boundary = np.zeros(problem.n, dtype=np.complex128)
         self._boundary[problem.fixed] = problem.frame.inward(problem.target)
+
+    def descending(self, functional: Functional) -> Objective:
+        """The same with another functional, made for this problem and this mesh."""
+        other = copy(self)
+        other.functional = functional
+        return other
 
     def evaluate(self, xi: ComplexArray) -> Iterate:
         """The map of ``xi`` and all that follows from it.
@@ -63,14 +74,40 @@ class Objective:
             When rounding leaves no positive definite Laplacian.
         """
         field = self.parameterization.field(xi)
-        stiffness = np.empty((3, xi.size))
-        for part in blocks(xi.size):
-            stiffness[:, part] = self.mesh[part].edge_stiffness(field[part].entries())
-        self.laplacian.factor(stiffness)
-        w = self.laplacian.extend(self._boundary)
+        operator = self.operator(field)
+        w = operator.extend(self._boundary)
         if not np.isfinite(w.view(np.float64)).all():
             raise NotPositiveDefinite("the solution is not finite")
-        return Iterate(self, field, w)
+        return Iterate(self, field, w, operator)
+
+    def operator(self, field: TensorField) -> FactoredLaplacian:
+        """The Laplacian of a tensor field, factored."""
+        stiffness = np.empty((3, field.xi.size))
+        for part in blocks(field.xi.size):
+            stiffness[:, part] = self.mesh[part].edge_stiffness(field[part].entries())
+        return self.laplacian.factor(stiffness)
+
+    def own_tensor(self, w: ComplexArray) -> ComplexArray:
+        """The μ of each triangle's own image, at which V₃ is least with the map held (eq. 39); (f,) complex128."""
+        dw = self.mesh.derivatives(w)
+        return own_tensor(dw.p, dw.q)
+
+    def of_map(self, w: ComplexArray) -> Iterate:
+        """A map at its own tensors: where it is injective, it is their quasi-harmonic map.
+
+        In the tanh parameterisation, which reaches them all.
+        """
+        return Iterate(self, TANH.field(TANH.invert(self.own_tensor(w))), w)
+
+    def near_map(self, w: ComplexArray) -> Iterate:
+        """The quasi-harmonic map of a map's own tensors, as far as this parameterisation reaches them.
+
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When rounding leaves no positive definite Laplacian.
+        """
+        return self.evaluate(self.bounded(self.parameterization.invert(self.own_tensor(w))))
 
     def step(self, start: Iterate, step: ComplexArray) -> Iterate:
         """Evaluate at ``ξ + step``, the tensors kept within the numbers' range and the step shortened when
@@ -103,20 +140,36 @@ class Objective:
         return inside
 
 
-@dataclass(frozen=True)
 class Iterate:
-    """The state at one ξ.
+    """A map, the tensors it belongs to, and what the objective is there.
 
-    Attributes
+    Parameters
     ----------
+    objective : Objective
     field : TensorField
     w : (n,) complex128
         The quasi-harmonic map in the problem's frame.
+    operator : FactoredLaplacian, optional
+        Of ``field``; factored when it is asked for where it is not at hand.
     """
 
-    objective: Objective
-    field: TensorField
-    w: ComplexArray
+    def __init__(
+        self, objective: Objective, field: TensorField, w: ComplexArray, operator: FactoredLaplacian | None = None
+    ) -> None:
+        self.objective = objective
+        self.field = field
+        self.w = w
+        # The pattern keeps the last operator. Most iterates never need theirs again, and it is as large as they are.
+        self._operator = None if operator is None else ref(operator)
+
+    @property
+    def operator(self) -> FactoredLaplacian:
+        """The Laplacian of these tensors."""
+        operator = None if self._operator is None else self._operator()
+        if operator is None:
+            operator = self.objective.operator(self.field)
+            self._operator = ref(operator)
+        return operator
 
     @property
     def xi(self) -> ComplexArray:

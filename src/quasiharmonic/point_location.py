@@ -10,14 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.nested_grid import NestedGrid
 from quasiharmonic.predicates import orientation, twice_area
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # The determinant l − r of differences of up to 1 is off by no more: (3u + O(u²)) · 2 with u = 2⁻⁵³.
 _UNSURE = 2.0**-50

@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from numbers import Real
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import check_finite, real_array
+from quasiharmonic.arrays import FloatArray, map_array, named, not_negative, real_array, whole_number
 from quasiharmonic.certificate import certify, flipped_triangles
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
+from quasiharmonic.domain import Domain
 from quasiharmonic.energies import (
     ARAP,
     MIPS,
@@ -23,20 +22,16 @@ from quasiharmonic.energies import (
     SymmetricDirichlet,
     conformal_area_blend,
 )
-from quasiharmonic.mesh.topology import named
 from quasiharmonic.newton_descent import NewtonDescent, in_units
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
-from quasiharmonic.strategy import whole_number
-
-FloatArray = NDArray[np.float64]
 
 #: What a polish can lower, by name. ARAP gets a tenth of the area barrier: alone it lets triangles collapse.
 ENERGIES: dict[str, Energy] = {
     "symmetric-dirichlet": SymmetricDirichlet(),
     "mips": MIPS(),
     "blend": conformal_area_blend(),
-    "arap": Combination((1.0, ARAP()), (0.1, AreaBarrier())),
+    "arap-barrier": Combination((1.0, ARAP()), (0.1, AreaBarrier())),
 }
 
 
@@ -72,7 +67,7 @@ def polish(
         - ``"mips"``: σ₁/σ₂ + σ₂/σ₁, angles and nothing else; scale may vary by many orders of magnitude.
         - ``"blend"``: (1 − θ) MIPS + θ (det J + 1/det J), θ = 1/128: angles, with the scale bounded. Another θ
           with `quasiharmonic.energies.conformal_area_blend`.
-        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)² and a tenth of det J + 1/det J, rigid where it can be.
+        - ``"arap-barrier"``: (σ₁ − 1)² + (σ₂ − 1)² and a tenth of det J + 1/det J, rigid where it can be.
 
         Or any `Energy` that is a barrier and has second derivatives. Lengths and areas are compared after
         scaling the map to the surface's area.
@@ -116,10 +111,10 @@ def polish(
     (True, True)
     """
     began = time.perf_counter()
-    # Where the fixed vertices are does not matter to the checks; where they are is where ``uv`` has them.
-    problem = Problem(V, F, fixed, np.zeros((np.size(fixed), 2)), reference="equilateral")
+    domain = Domain(V, F, fixed)
+    domain.check_boundary_fixed()
     result = polish_map(
-        problem,
+        domain,
         uv,
         energy=energy,
         weights=weights,
@@ -132,7 +127,7 @@ def polish(
 
 
 def polish_map(
-    problem: Problem,
+    domain: Domain,
     uv: ArrayLike,
     *,
     energy: str | Energy = "symmetric-dirichlet",
@@ -142,15 +137,15 @@ def polish_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
-    """Polish a map of a `Problem` at hand; the rest as `polish` has it.
+    """Polish a map of a `Domain` at hand; the rest as `polish` has it.
 
-    The problem's ``fixed`` vertices stay where they are in ``uv``; its ``target`` is not looked at.
+    The domain's ``fixed`` vertices stay where they are in ``uv``.
     """
     began = time.perf_counter()
     chosen = energy_named(energy)
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)
-    start = _start(problem, uv)
+    start = _start(domain, uv)
     if weights is not None:
         weights = real_array("weights", weights)
         bad = np.flatnonzero(~(weights > 0))
@@ -160,9 +155,9 @@ def polish_map(
     with np.errstate(all="ignore"):
         # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
         exponent = int(np.frexp(np.abs(start).max())[1])
-        area = float(signed_areas(problem.F, in_units(start, exponent)).sum())
-        deformation = DeformationEnergy(problem.V, problem.F, chosen, area=area, weights=weights)
-        descent = NewtonDescent(deformation, start, problem.fixed, exponent, linear_solver)
+        area = float(signed_areas(domain.F, in_units(start, exponent)).sum())
+        deformation = DeformationEnergy(domain.V, domain.F, chosen, area=area, weights=weights)
+        descent = NewtonDescent(deformation, start, domain.fixed, exponent, linear_solver)
     history: list[Step] = []
 
     def report() -> None:
@@ -183,7 +178,7 @@ def polish_map(
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     uv = descent.positions(descent.w)
-    certificate = certify(problem.F, uv, loops=problem.loops)
+    certificate = certify(domain.F, uv, loops=domain.loops)
     seconds = time.perf_counter() - began
     name = energy if isinstance(energy, str) else type(energy).__name__
     stage = Stage(
@@ -215,7 +210,7 @@ def polished(
 ) -> MapResult:
     """Polish the injective map of a result, by the linear solver that found it; stages and history are continued."""
     further = polish_map(
-        problem,
+        problem.domain,
         result.uv,
         energy=energy,
         max_iterations=max_iterations,
@@ -252,25 +247,10 @@ def energy_named(energy: str | Energy) -> Energy:
     return energy
 
 
-def not_negative(name: str, value: Any) -> None:
-    """Raise a ValueError for what is not a finite number of at least zero."""
-    if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
-        raise ValueError(f"{name} must be a finite number of at least 0, not {value!r}")
-
-
-def given_map(problem: Problem, uv: ArrayLike) -> FloatArray:
-    """A user's map of the problem's mesh as float64, checked; a copy."""
-    start = real_array("uv", uv)
-    if start.shape != (problem.n, 2):
-        raise ValueError(f"uv must have shape ({problem.n}, 2), a position for every vertex, not {start.shape}")
-    check_finite("uv", "vertex", "vertices", start)
-    return start
-
-
-def _start(problem: Problem, uv: ArrayLike) -> FloatArray:
+def _start(domain: Domain, uv: ArrayLike) -> FloatArray:
     """The start as float64, checked."""
-    start = given_map(problem, uv)
-    flipped = flipped_triangles(problem.F, start)
+    start = map_array("uv", uv, domain.n)
+    flipped = flipped_triangles(domain.F, start)
     if flipped.size:
         raise ValueError(
             f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; "

@@ -30,10 +30,9 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
+
 SignArray = NDArray[np.int8]
-IntArray = NDArray[np.int64]
 
 # |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r,
 # u = 2⁻⁵³ [1]_, and 4u covers the second order and the rounding of the bound itself.

@@ -7,14 +7,9 @@ to the apex where nothing else is left. If the coarse map is injective, so is th
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.coarsening import Coarsening, touching
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # A triangle's squared sides over twice its area are 2√3 = 3.5 when it is equilateral. Below this on average a vertex
 # has a good place.

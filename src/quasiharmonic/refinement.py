@@ -6,18 +6,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import check_finite, check_range, index_array, real_array
+from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, real_array
 from quasiharmonic.mesh.topology import edge_keys
 from quasiharmonic.mesh.topology import edges as sort_edges
 from quasiharmonic.problem import Problem
 
 if TYPE_CHECKING:
     from quasiharmonic.diagnosis import Diagnosis
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

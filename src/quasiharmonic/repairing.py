@@ -10,18 +10,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray, IntArray, counted, named
 from quasiharmonic.certificate import certify
 from quasiharmonic.diagnosis import Diagnosis
 from quasiharmonic.island_repair import IslandRepair
-from quasiharmonic.mesh.topology import counted, named
 from quasiharmonic.result import Step
 from quasiharmonic.seams import Island, islands
-from quasiharmonic.strategy import whole_number
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.search.strategy import whole_number
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.mesh.topology import edge_keys, named
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.mesh.topology import edge_keys
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, named
 from quasiharmonic.energies import Deformation, Energy, QuadraticForm, damped, inverse
 from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import boundary_edges, named
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from quasiharmonic.mesh.topology import boundary_edges
 
 
 class MassSpring(Energy):

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import Delaunay
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import FloatArray, IntArray
 
 
 def grid(nx: int, ny: int, *, alternating: bool = False) -> tuple[FloatArray, IntArray]:

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from quasiharmonic.arrays import ComplexArray, FloatArray
 
 # In place of a divisor that vanishes together with what it divides.
 _TINY = 1e-300
@@ -179,6 +177,27 @@ class TensorField:
         out: ComplexArray = self.ratio * grad
         out += radial * self.xi
         return out
+
+
+def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:
+    """The μ that makes V₃ least with the map held (eq. 39).
+
+    The energy ``2m |q − μp|² / (1 − |μ|²)`` of a triangle is least at its own Beltrami coefficient ``μ = q/p`` where it
+    is positive, and at ``conj(p/q)`` where it is inverted; the least values are 0 and twice the inverted area.
+
+    Parameters
+    ----------
+    p, q : (f,) complex128
+        Derivatives ``∂w/∂z`` and ``∂w/∂z̄`` of the map on each triangle.
+
+    Returns
+    -------
+    (f,) complex128
+        Of modulus 1 where a triangle has no area.
+    """
+    inverted = np.abs(q) > np.abs(p)
+    small, large = np.where(inverted, p.conj(), q), np.where(inverted, q.conj(), p)
+    return np.divide(small, large, out=np.zeros_like(p), where=large != 0)
 
 
 def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -8,12 +8,11 @@ have nothing in common.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.inverse import InverseMap, Per, SurfacePoints
 from quasiharmonic.predicates import orientation
-
-FloatArray = NDArray[np.float64]
 
 
 class SurfaceMap:

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.energies import Energy
-from quasiharmonic.inject import injective_map
 from quasiharmonic.inverse import InverseMap
-from quasiharmonic.mesh.topology import boundary_edges, named
+from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.result import MapResult
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.search.inject import injective_map
 
 # Cells along the longer side of a picture, and at least along the shorter, so that there is a way past landmarks.
 _ALONG, _ACROSS = 48, 6

@@ -175,7 +175,7 @@ def _checked(settings: Settings) -> Settings:
     from quasiharmonic.linsolve import available
     from quasiharmonic.mesh.reference import Reference
     from quasiharmonic.polishing import ENERGIES
-    from quasiharmonic.strategy import STRATEGIES
+    from quasiharmonic.search.strategy import STRATEGIES
 
     for name, words in (
         ("strategy", list(STRATEGIES)),

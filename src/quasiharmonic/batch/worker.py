@@ -31,12 +31,12 @@ from quasiharmonic import __version__, io
 from quasiharmonic.batch import records
 from quasiharmonic.batch.records import Record
 from quasiharmonic.certificate import certify
-from quasiharmonic.inject import solve
 from quasiharmonic.measures import distortion
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.polishing import polish_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status
+from quasiharmonic.search.inject import solve
 
 #: What a process says when it has imported what it needs.
 READY = "ready"
@@ -143,7 +143,7 @@ def _solve(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[di
         arrays = io.problem_arrays(mesh, fixed) if settings["to"] is None else _onto(settings["to"], mesh)
         problem = Problem(*arrays, reference=settings["reference"])
     record |= {"vertices": problem.n, "triangles": len(problem.F), "fixed": len(problem.fixed)}
-    record |= {"pins": len(problem.pins), "loops": len(problem.loops)}
+    record |= {"pins": len(problem.domain.pins), "loops": len(problem.domain.loops)}
     tell({"facts": record})
     with _timed(record, "map"):
         result = solve(
@@ -155,7 +155,9 @@ def _solve(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[di
     stages, found = result.stages, result
     if settings["polish"] is not None and result.status is Status.INJECTIVE:
         with _timed(record, "polish"):
-            found = polish_map(problem, result.uv, energy=settings["polish"], linear_solver=settings["linear_solver"])
+            found = polish_map(
+                problem.domain, result.uv, energy=settings["polish"], linear_solver=settings["linear_solver"]
+            )
         stages = stages + found.stages
     record |= {
         "status": found.status.name.lower(),

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     certificate = map.write(folder / "demo.obj", io.MeshData(V, F), result)
     with report.after_writing(folder / "demo.obj"):
         map.draw(folder / "demo.png", problem, result, certificate)
-        facts = {**result.to_dict(), **report.verdict(certificate), **report.sizes(problem)}
+        facts = {**result.to_dict(), **report.verdict(certificate), **report.sizes(problem.domain)}
         report.emit(facts, str(folder / "demo.json"), report.of_map(result, certificate, folder / "demo.obj"))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}")
     return 0 if certificate.injective else 1

@@ -46,6 +46,6 @@ def run(options: argparse.Namespace) -> int:
     with report.about(mesh_path):
         problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
     diagnosis = diagnose(problem)
-    facts = {**diagnosis.to_dict(), **report.sizes(problem), "input": str(options.input)}
+    facts = {**diagnosis.to_dict(), **report.sizes(problem.domain), "input": str(options.input)}
     report.emit(facts, options.json, f"{options.input}: {diagnosis.summary()}")
     return 1 if diagnosis.forbids_injective else 0

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.problem import Problem
+    from quasiharmonic.domain import Domain
     from quasiharmonic.result import MapResult, Step
 
 
@@ -54,11 +54,11 @@ def run(options: argparse.Namespace) -> int:
     """Read, harmonise, write, judge, report."""
     from . import polish
 
-    def lower(problem: Problem, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
+    def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
         from quasiharmonic.harmonising import harmonise_map
 
         return harmonise_map(
-            problem,
+            domain,
             uv,
             energy=options.energy,
             eta=options.eta,

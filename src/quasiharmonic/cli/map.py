@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
         facts = {
             **result.to_dict(),
             **report.verdict(certificate),
-            **report.sizes(problem),
+            **report.sizes(problem.domain),
             **posed.facts,
             "input": str(options.input),
             "output": str(options.output),
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
 
 def search(problem: Problem, strategy: str, polish: str | None, max_iterations: int, linear_solver: str) -> MapResult:
     """Solve with progress on the terminal."""
-    from quasiharmonic.inject import solve
+    from quasiharmonic.search.inject import solve
 
     from . import progress
 
@@ -159,9 +159,9 @@ def draw(path: Path, problem: Problem, result: MapResult, certificate: Certifica
     """Draw the rest surface, Tutte's embedding and the map; or how it distorts."""
     import numpy as np
 
-    from quasiharmonic.inject import quasi_harmonic_map
     from quasiharmonic.linsolve import NotPositiveDefinite
     from quasiharmonic.plot import save_distortion_figure, save_map_figure
+    from quasiharmonic.search.inject import quasi_harmonic_map
 
     def framed(uv: NDArray[np.float64]) -> NDArray[np.float64]:
         # Of unit size, so that a picture of coordinates of 1e300 does not overflow.

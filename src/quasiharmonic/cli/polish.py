@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.domain import Domain
     from quasiharmonic.measures import Distortion
-    from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Step
 
-    Lower: TypeAlias = Callable[[Problem, NDArray[np.float64], Callable[[Step], None] | None], MapResult]
+    Lower: TypeAlias = Callable[[Domain, NDArray[np.float64], Callable[[Step], None] | None], MapResult]
 
 
 def add_parser(commands: Commands) -> None:
@@ -49,11 +49,11 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, polish, write, judge, report."""
 
-    def lower(problem: Problem, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
+    def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
         from quasiharmonic.polishing import polish_map
 
         return polish_map(
-            problem,
+            domain,
             uv,
             energy=options.energy,
             max_iterations=options.max_iterations,
@@ -67,8 +67,8 @@ def run(options: argparse.Namespace) -> int:
 def improve(options: argparse.Namespace, lower: Lower) -> int:
     """Read a map, lower its distortion, write, judge, report; for every command that does so."""
     from quasiharmonic import io
+    from quasiharmonic.domain import Domain
     from quasiharmonic.measures import distortion
-    from quasiharmonic.problem import Problem
 
     from . import map, progress, report
 
@@ -77,18 +77,18 @@ def improve(options: argparse.Namespace, lower: Lower) -> int:
     uv = io.map_of(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
-        # Rest triangles without area are let pass here: what is lowered has the better words for them.
-        problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
-        problem.reference = None
+        V, F, held, _ = io.problem_arrays(mesh, fixed)
+        domain = Domain(V, F, held)
+        domain.check_boundary_fixed()
         with progress.line() as show:
-            result = lower(problem, uv, show)
+            result = lower(domain, uv, show)
     certificate = map.write(options.output, mesh, result)
     with report.after_writing(options.output):
-        before, after = (distortion(problem.V, problem.F, w) for w in (uv, result.uv))
+        before, after = (distortion(domain.V, domain.F, w) for w in (uv, result.uv))
         facts = {
             **result.to_dict(),
             **report.verdict(certificate),
-            **report.sizes(problem),
+            **report.sizes(domain),
             "input": str(options.input),
             "output": str(options.output),
             "distortion_before": before.to_dict(),

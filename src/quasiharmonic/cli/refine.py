@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
             "split": split,
             "rounds": result.rounds,
             "diagnosis": result.diagnosis.to_dict(),
-            **report.sizes(result.problem),
+            **report.sizes(result.problem.domain),
             "input": str(options.input),
             "output": str(output),
             "handles": str(handles),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quasiharmonic.certificate import Certificate
-    from quasiharmonic.problem import Problem
+    from quasiharmonic.domain import Domain
     from quasiharmonic.result import MapResult
 
 
@@ -26,9 +26,9 @@ def verdict(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def sizes(problem: Problem) -> dict[str, Any]:
-    """How large a problem is."""
-    return {"vertices": problem.n, "triangles": len(problem.F), "fixed": len(problem.fixed)}
+def sizes(domain: Domain) -> dict[str, Any]:
+    """How large a mesh is, and how much of it is held."""
+    return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
 
 
 def of_map(result: MapResult, certificate: Certificate, output: Path) -> str:

@@ -124,7 +124,8 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
 
 def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[NDArray[np.float64]]) -> Posed:
     """Lay the boundary along an outline."""
-    from quasiharmonic.mesh.topology import boundary_loops, counted
+    from quasiharmonic.arrays import counted
+    from quasiharmonic.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets import boundary_to, filled
 
@@ -164,7 +165,7 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[ND
 
 def _check_room(problem: Problem, to: str) -> None:
     """Refuse at once what cannot end well, before a search that may take long."""
-    from quasiharmonic.mesh.topology import named_edges
+    from quasiharmonic.arrays import named_edges
     from quasiharmonic.targets import flattened_edges
 
     flat = flattened_edges(problem.F, problem.fixed, problem.target)

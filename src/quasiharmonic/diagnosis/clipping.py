@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import FloatArray, IntArray
+
 Point = tuple[int, int]
 Line = tuple[int, int, int]
 """``a, b, c``: the point (x, y) lies to the left where ``a x + b y + c > 0``."""

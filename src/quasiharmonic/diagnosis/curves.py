@@ -14,14 +14,10 @@ from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.boundary_curves import Contacts, contacts, winding
 from quasiharmonic.predicates import SegmentRelation, orientation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # More meeting pairs than this are not collected: a target that is this entangled needs no full list.
 MOST_CONTACTS = 10_000

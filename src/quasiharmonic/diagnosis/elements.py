@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import named, named_edges
 from quasiharmonic.boundary_curves import winding
 from quasiharmonic.diagnosis.curves import BoundaryCurves
 from quasiharmonic.diagnosis.fixture import Fixture, Star
@@ -21,16 +21,14 @@ from quasiharmonic.diagnosis.obstruction import (
     named_vertices,
     smallest_conflict,
 )
-from quasiharmonic.mesh.topology import edge_keys, named, named_edges
+from quasiharmonic.mesh.topology import edge_keys
 from quasiharmonic.predicates import orientation
 from quasiharmonic.problem import Problem
-
-IntArray = NDArray[np.int64]
 
 
 def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
     """Edges whose two ends are fixed at the same position."""
-    every = np.concatenate([problem.edges.boundary, fixture.chords])
+    every = np.concatenate([problem.domain.edges.boundary, fixture.chords])
     where = fixture.positions
     for edge in every[(where[every[:, 0]] == where[every[:, 1]]).all(axis=1)]:
         message = f"The target gives both ends of {named_edges(edge[None])} the same position."
@@ -42,7 +40,7 @@ def inverted_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obstructi
     whole = np.flatnonzero(fixture.fixed[problem.F].all(axis=1))
     corners = problem.F[whole]
     sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
-    boundary = edge_keys(problem.edges.boundary[:, 0], problem.edges.boundary[:, 1], problem.n)
+    boundary = edge_keys(problem.domain.edges.boundary[:, 0], problem.domain.edges.boundary[:, 1], problem.n)
     for t, abc, s in zip(whole[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
         sides = np.stack([abc, np.roll(abc, -1)], axis=1)
         message = (
@@ -65,7 +63,7 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
 
     # Triangles around a free vertex belong together, and so do those of two free vertices joined.
     free = ~fixture.fixed
-    interior = problem.edges.interior
+    interior = problem.domain.edges.interior
     inner = interior[free[interior].all(axis=1)]
     graph = csr_array((np.ones(len(inner), dtype=np.int8), inner.T), shape=(problem.n, problem.n))
     label = connected_components(graph, directed=False)[1]
@@ -82,7 +80,7 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
     twice_area: dict[int, int] = {}
     for k, (px, py), (qx, qy) in zip(of.tolist(), fixture.points(edge[:, 0]), fixture.points(edge[:, 1]), strict=True):
         twice_area[k] = twice_area.get(k, 0) + px * qy - py * qx
-    boundary = edge_keys(problem.edges.boundary[:, 0], problem.edges.boundary[:, 1], problem.n)
+    boundary = edge_keys(problem.domain.edges.boundary[:, 0], problem.domain.edges.boundary[:, 1], problem.n)
     for k in sorted(k for k, area in twice_area.items() if area <= 0):
         around = edge[of == k]
         message = f"The fixed {named_edges(around)} around a part of the mesh leave it no positive area."
@@ -111,7 +109,7 @@ def misplaced_pins(problem: Problem, fixture: Fixture, curves: BoundaryCurves, p
     proper : bool
         Whether the curves are simple and properly nested.
     """
-    pins = problem.pins
+    pins = problem.domain.pins
     if not pins.size:
         return
     where, same, times = np.unique(fixture.positions[pins], axis=0, return_inverse=True, return_counts=True)

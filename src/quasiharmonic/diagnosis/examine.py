@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import IntArray, named, named_edges
 from quasiharmonic.diagnosis.curves import BoundaryCurves, Corners
 from quasiharmonic.diagnosis.elements import (
     collapsed_edges,
@@ -20,11 +20,8 @@ from quasiharmonic.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstru
 from quasiharmonic.diagnosis.shortcuts import Shortcuts
 from quasiharmonic.diagnosis.sight import Sight, bad_chords
 from quasiharmonic.diagnosis.witness import unplaced
-from quasiharmonic.mesh.topology import named, named_edges
 from quasiharmonic.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
-
-IntArray = NDArray[np.int64]
 
 # What is spent on vertices that see too little, in about microseconds, before those left are passed over.
 _MOST_EFFORT = 3_000_000
@@ -80,12 +77,12 @@ def diagnose(problem: Problem) -> Diagnosis:
        Vision, Graphics, and Image Processing 35 (1986).
     """
     fixture = Fixture.of(problem)
-    curves = BoundaryCurves(fixture.positions, problem.loops)
-    euler = problem.n - len(problem.edges.interior) - len(problem.edges.boundary) + len(problem.F)
+    curves = BoundaryCurves(fixture.positions, problem.domain.loops)
+    euler = problem.n - len(problem.domain.edges.interior) - len(problem.domain.edges.boundary) + len(problem.F)
     area = _twice_area(fixture, curves)
     if area < 0 and _fits_mirrored(curves, euler):
         message = "The target is wound against the mesh: every loop runs the wrong way around."
-        loops = np.arange(len(problem.loops))
+        loops = np.arange(len(problem.domain.loops))
         reversed_ = Obstruction(Kind.REVERSED, Forbids.INJECTIVE, message, loops=loops)
         return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",))
 
@@ -108,7 +105,7 @@ def diagnose(problem: Problem) -> Diagnosis:
         hidden, passed_over = _unplaced(problem, fixture, curves, corners, np.concatenate([curves.ends, chords]))
         found += hidden
         unchecked += passed_over
-    if corners is not None and len(problem.loops) == 1:
+    if corners is not None and len(problem.domain.loops) == 1:
         shortcuts = Shortcuts(problem, fixture, corners)
         found += shortcuts.find()
         unchecked.append(f"link distances of boundary vertices that are {shortcuts.unchecked} or more edges apart")
@@ -173,10 +170,10 @@ def _global(problem: Problem, curves: BoundaryCurves, euler: int, area: int) -> 
     area : int
         Any number of the sign of the area that the loops wind around.
     """
-    every = np.arange(len(problem.loops))
+    every = np.arange(len(problem.domain.loops))
     turning, ranges = curves.turning, curves.winding_range
     proper = _proper(curves)
-    genus = (2 - len(problem.loops) - euler) // 2
+    genus = (2 - len(problem.domain.loops) - euler) // 2
 
     if area <= 0:
         message = "The target encloses no positive area."

@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.diagnosis.clipping import Convex, Lattice, line
 from quasiharmonic.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -45,7 +41,7 @@ class Fixture:
         positions[problem.fixed] = problem.target
         row = np.full(problem.n, -1)
         row[problem.fixed] = np.arange(len(problem.fixed))
-        interior = problem.edges.interior
+        interior = problem.domain.edges.interior
         chords = interior[(row[interior] >= 0).all(axis=1)]
         return Fixture(positions, row >= 0, chords, Lattice(problem.target), row)
 
@@ -141,7 +137,7 @@ def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
         Vertices at which the boundary goes back along itself: nothing is near these.
     """
     fixed = fixture.fixed
-    interior = problem.edges.interior
+    interior = problem.domain.edges.interior
     joined = interior[fixed[interior[:, 0]] != fixed[interior[:, 1]]]
     joined = np.where(fixed[joined[:, :1]], joined[:, ::-1], joined)  # free, fixed
     two = np.flatnonzero(fixed[problem.F].sum(axis=1) == 2)
@@ -151,7 +147,7 @@ def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
     neighbours = np.bincount(joined[:, 0], minlength=problem.n)
     opposite = np.bincount(corner[:, 0], minlength=problem.n)
     following = np.full(problem.n, -1)
-    following[problem.edges.boundary[:, 0]] = problem.edges.boundary[:, 1]
+    following[problem.domain.edges.boundary[:, 0]] = problem.domain.edges.boundary[:, 1]
     outer = np.bincount(corner[following[corner[:, 1]] == corner[:, 2], 0], minlength=problem.n)
     placed = (neighbours <= 3) & (outer == neighbours - 1) & (outer == opposite)
     placed[corner[np.isin(corner[:, 1], folds), 0]] = False

@@ -22,13 +22,11 @@ from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import IntArray
 from quasiharmonic.diagnosis.clipping import MARGIN
 from quasiharmonic.diagnosis.triangulation import triangulate
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Point = tuple[int, int, int]
 """Homogeneous coordinates, the last positive."""
 

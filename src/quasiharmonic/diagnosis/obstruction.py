@@ -9,11 +9,9 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.mesh.topology import named
-
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import IntArray, named
 
 
 class Forbids(Enum):

@@ -9,19 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.diagnosis.clearance import clear
 from quasiharmonic.diagnosis.curves import Corners
 from quasiharmonic.diagnosis.fixture import Fixture
 from quasiharmonic.diagnosis.links import Polygon
 from quasiharmonic.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices
 from quasiharmonic.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # Pairs this many edges apart and more are not looked at.
 LONGEST = 8
@@ -53,9 +49,9 @@ class Shortcuts:
     """
 
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
-        self._loop = problem.loops[0]
+        self._loop = problem.domain.loops[0]
         free = ~fixture.fixed
-        interior = problem.edges.interior
+        interior = problem.domain.edges.interior
         inner = interior[free[interior].all(axis=1)]
         mixed = interior[free[interior[:, 0]] != free[interior[:, 1]]]
         mixed = np.where(free[mixed[:, :1]], mixed[:, ::-1], mixed)  # fixed, free

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import IntArray, named_edges
 from quasiharmonic.boundary_curves import contacts
 from quasiharmonic.diagnosis.clipping import Convex, Walls
 from quasiharmonic.diagnosis.curves import MOST_CONTACTS, BoundaryCurves, Corners
@@ -25,11 +25,7 @@ from quasiharmonic.diagnosis.obstruction import (
 )
 from quasiharmonic.diagnosis.views import Views
 from quasiharmonic.diagnosis.wedges import Wedges
-from quasiharmonic.mesh.topology import named_edges
 from quasiharmonic.problem import Problem
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # So many vertices are looked at before all others, however many have to be seen.
 _APART = 8
@@ -40,7 +36,7 @@ def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves, corne
     chords, where = fixture.chords, fixture.positions
     if not len(chords):
         return
-    segments = np.concatenate([curves.ends, np.stack([problem.pins, problem.pins], axis=1), chords])
+    segments = np.concatenate([curves.ends, np.stack([problem.domain.pins, problem.domain.pins], axis=1), chords])
     first = len(segments) - len(chords)
     met: dict[int, list[IntArray]] = {}
     for i, j in contacts(where, segments, MOST_CONTACTS).pairs.tolist():

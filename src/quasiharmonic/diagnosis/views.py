@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.diagnosis.clipping import Lattice, cross
 from quasiharmonic.diagnosis.wedges import Effort, Wedges
 from quasiharmonic.predicates import orientation
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 SignArray = NDArray[np.int8]
 
 # Views that are kept, for eyes that are looked from again.

@@ -7,16 +7,12 @@ less than showing that there is none.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.diagnosis.clearance import clear
 from quasiharmonic.diagnosis.curves import Corners
 from quasiharmonic.diagnosis.fixture import Fixture, Stars
 from quasiharmonic.predicates import orientation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # How far from the edges around it a vertex is looked for, as parts of the distance of its neighbours.
 _MARGINS = 0.1, 0.01, 0.001

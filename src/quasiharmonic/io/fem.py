@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.mesh.topology import named
+from quasiharmonic.arrays import FloatArray, IntArray, named
 
 from .atomic import check_writable, write_whole
 from .errors import MeshFileError
@@ -22,9 +22,6 @@ from .legacy_vtk import read_legacy_vtk
 from .meshdata import is_planar
 from .meshparts import MeshParts
 from .vtu import read_vtu
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _READERS = {".msh": read_gmsh, ".vtk": read_legacy_vtk, ".vtu": read_vtu}
 # What readers meet in files that are damaged.

@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quasiharmonic.arrays import FloatArray, IntArray
 
 from .meshparts import MeshParts
 from .tables import Table, TableReader, replaced, stacked
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _LINE, _TRIANGLE, _POINT = 1, 2, 15
 _CORNERS = {_LINE: 2, _TRIANGLE: 3, _POINT: 1}

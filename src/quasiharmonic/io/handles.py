@@ -14,10 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.mesh.topology import boundary_edges, named
+from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.mesh.topology import boundary_edges
 
 from .errors import MeshFileError
-from .meshdata import FloatArray, IntArray, MeshData, vertex_places
+from .meshdata import MeshData, vertex_places
 from .obj import read_obj
 from .textual import integer, read_text
 

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quasiharmonic.arrays import FloatArray, IntArray
 
 from .meshparts import MeshParts
 from .tables import Table, TableReader, replaced
 from .vtk_cells import triangles
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _KINDS = {
     b"char": "i1",

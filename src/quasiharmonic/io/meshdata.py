@@ -7,12 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.mesh.topology import named
+from quasiharmonic.arrays import FloatArray, IntArray, named
 
 from .errors import MeshFileError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from quasiharmonic.arrays import FloatArray, IntArray
+
 from .atomic import write_whole
 from .errors import MeshFileError
-from .meshdata import FloatArray, IntArray, MeshData
+from .meshdata import MeshData
 from .textual import integer, integer_table, number, number_table, read_text, shown
 
 # Texture coordinates, colours and normals stand behind the coordinates, so they can be passed over.

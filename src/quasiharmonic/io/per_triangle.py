@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import FloatArray
+
 from .atomic import write_whole
 from .errors import OutputError
-
-FloatArray = NDArray[np.float64]
 
 #: Suffixes that `write_per_triangle` knows.
 FORMATS = (".csv", ".npz", ".ply")

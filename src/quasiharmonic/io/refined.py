@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .meshdata import FloatArray, IntArray, MeshData
+from quasiharmonic.arrays import FloatArray, IntArray
+
+from .meshdata import MeshData
 
 if TYPE_CHECKING:
     from quasiharmonic.refinement import Refined

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.seams import islands
 
 from .meshdata import MeshData, check_mapped, map_of, vertex_places
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import IntArray
 
 #: Kinds without area: vertices and lines, one or several.
 _LOWER = (1, 2, 3, 4)

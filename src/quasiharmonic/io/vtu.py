@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
+
 from .meshparts import MeshParts
 from .tables import TableReader, replaced
 from .vtk_cells import triangles
-
-FloatArray = NDArray[np.float64]
 
 _KINDS = {
     **{f"Int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},

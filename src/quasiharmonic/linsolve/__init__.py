@@ -15,7 +15,8 @@ from importlib import import_module
 
 from numpy.typing import ArrayLike
 
-from .base import LinearSolver, NotPositiveDefinite
+from .base import LinearSolver
+from .errors import NotPositiveDefinite
 
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver"]
 

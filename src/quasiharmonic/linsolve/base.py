@@ -14,15 +14,12 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from quasiharmonic.arrays import FloatArray
 
+from .errors import NotPositiveDefinite
+from .guard import ResidualTest
 
-class NotPositiveDefinite(ArithmeticError):  # noqa: N818  (the name says what happened to the matrix, not to the program)
-    """The matrix is not numerically positive definite, or no solution can be vouched for.
-
-    Callers are expected to handle it: by a shorter step, by adding to the diagonal, by another backend.
-    """
+Pattern = NDArray[np.int32]
 
 
 class LinearSolver(ABC):
@@ -63,13 +60,11 @@ class LinearSolver(ABC):
         self.nnz = len(self._indices)
         # The backend reads from this buffer and from no other: the caller's array is free for the next matrix, and a
         # backend that holds addresses can prepare them once.
-        self._values: Floats = np.zeros(self.nnz)
+        self._values: FloatArray = np.zeros(self.nnz)
         self._lock = threading.Lock()
         self._ready = False
         self._closed = False
         if self.n:
-            from .guard import ResidualTest
-
             self._test = ResidualTest(self._indptr, self._indices, self._values)
             self._analyse()
 
@@ -105,7 +100,7 @@ class LinearSolver(ABC):
                 self._factor()
             self._ready = True
 
-    def solve(self, rhs: ArrayLike) -> Floats:
+    def solve(self, rhs: ArrayLike) -> FloatArray:
         """Solve for one or several right-hand sides with the last factor.
 
         Parameters
@@ -164,7 +159,7 @@ class LinearSolver(ABC):
         if self._closed:
             raise ValueError("the solver is closed")
 
-    def _examine(self, b: Floats, x: Floats) -> Floats:
+    def _examine(self, b: FloatArray, x: FloatArray) -> FloatArray:
         """Judge by the true residual, refine once if it is too large, and give up if that does not help."""
         excess = self._test.excess(b, x)
         if excess > 1:
@@ -191,7 +186,7 @@ class LinearSolver(ABC):
         """Factor `self._values`, or raise `NotPositiveDefinite` if any pivot is not positive."""
 
     @abstractmethod
-    def _solve(self, b: Floats) -> Floats:
+    def _solve(self, b: FloatArray) -> FloatArray:
         """Solve for (n, k) Fortran-ordered `b`, leaving it as it is, into a new Fortran-ordered array."""
 
     @abstractmethod
@@ -199,7 +194,7 @@ class LinearSolver(ABC):
         """Drop the factor and whatever the library holds."""
 
 
-def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Ints, Ints]:
+def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:
     """Private int32 copies of a pattern of an upper triangle, checked entry by entry."""
     starts, columns = np.asarray(indptr), np.asarray(indices)
     if starts.ndim != 1 or columns.ndim != 1 or starts.size == 0 or starts[0] != 0 or starts[-1] != columns.size:

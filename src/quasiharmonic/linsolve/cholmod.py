@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from .base import Floats, LinearSolver, NotPositiveDefinite
+from quasiharmonic.arrays import FloatArray
+
+from .base import LinearSolver
+from .errors import NotPositiveDefinite
 
 # Up to this many unknowns of a planar mesh the supernodal code does not repay its overhead (18 ms against 30 at 20k).
 _SIMPLICIAL_BELOW = 50_000
@@ -63,8 +66,8 @@ class Cholmod(LinearSolver):
         if not positive:
             raise NotPositiveDefinite("the matrix is not positive definite: CHOLMOD met a pivot that is not positive")
 
-    def _solve(self, b: Floats) -> Floats:
-        x: Floats
+    def _solve(self, b: FloatArray) -> FloatArray:
+        x: FloatArray
         if self._old:
             x = self._numeric(b)
         elif self._numeric.rcond >= self.n * np.finfo(np.float64).eps:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .base import Floats, Ints, NotPositiveDefinite
+from quasiharmonic.arrays import FloatArray
+
+from .errors import NotPositiveDefinite
 
 # Largest residual that a backward stable factorisation can be held responsible for, relative to |A||x| + |b| after
 # scaling the diagonal to one. Cholesky stays near 1e-15; a factor that is wrong is wrong in the first digits.
@@ -28,7 +31,7 @@ class ResidualTest:
         Its entries. The array is kept and read anew by `read`.
     """
 
-    def __init__(self, indptr: Ints, indices: Ints, values: Floats) -> None:
+    def __init__(self, indptr: NDArray[np.int32], indices: NDArray[np.int32], values: FloatArray) -> None:
         from scipy.sparse import csr_array
 
         n = len(indptr) - 1
@@ -60,13 +63,13 @@ class ResidualTest:
         if not (np.isfinite(self._image.min()) and np.isfinite(self._image.max())):
             raise NotPositiveDefinite("the matrix is not positive definite: it has entries that are NaN or too large")
 
-    def multiply(self, x: Floats) -> Floats:
+    def multiply(self, x: FloatArray) -> FloatArray:
         """A @ x for x of shape (n,) or (n, k)."""
         diagonal = self._diagonal if x.ndim == 1 else self._diagonal[:, None]
-        product: Floats = self._upper @ x + self._lower @ x - diagonal * x
+        product: FloatArray = self._upper @ x + self._lower @ x - diagonal * x
         return product
 
-    def plausible(self, b: Floats, x: Floats) -> bool:
+    def plausible(self, b: FloatArray, x: FloatArray) -> bool:
         """Whether all columns of x pass a test that needs no product with A.
 
         For the probe z = S·(random signs), zᵀ(b - A x) = zᵀb - (A z)ᵀx has the size of the scaled residual, and A z is
@@ -83,7 +86,7 @@ class ResidualTest:
             limit = np.minimum(BACKWARD * (size_x + size_b), FORWARD * size_b)
             return bool(np.all((residual <= limit) & np.isfinite(limit)))
 
-    def excess(self, b: Floats, x: Floats) -> float:
+    def excess(self, b: FloatArray, x: FloatArray) -> float:
         """Largest true residual of the columns of x in units of what is allowed; infinite if anything is not finite.
 
         In the maximum norm, which neither over- nor underflows.

@@ -15,7 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .base import Floats, Ints, LinearSolver, NotPositiveDefinite
+from quasiharmonic.arrays import FloatArray
+
+from .base import LinearSolver, Pattern
+from .errors import NotPositiveDefinite
 
 _ANALYSE, _FACTOR, _SOLVE, _FORWARD_ONLY, _RELEASE = 11, 22, 33, 331, -1
 _MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3
@@ -74,7 +77,7 @@ class Pardiso(LinearSolver):
         self._fewest = 1 if sequential or not self._handle.improved else 2
         self._ones = np.ones((self._size, self._fewest), order="F")
 
-    def _begun(self, indptr: Ints, indices: Ints, values: Floats, sequential: bool) -> _Handle:
+    def _begun(self, indptr: Pattern, indices: Pattern, values: FloatArray, sequential: bool) -> _Handle:
         """A pattern analysed, by as many threads as there may be now."""
         handle = _Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
         self._release_once = weakref.finalize(self, handle.release)
@@ -98,7 +101,7 @@ class Pardiso(LinearSolver):
             if not np.isfinite(forward.sum()):
                 raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a negative pivot")
 
-    def _solve(self, b: Floats) -> Floats:
+    def _solve(self, b: FloatArray) -> FloatArray:
         if self._size > self.n:
             b = np.asfortranarray(np.concatenate([b, np.zeros((self._size - self.n, b.shape[1]))]))
         columns = b.shape[1]
@@ -119,7 +122,9 @@ class _Handle:
     moment it takes to release the memory.
     """
 
-    def __init__(self, indptr: Ints, indices: Ints, values: Floats, *, sequential: bool, ordered: bool) -> None:
+    def __init__(
+        self, indptr: Pattern, indices: Pattern, values: FloatArray, *, sequential: bool, ordered: bool
+    ) -> None:
         self.sequential = sequential
         self.pattern = indptr, indices, values
         order = np.arange(len(indptr) - 1, dtype=np.int32) if ordered else None
@@ -164,7 +169,7 @@ class _Handle:
         """How many threads the caller allows at this moment, by the environment, threadpoolctl or MKL itself."""
         return 1 if self.sequential else min(int(self._library.MKL_Get_Max_Threads()), _largest_team())
 
-    def check(self, phase: int, b: Floats | None = None, x: Floats | None = None) -> None:
+    def check(self, phase: int, b: FloatArray | None = None, x: FloatArray | None = None) -> None:
         """Run one phase and turn its error code into an exception."""
         code = self._call(phase, b, x)
         # Positive codes are not documented; seen where a pivot came out negative.
@@ -178,7 +183,7 @@ class _Handle:
         """Free what PARDISO allocated."""
         self._call(_RELEASE, None, None)
 
-    def _call(self, phase: int, b: Floats | None, x: Floats | None) -> int:
+    def _call(self, phase: int, b: FloatArray | None, x: FloatArray | None) -> int:
         self._phase.value = phase
         self._columns.value = 1 if b is None else b.shape[1]
         self._error.value = 0
@@ -191,7 +196,7 @@ class _Handle:
         return self._error.value
 
 
-def _address(array: Floats | Ints | np.ndarray[tuple[int, ...], np.dtype[np.int64]] | None) -> ctypes.c_void_p:
+def _address(array: FloatArray | Pattern | np.ndarray[tuple[int, ...], np.dtype[np.int64]] | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 

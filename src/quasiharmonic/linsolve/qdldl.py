@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .base import Floats, LinearSolver, NotPositiveDefinite
+from quasiharmonic.arrays import FloatArray
+
+from .base import LinearSolver
+from .errors import NotPositiveDefinite
 
 
 class Qdldl(LinearSolver):
@@ -49,7 +52,7 @@ class Qdldl(LinearSolver):
         if not pivots.min() > 0:
             raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is not positive")
 
-    def _solve(self, b: Floats) -> Floats:
+    def _solve(self, b: FloatArray) -> FloatArray:
         x = np.empty_like(b, order="F")
         for j in range(b.shape[1]):
             x[:, j] = self._solver.solve(b[:, j])

@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from .base import Floats, LinearSolver, NotPositiveDefinite
+from quasiharmonic.arrays import FloatArray
+
+from .base import LinearSolver
+from .errors import NotPositiveDefinite
 
 
 class SuperLU(LinearSolver):
@@ -59,7 +62,7 @@ class SuperLU(LinearSolver):
             raise NotPositiveDefinite("the matrix is not positive definite: SuperLU met a pivot that is not positive")
         self._lu = lu
 
-    def _solve(self, b: Floats) -> Floats:
+    def _solve(self, b: FloatArray) -> FloatArray:
         x = np.empty_like(b, order="F")
         x[self._order] = self._lu.solve(b[self._order])
         return x

@@ -30,9 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 
 # Vertices with more neighbours stay until they have lost some.
 _MOST_NEIGHBOURS = 8

@@ -24,7 +24,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quasiharmonic.arrays import FloatArray
+
 IntArray = NDArray[np.integer]
 Codes = NDArray[np.int32]
 

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, vstack
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray
+
 Reference = Literal["equilateral", "rest", "corrected"]
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # Triangles in a block: a complex number for each takes 128 KiB, and a dozen such arrays fit into a core's own cache.
 _BLOCK = 8192

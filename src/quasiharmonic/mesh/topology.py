@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-IntArray = NDArray[np.int64]
+from quasiharmonic.arrays import IntArray, named
 
 
 @dataclass(frozen=True)
@@ -195,22 +195,3 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
             return label
         tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
         np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
-
-
-def counted(one: str, many: str, count: int) -> str:
-    """Say how many of some elements there are: ``1 vertex``, ``7 vertices``."""
-    return f"{count} {one if count == 1 else many}"
-
-
-def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:
-    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``."""
-    listed = ", ".join(str(int(i)) for i in indices[:most])
-    rest = f", … ({len(indices)} in all)" if len(indices) > most else ""
-    return f"{one if len(indices) == 1 else many} {listed}{rest}"
-
-
-def named_edges(pairs: IntArray, most: int = 5) -> str:
-    """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
-    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
-    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
-    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"

@@ -19,8 +19,6 @@ from quasiharmonic.plot.shading import view
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
-
 
 def save_animation(
     path: str | PathLike[str],

@@ -6,9 +6,9 @@ from os import PathLike
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import check_range, index_array
+from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.plot.shading import View, drawable, edge_style, least_heights
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 RED = (0.89, 0.07, 0.17)
 INK = (0.06, 0.12, 0.29)

@@ -7,8 +7,9 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.measures import Distortion, distortion
 from quasiharmonic.plot.canvas import INK, RED, as_map, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
 from quasiharmonic.plot.shading import lit, view
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 
 _GREY = (0.6, 0.6, 0.6)  # of triangles on which nothing can be measured
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.measures import distortion
 from quasiharmonic.plot.canvas import RED, as_map, as_mesh
-
-FloatArray = NDArray[np.float64]
 
 #: Measures of distortion that the window offers as colours.
 SHOWN = ("isometric", "conformal", "area_ratio", "mips")

@@ -6,8 +6,9 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.plot.canvas import (
     as_map,
     as_mesh,
@@ -25,9 +26,6 @@ from quasiharmonic.plot.shading import View, view
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:

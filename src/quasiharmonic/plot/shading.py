@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.targets.correspondence import upright
-
-FloatArray = NDArray[np.float64]
 
 # Colours at the left and right, bottom and top of the view, and far from the red of inversions.
 _CORNERS = np.array([[(40, 96, 190), (16, 160, 140)], [(140, 110, 230), (255, 200, 60)]]) / 255

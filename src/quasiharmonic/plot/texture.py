@@ -7,8 +7,9 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.plot.canvas import (
     RED,
     as_map,
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _LIGHT, _DARK = np.array((0.93, 0.93, 0.90)), np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.boundary_curves import judge_loops, listed
-from quasiharmonic.problem import Problem
+from quasiharmonic.domain import Domain
 from quasiharmonic.targets.chords import chords_of
 from quasiharmonic.targets.contours import from_corner, in_unit
 from quasiharmonic.targets.correspondence import arc, seen_flat
@@ -16,9 +17,6 @@ from quasiharmonic.targets.course import Course
 from quasiharmonic.targets.holes import least_stretch, match_holes
 from quasiharmonic.targets.nesting import Arranged, arranged
 from quasiharmonic.targets.pins import Corners, Pins
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def boundary_to(
@@ -73,9 +71,8 @@ def boundary_to(
         vertices, or the boundary has so few that it would cross itself; when a corner vertex is not on
         the boundary, its place not on the outline, or they follow each other in different orders.
     """
-    # All vertices fixed, anywhere: this checks the mesh and nothing else.
-    count = len(np.asarray(V))
-    surface = Problem(V, F, np.arange(count), np.zeros((count, 2)), reference="equilateral")
+    surface = Domain(V, F, [])
+    count = surface.n
     # Numbers of corners are the user's, whichever way the outline runs: the first of them stays the first point.
     given = [outline] if isinstance(outline, np.ndarray) and outline.ndim == 2 else list(outline)
     found = arranged(given)
@@ -107,7 +104,7 @@ def boundary_to(
     return np.concatenate(loops), target
 
 
-def _check_fit(surface: Problem, contours: list[Arranged]) -> None:
+def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
     """Raise unless the surface and what the contours enclose are of one topology."""
     loops, f = len(surface.loops), len(surface.F)
     euler = surface.n - len(surface.edges.interior) - len(surface.edges.boundary) + f

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.targets.contours import as_complex
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # How far a line may bend outwards and count as straight, as a share of the outline's larger side.
 STRAIGHT = 1e-9

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+
 # A path of lines and Bézier curves: the control points (degree + 1, 2) of each piece, joined end to start.
 Pieces = list[FloatArray]
 

@@ -6,12 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.targets.contours import checked, corners, signed_area
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 # Vertices of a loop and where along a contour they go.
 Held = Sequence[tuple[int, float]]
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.boundary_curves import contacts
 from quasiharmonic.targets.chords import STRAIGHT, flat_chords
 from quasiharmonic.targets.correspondence import Held, at, best_start, off, places_along
 from quasiharmonic.targets.room import make_room
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Starts that are tried, nearest to the best fit first, where chords have no room.
 _MOST_STARTS = 256

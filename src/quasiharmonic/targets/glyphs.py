@@ -8,12 +8,10 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.targets.contours import distinct, flatten, signed_area
 from quasiharmonic.targets.nesting import filled, nested
-
-FloatArray = NDArray[np.float64]
 
 Font = str | PathLike[str]
 _FONT_FILES = ".ttf", ".otf", ".ttc"

@@ -5,22 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.domain import Domain
 from quasiharmonic.laplacian import Laplacian
-from quasiharmonic.problem import Problem
 from quasiharmonic.targets.contours import as_complex
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 
 # Choices for a loop that are looked into closely.
 _PROMISING = 8
 
 
 def match_holes(
-    surface: Problem, outer: int, places: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
+    surface: Domain, outer: int, places: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
 ) -> dict[int, int]:
     """Give every loop without a contour one that lies near to it.
 
@@ -29,7 +25,7 @@ def match_holes(
 
     Parameters
     ----------
-    surface : Problem
+    surface : Domain
         The mesh; its own positions play no part.
     outer : int
         Which of its loops goes to the outer contour,
@@ -57,7 +53,7 @@ def match_holes(
 
 
 def least_stretch(
-    surface: Problem, given: Mapping[int, FloatArray], choices: Mapping[int, list[FloatArray]]
+    surface: Domain, given: Mapping[int, FloatArray], choices: Mapping[int, list[FloatArray]]
 ) -> dict[int, FloatArray]:
     """Choose among places for some loops those for which Tutte's embedding has the least Dirichlet energy.
 
@@ -69,7 +65,7 @@ def least_stretch(
 
     Parameters
     ----------
-    surface : Problem
+    surface : Domain
         The mesh; its own positions play no part.
     given : mapping of int to (l, 2) float64
         Places of some loops.
@@ -84,9 +80,9 @@ def least_stretch(
     loops = surface.loops
     if all(len(places) == 1 for places in choices.values()):
         return {i: places[0] for i, places in choices.items()}
-    laplacian = Laplacian(surface.F, surface.n, np.concatenate(loops))
+    pattern = Laplacian(surface.F, surface.n, np.concatenate(loops))
     # Equilateral triangles, but for a factor.
-    laplacian.factor(np.full((3, len(surface.F)), -1.0))
+    laplacian = pattern.factor(np.full((3, len(surface.F)), -1.0))
 
     def forces(places: Mapping[int, ComplexArray]) -> ComplexArray:
         w = np.zeros(surface.n, dtype=np.complex128)
@@ -125,7 +121,7 @@ def least_stretch(
     return {i: choices[i][kept[i][k]] for i, k in taken.items()}
 
 
-def _middles(surface: Problem, outer: int, places: FloatArray) -> ComplexArray:
+def _middles(surface: Domain, outer: int, places: FloatArray) -> ComplexArray:
     """Where the middles of the holes come to lie, each filled by a fan around it; a number for every loop."""
     fans = [surface.F]
     for i, loop in enumerate(surface.loops):
@@ -136,8 +132,7 @@ def _middles(surface: Problem, outer: int, places: FloatArray) -> ComplexArray:
     F, n = np.concatenate(fans), surface.n + len(surface.loops)
     # The outer loop's own number stands for no vertex, and is held like its loop.
     fixed = np.append(surface.loops[outer], surface.n + outer)
-    laplacian = Laplacian(F, n, fixed)
-    laplacian.factor(np.full((3, len(F)), -1.0))
+    laplacian = Laplacian(F, n, fixed).factor(np.full((3, len(F)), -1.0))
     w = np.zeros(n, dtype=np.complex128)
     w[surface.loops[outer]] = as_complex(places)
     return laplacian.extend(w)[surface.n :]

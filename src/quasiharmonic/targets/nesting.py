@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.boundary_curves import contacts, winding
 from quasiharmonic.predicates import SegmentRelation, orientation
 from quasiharmonic.targets.contours import checked, distinct, in_unit, signed_area
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Meeting sides that are looked for; the first of them is told.
 _MOST_MEETINGS = 100

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quasiharmonic.arrays import FloatArray
 
 
 def disk(radius: float = 1.0, points: int = 256) -> FloatArray:

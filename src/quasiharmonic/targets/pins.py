@@ -8,12 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.mesh.topology import named
+from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.targets.contours import corners as corners_of
 from quasiharmonic.targets.correspondence import arc, at
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
 # How far from the outline a point may lie that is said to be on it, as a share of its larger side.

@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.boundary_curves import listed
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import number, read_text
 from quasiharmonic.targets.contours import MOST_POINTS, distinct
 from quasiharmonic.targets.nesting import arranged, collinear
-
-FloatArray = NDArray[np.float64]
 
 
 def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:

@@ -11,14 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.targets.contours import corners, turns
 from quasiharmonic.targets.correspondence import Held, Stretch, arc, stretches
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # A bend to the left that is one, and not a straight line rounded; radians.
 _BEND = 1e-9

@@ -6,16 +6,12 @@ import math
 from os import PathLike, fspath
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.targets import outlines
 from quasiharmonic.targets.contours import MOST_POINTS
 from quasiharmonic.targets.glyphs import Font, letter, word
 from quasiharmonic.targets.polylines import read_polylines
 from quasiharmonic.targets.svg import read_svg
-
-FloatArray = NDArray[np.float64]
 
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 _POINT_FILES = ".txt", ".csv"

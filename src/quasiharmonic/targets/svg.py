@@ -14,15 +14,13 @@ from collections.abc import Callable
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import read_text
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces, as_complex, flatten
 from quasiharmonic.targets.nesting import arranged
 from quasiharmonic.targets.svgpath import parse_path
-
-FloatArray = NDArray[np.float64]
 
 _SVG = "http://www.w3.org/2000/svg"
 _MOST_BYTES = 64 << 20

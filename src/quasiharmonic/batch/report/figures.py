@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quasiharmonic.arrays import FloatArray
 
 _WIDTH, _HEIGHT = 640, 400
 # Room for labels: left, top, right, bottom.

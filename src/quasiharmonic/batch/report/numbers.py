@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.batch import records
 from quasiharmonic.batch.problems import MARKER
 from quasiharmonic.batch.records import Record
-
-FloatArray = NDArray[np.float64]
 
 PHASES = "read", "setup", "map", "polish", "write", "measure"
 

@@ -6,31 +6,32 @@ fold and opens away from it. A vertex on the near side of the fold misses it by 
 around the fold. So a patch around an inverted triangle is started anew, again and again: from a quasi-harmonic map of
 random tensors, or with a vertex of that triangle put somewhere into its intersection and held there while the others
 make room. Where it is not one vertex but a chain of them that must go around, its inverted triangles come to weigh
-more (`quasiharmonic.optimize.weighing`). A patch is taken on if no more triangles are inverted than before; this lets
+more (`quasiharmonic.descent.reweighting`). A patch is taken on if no more triangles are inverted than before; this lets
 the map drift until it falls into place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, ComplexArray, whole_number
 from quasiharmonic.certificate import flipped_triangles
 from quasiharmonic.deformation_energy import signed_areas
+from quasiharmonic.descent.base import Iterates, VertexDescent
+from quasiharmonic.descent.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around
+from quasiharmonic.descent.reweighting import reweighted
+from quasiharmonic.descent.untangling import GRADINGS, untangled
 from quasiharmonic.laplacian import Laplacian
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.optimize.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around
-from quasiharmonic.optimize.untangling import GRADINGS, iterate_of, untangled
-from quasiharmonic.optimize.weighing import weighed
+from quasiharmonic.problem import Problem
 from quasiharmonic.tensor import TANH
 
-BoolArray = NDArray[np.bool_]
-ComplexArray = NDArray[np.complex128]
-Generator = np.random.Generator
+Generator: TypeAlias = np.random.Generator
 
 # Rings around an inverted triangle, and sizes of the random ξ; one of them is drawn.
 _RINGS = 2, 3, 4, 6, 8, 12
@@ -39,69 +40,70 @@ _SPREADS = 0.0, 0.5, 1.5
 # no solution end above 1e-4, and those that have one and need many tries below 1e-6.
 _NEXT_TO_NOTHING, _DILIGENCE = 1e-5, 10
 # How many of the tries weigh triangles: these last several times as long as the others.
-_WEIGHED = 0.5
+_REWEIGHTED = 0.5
 # Placed vertices lie this much of the way from a corner of the intersection to its middle, in powers of ten.
 _DEPTHS = -3.5, 0.0
 
 
-def shaking(
-    objective: Objective,
-    start: Iterate,
-    visit: Callable[[Iterate], None],
-    *,
-    iterations: int,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class RandomRestarts(VertexDescent):
     """Right the last inverted triangles by solving patches around them from random starts.
 
-    The numbers are drawn from a generator of its own, always the same.
+    The numbers are drawn from a generator of its own, always the same. If the inverted triangles are too many for
+    local repair, all of the mesh is untangled first.
 
-    Parameters
+    Attributes
     ----------
-    objective : Objective
-        Its functional is not looked at.
-    start : Iterate
-        If its inverted triangles are too many for local repair, all of it is untangled first.
-    visit : callable
-        Called after every patch that left fewer inverted triangles; raises `Stop` to end.
-    iterations : int
+    in_vain : int
         So many patches in a row may be of no use; ten times as many where next to nothing is left to be righted.
     """
-    problem, solver = objective.problem, objective.laplacian.solver.name
-    rng = np.random.default_rng(0)
-    w = start.w
-    left = flipped_triangles(problem.F, problem.positions(w))
-    if left.size > MOST_FLIPS:
-        for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
-            visit(iterate_of(objective, w))
+
+    in_vain: int = 30
+
+    word: ClassVar[str] = "random restarts"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number("in_vain", self.in_vain, least=1)
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`; a map after every patch that left fewer inverted triangles."""
+        problem, solver = objective.problem, objective.laplacian.solver.name
+        rng = np.random.default_rng(0)
+        w = start.w
         left = flipped_triangles(problem.F, problem.positions(w))
-    in_vain, patience = 0, iterations
-    if 0 < left.size <= MOST_FLIPS and iterate_of(objective, w).energy < _NEXT_TO_NOTHING:
-        patience *= _DILIGENCE
-    while 0 < left.size <= MOST_FLIPS and in_vain < patience:
-        in_vain += 1
-        patch = patch_around(objective, int(rng.choice(left)), int(rng.choice(_RINGS)), MOST_TRIANGLES)
-        if patch is None:
-            continue
-        moved = w.copy()
-        try:
-            moved[patch.vertices] = _shaken(rng, objective, patch, w[patch.vertices])
-        except NotPositiveDefinite:
-            continue
-        now = flipped_triangles(problem.F, problem.positions(moved))
-        if now.size <= left.size:
-            fewer, w, left = now.size < left.size, moved, now
-            if fewer:
-                in_vain = 0
-                visit(iterate_of(objective, w))
+        if left.size > MOST_FLIPS:
+            for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
+                yield objective.of_map(w)
+            left = flipped_triangles(problem.F, problem.positions(w))
+        in_vain, patience = 0, self.in_vain
+        if 0 < left.size <= MOST_FLIPS and objective.of_map(w).energy < _NEXT_TO_NOTHING:
+            patience *= _DILIGENCE
+        while 0 < left.size <= MOST_FLIPS and in_vain < patience:
+            in_vain += 1
+            patch = patch_around(problem, int(rng.choice(left)), int(rng.choice(_RINGS)), MOST_TRIANGLES)
+            if patch is None:
+                continue
+            moved = w.copy()
+            try:
+                moved[patch.vertices] = _restarted(rng, problem, patch, w[patch.vertices], solver)
+            except NotPositiveDefinite:
+                continue
+            now = flipped_triangles(problem.F, problem.positions(moved))
+            if now.size <= left.size:
+                fewer, w, left = now.size < left.size, moved, now
+                if fewer:
+                    in_vain = 0
+                    yield objective.of_map(w)
+        return True
 
 
-def _shaken(rng: Generator, objective: Objective, patch: Patch, w: ComplexArray) -> ComplexArray:
+def _restarted(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str) -> ComplexArray:
     """Another map of a patch."""
-    solver = objective.laplacian.solver.name
-    if rng.random() < _WEIGHED:
-        return weighed(rng, patch, w, solver)
+    if rng.random() < _REWEIGHTED:
+        return reweighted(rng, patch, w, solver)
     grading = float(rng.choice(GRADINGS))
-    place = _place(rng, objective, patch, w) if rng.random() < 0.5 else None
+    place = _place(rng, problem, patch, w) if rng.random() < 0.5 else None
     held = patch.held.copy()
     if place is not None:
         vertex, there = place
@@ -118,11 +120,10 @@ def _random_map(rng: Generator, patch: Patch, w: ComplexArray, held: BoolArray, 
     xi = rng.choice(_SPREADS) * (rng.standard_normal(len(patch.F)) + 1j * rng.standard_normal(len(patch.F)))
     mesh = ReferenceMesh(np.zeros((len(w), 2)), patch.F, "equilateral")
     laplacian = Laplacian(patch.F, len(w), np.flatnonzero(held), linear_solver)
-    laplacian.factor(mesh.edge_stiffness(TANH.field(xi).entries()))
-    return laplacian.extend(w)
+    return laplacian.factor(mesh.edge_stiffness(TANH.field(xi).entries())).extend(w)
 
 
-def _place(rng: Generator, objective: Objective, patch: Patch, w: ComplexArray) -> tuple[int, complex] | None:
+def _place(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray) -> tuple[int, complex] | None:
     """A free vertex of an inverted triangle, or next to one, and a random place to the left of the fixed edges
     around it; None where there is no such place.
     """
@@ -134,11 +135,11 @@ def _place(rng: Generator, objective: Objective, patch: Patch, w: ComplexArray) 
     if not candidates.size:
         return None
     vertex = int(rng.choice(candidates))
-    fixed = np.isin(patch.vertices, objective.problem.fixed)
+    fixed = np.isin(patch.vertices, problem.fixed)
     t, k = np.nonzero(np.equal(patch.F, vertex))
     tails, heads = patch.F[t, (k + 1) % 3], patch.F[t, (k + 2) % 3]
     both = fixed[tails] & fixed[heads]
-    within = w if rng.random() < 0.5 else objective.problem.frame.inward(objective.problem.target)
+    within = w if rng.random() < 0.5 else problem.frame.inward(problem.target)
     low, high = complex(within.real.min(), within.imag.min()), complex(within.real.max(), within.imag.max())
     area = np.array([low, complex(high.real, low.imag), high, complex(low.real, high.imag)])
     for tail, head in zip(w[tails[both]], w[heads[both]], strict=True):

@@ -1,27 +1,24 @@
 """Local repair: only a patch around the last inverted triangles is solved again.
 
 What is left at the end is typically a triangle or two against the boundary whose room is a millionth of a triangle's.
-Everything outside a few rings around them stays, and the inside is untangled (`quasiharmonic.optimize.untangling`). A
+Everything outside a few rings around them stays, and the inside is untangled (`quasiharmonic.descent.untangling`). A
 patch that fails is grown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
 from quasiharmonic.certificate import flipped_triangles
+from quasiharmonic.descent.base import Iterates, VertexDescent
+from quasiharmonic.descent.untangling import untangled
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.optimize.untangling import iterate_of, untangled
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from quasiharmonic.problem import Problem
 
 # More flips than this are no matter for local repair, and larger patches are no patches.
 MOST_FLIPS, MOST_TRIANGLES = 50, 1000
@@ -49,48 +46,49 @@ class Patch(NamedTuple):
     held: BoolArray
 
 
-def patches(
-    objective: Objective,
-    start: Iterate,
-    visit: Callable[[Iterate], None],
-    *,
-    iterations: int,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Patches(VertexDescent):
     """Right the last inverted triangles one patch at a time.
 
-    Parameters
+    Attributes
     ----------
-    objective : Objective
-        Its functional is not looked at.
-    start : Iterate
-    visit : callable
-        Called after every patch that left fewer inverted triangles; raises `Stop` to end.
-    iterations : int
-        Patches to try at most.
+    tries : int
+        Patches to try at most; those of no use yield nothing.
     """
-    problem, solver = objective.problem, objective.laplacian.solver.name
-    w = start.w
-    left = flipped_triangles(problem.F, problem.positions(w))
-    most = min(MOST_TRIANGLES, int(_MOST_SHARE * len(problem.F)))
-    for rings in _RINGS:
-        for triangle in left.tolist():
-            if not 0 < left.size <= MOST_FLIPS or iterations <= 0:
-                return
-            patch = patch_around(objective, triangle, rings, most) if triangle in left else None
-            if patch is None:
-                continue
-            iterations -= 1
-            moved = w.copy()
-            moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, 0.0, solver)
-            now = flipped_triangles(problem.F, problem.positions(moved))
-            if now.size < left.size:
-                w, left = moved, now
-                visit(iterate_of(objective, w))
+
+    tries: int = 30
+
+    word: ClassVar[str] = "patches"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number("tries", self.tries, least=1)
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`; a map after every patch that left fewer inverted triangles."""
+        problem, solver = objective.problem, objective.laplacian.solver.name
+        w, tries = start.w, self.tries
+        left = flipped_triangles(problem.F, problem.positions(w))
+        most = min(MOST_TRIANGLES, int(_MOST_SHARE * len(problem.F)))
+        for rings in _RINGS:
+            for triangle in left.tolist():
+                if not 0 < left.size <= MOST_FLIPS or tries <= 0:
+                    return True
+                patch = patch_around(problem, triangle, rings, most) if triangle in left else None
+                if patch is None:
+                    continue
+                tries -= 1
+                moved = w.copy()
+                moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, 0.0, solver)
+                now = flipped_triangles(problem.F, problem.positions(moved))
+                if now.size < left.size:
+                    w, left = moved, now
+                    yield objective.of_map(w)
+        return True
 
 
-def patch_around(objective: Objective, triangle: int, rings: int, most: int) -> Patch | None:
+def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patch | None:
     """Triangles within some rings of one, or None where those are too many or have no vertex that may move."""
-    problem = objective.problem
     inside = np.zeros(problem.n, dtype=bool)
     inside[problem.F[triangle]] = True
     for _ in range(rings):

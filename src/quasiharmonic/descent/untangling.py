@@ -15,26 +15,22 @@ stops the other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, whole_number
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
+from quasiharmonic.descent.base import Iterates, VertexDescent
 from quasiharmonic.energies import Deformation, Isotropic
-from quasiharmonic.functionals import work
 from quasiharmonic.laplacian import Laplacian
-from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.line_search import backtrack, extend
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.newton_system import NewtonSystem
 from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.optimize.alternating import own_tensor
-from quasiharmonic.tensor import TANH
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 
 # Powers of the boundary edges' lengths, tried in turn.
 GRADINGS = 0.5, 0.0, 1.0
@@ -51,11 +47,11 @@ _FLAT = 1e-30
 _SMALLEST = 1e-100
 # Raised diagonals, one after the other until a factorisation exists.
 _SHIFTS = 0.0, 1e-10, 1e-6, 1e-3
-# Of the decrease that the gradient promises (Armijo's condition), and how often a step is halved.
-_SUFFICIENT, _HALVINGS = 1e-4, 24
+# How often a step is halved.
+_HALVINGS = 24
 
 
-class Regularized(Isotropic):
+class Regularised(Isotropic):
     """The energy above; ``φ`` in ``a = |p|²`` and ``b = |q|²``.
 
     Parameters
@@ -92,40 +88,41 @@ class Regularized(Isotropic):
         return root, chi, d.a + d.b + _LAMBDA * (d.det**2 + 1)
 
 
-def untangling(
-    objective: Objective,
-    start: Iterate,
-    visit: Callable[[Iterate], None],
-    *,
-    iterations: int,
-) -> None:
-    """Right inverted triangles by moving vertices.
+@dataclass(frozen=True, kw_only=True)
+class Untangling(VertexDescent):
+    """Right inverted triangles by moving all vertices.
 
-    Parameters
+    Attributes
     ----------
-    objective : Objective
-        Its functional is not looked at.
-    start : Iterate
-    visit : callable
-        Called with every map; raises `Stop` to end.
     iterations : int
         Steps to take at most, over all gradings.
+    resume : bool
+        Start from the map of the lowest V₃ so far.
     """
-    for grading in GRADINGS:
+
+    iterations: int = 300
+
+    word: ClassVar[str] = "untangling"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number("iterations", self.iterations, least=1)
+
+    def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:
+        """All of the mesh is moved: what matters is how far it is from a map on the whole."""
+        return deepest.w
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`."""
         problem, solver = objective.problem, objective.laplacian.solver.name
-        for w in untangled(problem.F, start.w, problem.fixed, grading=grading, linear_solver=solver):
-            visit(iterate_of(objective, w))
-            iterations -= 1
-            if iterations <= 0:
-                return
-
-
-def iterate_of(objective: Objective, w: ComplexArray) -> Iterate:
-    """A map with its own tensors: where it is injective, it is their quasi-harmonic map (eq. 39).
-
-    In the tanh parameterisation, which reaches them all.
-    """
-    return Iterate(objective, TANH.field(TANH.invert(own_tensor(objective.mesh.derivatives(w)))), w)
+        left = self.iterations
+        for grading in GRADINGS:
+            for w in untangled(problem.F, start.w, problem.fixed, grading=grading, linear_solver=solver):
+                yield objective.of_map(w)
+                left -= 1
+                if left <= 0:
+                    return False
+        return True
 
 
 def untangled(
@@ -164,7 +161,7 @@ def untangled(
         return
     # Around what is computed, and not around a yield, which would carry the state to the caller.
     with np.errstate(all="ignore"):
-        descent = _Descent(F, w, held, sizes, linear_solver, 1.0 if weights is None else weights)
+        descent = RegularisedDescent(F, w, held, sizes, linear_solver, 1.0 if weights is None else weights)
     least = descent.least
     descent.energy.epsilon = np.hypot(1e-9, _FIRST * least)
     while not least > 0 and descent.energy.epsilon > _HOPELESS * max(abs(least), _FLAT):
@@ -206,14 +203,13 @@ def _sizes(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> 
     if grading != 0:
         laplacian = Laplacian(F, n, np.flatnonzero(ends), linear_solver)
         unit = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
-        laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit))
-        log = laplacian.extend(log)
+        log = laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit)).extend(log)
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
     sizes = np.maximum(sizes, _SMALLEST * sizes.max())
     return sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
 
 
-class _Descent:
+class RegularisedDescent:
     """A map, and steps down its energy at the present ε."""
 
     def __init__(
@@ -225,7 +221,7 @@ class _Descent:
         linear_solver: str,
         weights: FloatArray | float,
     ) -> None:
-        self.energy = Regularized(1.0)
+        self.energy = Regularised(1.0)
         corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
         rest = (sizes[:, None, None] * corners).reshape(-1, 2)
         # All triangles of one weight count alike, however small.
@@ -252,37 +248,22 @@ class _Descent:
         system = self._system
         gradient = self._deformed.gradient_of(self._at, self.w.size)[system.free]
         system.assemble(self._deformed.curvature_of(self._at))
-        for shift in _SHIFTS:
-            try:
-                system.factor(shift)
-                direction = system.solve(-gradient)
-            except NotPositiveDefinite:
-                continue
-            promise = -work(gradient, direction)
-            if promise > 0:
-                break
-        else:
+        found = system.descent(gradient, _SHIFTS)
+        if found is None or not found[1] > 0:
             return None
+        direction, promise = found
         full = np.zeros_like(self.w)
         full[system.free] = direction
-        start, t = self.w, 1.0
-        for _ in range(_HALVINGS):
-            after = self._moved(start + t * full, before - _SUFFICIENT * t * promise)
-            if after is not None:
-                break
-            t *= 0.5
-        else:
-            return None
-        # Far from the minimum, barriers fall by powers and Newton's step is several times too short.
-        while t >= 1 and (further := self._moved(start + 2 * t * full, after)) is not None:
-            t, after = 2 * t, further
-        return after
+        start = self.w
 
-    def _moved(self, w: ComplexArray, bound: float) -> float | None:
-        """Go there if the energy is below a bound."""
-        at = self._deformed.deform(w)
-        value = self._deformed.value_of(at)
-        if not value < bound:
+        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+            w = start + t * full
+            at = self._deformed.deform(w)
+            value = self._deformed.value_of(at)
+            return value, (w, at) if value < bound else None
+
+        taken = backtrack(trial, before, promise, tries=_HALVINGS)
+        if taken is None:
             return None
-        self.w, self._at = w, at
-        return value
+        _, after, (self.w, self._at) = extend(trial, taken)
+        return after

@@ -9,13 +9,12 @@ of others, which become heavier in turn, until a map is found that has room for 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.deformation_energy import signed_areas
-from quasiharmonic.optimize.patches import Patch, last_untangled
-from quasiharmonic.optimize.untangling import GRADINGS
+from quasiharmonic.descent.patches import Patch, last_untangled
+from quasiharmonic.descent.untangling import GRADINGS
 
-ComplexArray = NDArray[np.complex128]
 Generator = np.random.Generator
 
 # What weights are multiplied by, one of them drawn; rounds; and how many more inverted triangles than at first end it:
@@ -23,7 +22,7 @@ Generator = np.random.Generator
 _FACTORS, _ROUNDS, _WILD = (3.0, 10.0), 15, 15
 
 
-def weighed(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str) -> ComplexArray:
+def reweighted(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str) -> ComplexArray:
     """Another map of a patch, by weighing its inverted triangles.
 
     Parameters

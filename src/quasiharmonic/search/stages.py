@@ -7,50 +7,52 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.certificate import flipped_triangles
-from quasiharmonic.coarse_problem import coarse_problem
+from quasiharmonic.descent import Descent, Newton, Patches, Untangling, VectorAdam
+from quasiharmonic.descent.base import SoFar, Steps
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.optimize import Stop
-from quasiharmonic.optimize.alternating import alternating, own_tensor
-from quasiharmonic.optimize.lbfgs import lbfgs
-from quasiharmonic.optimize.newton import newton
-from quasiharmonic.optimize.patches import patches
-from quasiharmonic.optimize.shaking import shaking
-from quasiharmonic.optimize.untangling import iterate_of, untangling
-from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.polishing import polish_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import Snapshot, Stage, Status, Step
-from quasiharmonic.strategy import Descent
-from quasiharmonic.tensor import TANH, TensorField
+from quasiharmonic.search.coarse import coarse_mesh
+from quasiharmonic.tensor import TANH, TensorField, own_tensor
 
 if TYPE_CHECKING:
     from quasiharmonic.diagnosis import Diagnosis
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
 
-_Visit = Callable[[Iterate], None]
-_METHODS: dict[str, Callable[[Objective, Iterate, _Visit, Descent, int], None]] = {
-    "vector-adam": lambda o, start, visit, stage, n: vector_adam(o, start, visit, iterations=n, schedule=stage.steps),
-    "l-bfgs": lambda o, start, visit, stage, n: lbfgs(o, start, visit, iterations=n),
-    "newton": lambda o, start, visit, stage, n: newton(o, start, visit, iterations=n),
-    "alternating": lambda o, start, visit, stage, n: alternating(o, start, visit, iterations=n),
-    "untangling": lambda o, start, visit, stage, n: untangling(o, start, visit, iterations=n),
-    "shaking": lambda o, start, visit, stage, n: shaking(o, start, visit, iterations=n),
-    "patches": lambda o, start, visit, stage, n: patches(o, start, visit, iterations=n),
-}
+
+@dataclass(frozen=True)
+class CoarseToFine:
+    """A stage that searches on a coarse mesh, if this one is large, and carries the map that it finds to this one.
+
+    Attributes
+    ----------
+    first : Descent
+        What the search on the coarse mesh begins with; local repair and untangling follow.
+    """
+
+    first: Descent
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return f"coarse-to-fine, {self.first.name}"
+
+
+#: Whatever a strategy is made of.
+Stages: TypeAlias = Sequence[Descent | CoarseToFine]
 
 
 class Search:
@@ -59,7 +61,7 @@ class Search:
     Parameters
     ----------
     problem : Problem
-        Nobody else's while the search runs.
+        On a domain that is nobody else's while the search runs.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
     callback : callable, optional
@@ -110,72 +112,81 @@ class Search:
         self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
         self._rounded = False
-        self._mark, self._marked = self.best, 0
-        self._patience, self._progress = 0, 0.0
-        self._moves_tensors = True
 
-    def run(self, given: Sequence[Descent]) -> Status:
+    def run(self, stages: Stages) -> Status:
         """Run stages until one finds an injective map; why the search ended."""
-        status = Status.OUT_OF_ITERATIONS
         try:
-            plain = replace(given[0], optimizer="vector-adam")
-            here = [stage for stage in given if stage.optimizer != "coarse-to-fine"] or [plain]
-            if not self.problem.encloses_area:
-                self._descend(replace(here[0], iterations=1))
-                self._examine()
-                return Status.IMPOSSIBLE
-            # From a map at hand the first stage is tried before all.
-            stages, number = (given, -1) if self._first is None else ([here[0], *here], -2)
-            for stage in stages:
-                if stage.optimizer == "coarse-to-fine":
-                    if self._from_coarse(stage) is Status.INJECTIVE:
-                        return Status.INJECTIVE
-                    continue
-                number += 1
-                before, status = status, self._descend(stage)
-                while status is Status.UNSOLVABLE and self._spare and self._left > 0:
-                    self.linear_solver = self._spare[0]
-                    status = self._descend(replace(stage, resume=True))
-                if status is Status.INJECTIVE:
-                    return status
-                # That vertices got nowhere does not mean that tensors had settled.
-                if stage.moves_vertices and before is Status.UNSOLVABLE:
-                    status = before
-                # What is tried after the first stage takes long, and is pointless where there is a reason.
-                if self._left <= 0 or (number == 0 and self._examine().forbids_injective):
-                    break
-            if number == -1 and self.best_field is None and self._left > 0:
-                # Stages for a coarse mesh alone, and none was to be had or it led to nothing.
-                status = self._descend(here[0])
-                if status is Status.INJECTIVE:
-                    return status
-            if self._examine().forbids_injective:
-                self._sink()
-                return Status.IMPOSSIBLE
-            return Status.ROUNDED if self._rounded else status
+            return self._run(stages)
         except KeyboardInterrupt:
             return Status.INTERRUPTED
 
-    def _from_coarse(self, stage: Descent) -> Status:
+    def _run(self, stages: Stages) -> Status:
+        """Stage after stage, as long as there is hope."""
+        status = Status.OUT_OF_ITERATIONS
+        here = [stage for stage in stages if isinstance(stage, Descent)]
+        plain = here[0] if here else next(stage.first for stage in stages if isinstance(stage, CoarseToFine))
+        if not self.problem.encloses_area:
+            self._descend(VectorAdam(iterations=1))
+            self._examine()
+            return Status.IMPOSSIBLE
+        if self._first is not None:
+            # From a map at hand the first stage is tried before all, and no coarse mesh.
+            status = self._attempt(plain, status)
+            stages = here or [plain]
+        for stage in stages:
+            if status is Status.INJECTIVE or self._left <= 0:
+                break
+            if isinstance(stage, CoarseToFine):
+                if self._from_coarse(stage) is Status.INJECTIVE:
+                    return Status.INJECTIVE
+                continue
+            status = self._attempt(stage, status)
+            # What is tried after the first stage takes long, and is pointless where there is a reason.
+            if status is not Status.INJECTIVE and self._examine().forbids_injective:
+                break
+        if self.best_field is None and self._left > 0:
+            # Stages for a coarse mesh alone, and none was to be had or it led to nothing.
+            status = self._attempt(plain, status)
+        if status is Status.INJECTIVE:
+            return status
+        if self._examine().forbids_injective:
+            self._sink()
+            return Status.IMPOSSIBLE
+        return Status.ROUNDED if self._rounded else status
+
+    def _attempt(self, stage: Descent, before: Status) -> Status:
+        """Run one stage, by another linear solver where one has failed; how it ended, or else the search so far."""
+        status = self._descend(stage)
+        while status is Status.UNSOLVABLE and self._spare and self._left > 0:
+            self.linear_solver = self._spare[0]
+            status = self._descend(replace(stage, resume=True))
+        # That vertices got nowhere does not mean that tensors had settled.
+        if status is not Status.INJECTIVE and stage.moves_vertices and before is Status.UNSOLVABLE:
+            return before
+        return status
+
+    def _from_coarse(self, stage: CoarseToFine) -> Status:
         """Search on a coarse mesh, if there is one to be had, and carry its map to this one."""
         # What is recorded are maps of this mesh.
-        coarse = None if self.record or self._left <= 0 else coarse_problem(self.problem)
+        coarse = None if self.record else coarse_mesh(self.problem)
         if coarse is None:
             return Status.OUT_OF_ITERATIONS
         done, began, before = max(len(self.history), 1), time.perf_counter(), self.best
-        status, uv, self.linear_solver = _on_coarse(coarse.problem, stage, self.linear_solver, self._left, self._note)
+        problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
+        status, uv, self.linear_solver = _on_coarse(problem, stage.first, self.linear_solver, self._left, self._note)
         if status in (Status.INJECTIVE, Status.INTERRUPTED):
-            w = coarse.prolong(uv)
-            mesh = self.problem.mesh("equilateral")
+            w = coarse.prolong(problem.frame.inward(uv))
+            mesh = self.problem.domain.mesh("equilateral")
             flipped = flipped_triangles(self.problem.F, self.problem.positions(w)).size
             self.best = flipped, 0.0 if flipped == 0 else np.inf
             self.best_map, self.best_reference = w, mesh.kind
-            self.best_field = TANH.field(TANH.invert(own_tensor(mesh.derivatives(w))))
+            dw = mesh.derivatives(w)
+            self.best_field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
             self._rounded |= status is Status.INJECTIVE and flipped > 0
             self._note(Step(0, *self.best))
         self.stages.append(
             Stage(
-                name=f"{stage.name}, {len(coarse.problem.F)} triangles",
+                name=f"{stage.name}, {len(problem.F)} triangles",
                 iterations=len(self.history) - done,
                 seconds=time.perf_counter() - began,
                 flipped=(before[0], self.best[0]),
@@ -205,7 +216,7 @@ class Search:
     def _sink(self) -> None:
         """Where no map is injective, go to the one of least area: the target's area and V₃ make it up (eq. 42)."""
         if self._left > 0:
-            self._descend(Descent("newton", iterations=_TO_LEAST_AREA, resume=True))
+            self._descend(Newton(iterations=_TO_LEAST_AREA, resume=True))
         if self.deepest is not None:
             here = self.deepest
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.mesh.kind
@@ -219,29 +230,16 @@ class Search:
         """Run one stage."""
         before, done, began = None, max(len(self.history), 1), time.perf_counter()
         status = Status.INTERRUPTED
-        self._mark, self._marked = (len(self.problem.F) + 1, np.inf), len(self.history)
-        self._patience, self._progress = stage.patience
-        self._moves_tensors = not stage.moves_vertices
         try:
-            objective = Objective(
-                self.problem, stage.functional, stage.parameterization, stage.reference, self.linear_solver
-            )
+            objective = stage.objective(self.problem, self.linear_solver)
             self.linear_solver = objective.laplacian.solver.name
             if self.linear_solver in self._spare:
                 self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
-            start = self._start(objective, stage)
+            given = None if self.history else self._first
+            start = stage.start(objective, SoFar(given, self.best_map, self.deepest))
             # The first map of all is what the first stage begins with.
             before = (start.flipped, start.energy) if self.best_field is None else self.best
-            self._visit(start)
-            begun, allowed = len(self.history), min(stage.iterations, self._left)
-            _METHODS[stage.optimizer](objective, start, self._visit, stage, allowed)
-            # A method that returns before its iterations are spent has nothing left to do. Those of local repair are
-            # tries, of which it has made enough.
-            spent = len(self.history) - begun >= allowed
-            ended = (spent or stage.optimizer == "newton") and stage.optimizer not in ("patches", "shaking")
-            status = Status.OUT_OF_ITERATIONS if ended or self._left <= 0 else Status.SETTLED
-        except Stop as stop:
-            status = stop.status
+            status = self._follow(stage, objective, start)
         except NotPositiveDefinite:
             status = Status.UNSOLVABLE
         finally:
@@ -257,28 +255,22 @@ class Search:
             )
         return status
 
-    def _start(self, objective: Objective, stage: Descent) -> Iterate:
-        """Where a stage begins: at ξ = 0; at the tensors of the lowest V₃ so far; or at the best map. The very first
-        begins at the caller's map, if there is one.
+    def _follow(self, stage: Descent, objective: Objective, start: Iterate) -> Status:
+        """Look at every map of a stage until one is injective or nothing moves any more; why it ended."""
+        patience = _Patience(stage.patience)
+        steps = Steps(stage.iterates(objective, start))
+        for here in chain([start], steps):
+            step = self._visit(here, tensors=not stage.moves_vertices)
+            if step.flipped == 0:
+                return Status.INJECTIVE
+            if self._left <= 0:
+                return Status.OUT_OF_ITERATIONS
+            if patience.is_over(step):
+                return Status.SETTLED
+        return Status.SETTLED if steps.at_rest else Status.OUT_OF_ITERATIONS
 
-        Tensors are not resumed from the map of the fewest flips, which may have been passed by early on, far from
-        any solution. For local repair it is the one to repair.
-        """
-        best = self.deepest if stage.resume else None
-        if best is not None and stage.moves_vertices:
-            return iterate_of(objective, best.w if stage.optimizer == "untangling" else self.best_map)
-        if self._first is not None and not self.history:
-            mu = own_tensor(objective.mesh.derivatives(self._first))
-        elif best is None:
-            mu = np.zeros(len(self.problem.F), dtype=np.complex128)
-        elif best.objective.mesh is objective.mesh:
-            mu = best.field.mu
-        else:
-            mu = own_tensor(objective.mesh.derivatives(best.w))
-        return objective.evaluate(objective.bounded(objective.parameterization.invert(mu)))
-
-    def _visit(self, here: Iterate) -> None:
-        """Take note of an iterate; stop at an injective one and where nothing moves any more."""
+    def _visit(self, here: Iterate, *, tensors: bool) -> Step:
+        """Take note of an iterate."""
         flipped = here.flipped
         if flipped == 0:
             # Decided on the coordinates that are handed back, not on the solver's own.
@@ -291,34 +283,38 @@ class Search:
         if (flipped, step.energy) < self.best:
             self.best = flipped, step.energy
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.mesh.kind
-        if self._moves_tensors and (self.deepest is None or here.energy < self.deepest.energy):
+        if tensors and (self.deepest is None or here.energy < self.deepest.energy):
             self.deepest = here
-        if flipped == 0:
-            raise Stop(Status.INJECTIVE)
-        if self._left <= 0:
-            raise Stop(Status.OUT_OF_ITERATIONS)
-        flips, energy = self._mark
-        if flipped < flips or step.energy < (1 - self._progress) * energy:
-            self._mark = min(flipped, flips), min(step.energy, energy)
-            self._marked = len(self.history)
-        elif len(self.history) - self._marked > self._patience:
-            raise Stop(Status.SETTLED)
+        return step
+
+
+class _Patience:
+    """How long a stage has made no progress."""
+
+    def __init__(self, limits: tuple[int, float] | None) -> None:
+        self._most: float
+        self._most, self._progress = limits or (np.inf, 0.0)
+        self._flipped, self._energy, self._in_vain = np.inf, np.inf, 0
+
+    def is_over(self, step: Step) -> bool:
+        """Whether too many steps in a row have righted no triangle and lowered the energy by too little."""
+        if step.flipped < self._flipped or step.energy < (1 - self._progress) * self._energy:
+            self._flipped, self._energy = min(step.flipped, self._flipped), min(step.energy, self._energy)
+            self._in_vain = 0
+        else:
+            self._in_vain += 1
+        return self._in_vain > self._most
 
 
 def _on_coarse(
-    problem: Problem, stage: Descent, linear_solver: str, budget: int, callback: Callable[[Step], object]
+    problem: Problem, first: Descent, linear_solver: str, budget: int, callback: Callable[[Step], object]
 ) -> tuple[Status, FloatArray, str]:
     """Solve a coarse problem, and lower the distortion of its map a little: why it ended, the map, the backend."""
     search = Search(problem, linear_solver, callback, budget)
-    status = search.run(
-        [
-            replace(stage, optimizer="vector-adam"),
-            Descent("patches", iterations=30, resume=True),
-            Descent("untangling", iterations=300, resume=True),
-        ]
-    )
+    status = search.run([first, Patches(resume=True), Untangling(resume=True)])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
         # Fine vertices crowd where coarse triangles are thin: a few steps against that pay many times over.
-        uv = polish_map(problem, uv, energy="mips", max_iterations=10, linear_solver=search.linear_solver).uv
+        polish = polish_map(problem.domain, uv, energy="mips", max_iterations=10, linear_solver=search.linear_solver)
+        uv = polish.uv
     return status, uv, search.linear_solver

@@ -7,19 +7,16 @@ vertex: a fine mesh is neither factored nor descended on at all.
 
 from __future__ import annotations
 
-from copy import copy
-from typing import cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.domain import Domain
 from quasiharmonic.mesh.coarsening import coarsen
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.problem import Problem
 from quasiharmonic.prolongation import prolong
-
-ComplexArray = NDArray[np.complex128]
-FloatArray = NDArray[np.float64]
 
 # The coarse mesh has an eighth of the vertices or so many, whichever is less, but some for every fixed vertex: as many
 # as it takes to grade the mesh from the boundary, whose vertices all stay, to the inside.
@@ -28,18 +25,26 @@ _SHARE, _MOST, _PER_FIXED = 1 / 8, 1500, 3
 _WORTHWHILE, _LEAST = 0.5, 1500
 
 
-class CoarseProblem:
-    """A coarse mesh with the fixed vertices of a problem, and the way back.
+#: Coarse meshes of domains in use, None where there is none to be had.
+_MADE: WeakKeyDictionary[Domain, CoarseMesh | None] = WeakKeyDictionary()
 
-    Made by `coarse_problem`.
+
+class CoarseMesh:
+    """A coarse mesh with the fixed vertices of a fine one, and the way back.
+
+    Parameters
+    ----------
+    fine : Domain
+    goal : int
+        Vertices that it is to have, about.
 
     Attributes
     ----------
-    problem : Problem
-        The coarse problem, in the same frame as the fine one.
+    domain : Domain
+        The coarse mesh, with the same vertices held in the same order.
     """
 
-    def __init__(self, fine: Problem, goal: int) -> None:
+    def __init__(self, fine: Domain, goal: int) -> None:
         self._held = np.zeros(fine.n, dtype=bool)
         self._held[fine.fixed] = True
         self._coarsening = coarsen(fine.F, fine.n, self._held, goal)
@@ -49,48 +54,42 @@ class CoarseProblem:
         number = np.full(fine.n, -1)
         number[self._vertices] = np.arange(self._vertices.size)
         F = number[self._coarsening.F]
-        V = _not_flat(fine.V[self._vertices], F)
-        self.problem = Problem(V, F, number[fine.fixed], fine.target, reference="equilateral")
+        self.domain = Domain(_not_flat(fine.V[self._vertices], F), F, number[fine.fixed])
 
-    def moved(self, target: FloatArray) -> CoarseProblem:
-        """The same with the fixed vertices elsewhere."""
-        other = copy(self)
-        other.problem = self.problem.moved(target)
-        return other
-
-    def prolong(self, uv: FloatArray) -> ComplexArray:
+    def prolong(self, w: ComplexArray) -> ComplexArray:
         """Carry a map of the coarse mesh to the fine one.
 
         Parameters
         ----------
-        uv : (nc, 2) float64
+        w : (nc,) complex128
+            ``u + i v``, in any frame.
 
         Returns
         -------
         (n,) complex128
-            ``u + i v`` in the problem's frame, injective where ``uv`` is, but for rounding.
+            In the same frame, injective where ``w`` is, but for rounding.
         """
         fine = np.zeros(self._held.size, dtype=np.complex128)
-        fine[self._vertices] = self.problem.frame.inward(uv)
+        fine[self._vertices] = w
         return prolong(fine, self._coarsening, self._held)
 
 
-def coarse_problem(fine: Problem) -> CoarseProblem | None:
-    """The coarse problem of one that is large enough, made once for a mesh and all its targets.
+def coarse_mesh(problem: Problem) -> CoarseMesh | None:
+    """The coarse mesh for a problem that is large enough, made once for a domain and all its targets.
 
     None where the mesh is small, most of its vertices are fixed, or the caller wants its own triangles looked at.
     """
-    if fine.reference not in (None, "equilateral"):
+    if problem.reference not in (None, "equilateral"):
         return None
-    if "coarse" not in fine.derived:
+    fine = problem.domain
+    if fine not in _MADE:
         goal = int(max(_PER_FIXED * fine.fixed.size, min(_SHARE * fine.n, _MOST)))
         worthwhile = fine.n >= _LEAST and goal < _WORTHWHILE * fine.n
-        fine.derived["coarse"] = CoarseProblem(fine, goal) if worthwhile else None
-    made = cast("CoarseProblem | None", fine.derived["coarse"])
-    return None if made is None else made.moved(fine.target)
+        _MADE[fine] = CoarseMesh(fine, goal) if worthwhile else None
+    return _MADE[fine]
 
 
-def _not_flat(V: FloatArray, F: NDArray[np.int64]) -> FloatArray:
+def _not_flat(V: FloatArray, F: IntArray) -> FloatArray:
     """Positions in space (n, 3), stirred a little if any triangle has no area there, as in the plane many have not.
 
     A coarse triangle was never there: its shape is a guide to how large the fine ones were, and no more.

@@ -16,20 +16,17 @@ gradient's, and ``H − B K⁻¹ Bᵀ`` towards the positive definite H.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ComplexArray
+from quasiharmonic.descent.base import Iterates, TensorDescent
 from quasiharmonic.energies import QuadraticForm
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.newton_system import NewtonSystem
 from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.optimize import Stop
-from quasiharmonic.result import Status
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _FIRST_DAMPING = 1e-2
 _MOST_DAMPING = 1e12
@@ -37,57 +34,67 @@ _MOST_DAMPING = 1e12
 _LEAST = 1e-100
 
 
-def newton(
-    objective: Objective,
-    start: Iterate,
-    visit: Callable[[Iterate], None],
-    *,
-    iterations: int,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Newton(TensorDescent):
     """Descend V₃ by Newton steps in a trust region.
+
+    Attributes
+    ----------
+    iterations : int
+        Steps to try at most; those that are rejected yield nothing.
+    """
+
+    word: ClassVar[str] = "newton"
+
+    @property
+    def patience(self) -> tuple[int, float] | None:
+        """Newton's steps are dear, and where they lead anywhere they do so at once."""
+        return 40, 0.1
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`; at rest where no step lowers the energy any more."""
+        mesh, problem = objective.mesh, objective.problem
+        system = NewtonSystem(problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name)
+        here, damping = start, _FIRST_DAMPING
+        model = SecondOrderModel(here)
+        for _ in range(self.iterations):
+            try:
+                step, predicted = model.step(system, damping)
+                there = objective.evaluate(objective.bounded(here.xi + step))
+            except NotPositiveDefinite:
+                predicted, there = 0.0, None
+            gain = (here.dirichlet - there.dirichlet) / predicted if there is not None and predicted > 0 else -np.inf
+            if gain < 0.25:
+                damping *= 4
+            elif gain > 0.75:
+                damping /= 4
+            if there is not None and gain > 1e-4:
+                here = there
+                yield here
+                model = SecondOrderModel(here)
+            elif damping > _MOST_DAMPING:
+                return True
+        return False
+
+
+class SecondOrderModel:
+    """Second-order model of P around a quasi-harmonic map.
 
     Parameters
     ----------
-    objective : Objective
-        Its functional is not looked at: the method is V₃'s.
-    start : Iterate
-    visit : callable
-        Called with every accepted iterate; raises `Stop` to end.
-    iterations : int
-        Steps to try at most.
+    here : Iterate
 
-    Raises
-    ------
-    Stop
-        When no step lowers the energy any more.
-    quasiharmonic.linsolve.NotPositiveDefinite
-        When rounding leaves no positive definite Laplacian.
+    Attributes
+    ----------
+    K : three of (f,) float64
+        Entries 11, 12, 22 of each triangle's block, along ξ and across it.
+    B : two of two of (f,) complex128
+        By p and by q, of the direction along ξ and of that across it.
+    g : two of (f,) float64
+        The gradient along ξ and across it.
+    unit : (f,) complex128
+        ``ξ/|ξ|``.
     """
-    mesh, problem = objective.mesh, objective.problem
-    system = NewtonSystem(problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name)
-    here, damping = start, _FIRST_DAMPING
-    model = _Model(here)
-    for _ in range(iterations):
-        try:
-            step, predicted = model.step(system, damping)
-            there = objective.evaluate(objective.bounded(here.xi + step))
-        except NotPositiveDefinite:
-            predicted, there = 0.0, None
-        gain = (here.dirichlet - there.dirichlet) / predicted if there is not None and predicted > 0 else -np.inf
-        if gain < 0.25:
-            damping *= 4
-        elif gain > 0.75:
-            damping /= 4
-        if there is not None and gain > 1e-4:
-            here = there
-            visit(here)
-            model = _Model(here)
-        elif damping > _MOST_DAMPING:
-            raise Stop(Status.SETTLED)
-
-
-class _Model:
-    """Second-order model of P around a quasi-harmonic map."""
 
     def __init__(self, here: Iterate) -> None:
         field, (p, q, _) = here.field, here.dw
@@ -150,7 +157,7 @@ class _Model:
 
         g1 = self.g[0] / l11
         g2 = (self.g[1] - l21 * g1) / l22
-        load = _gather(self.here, first[0] * g1 + second[0] * g2, first[1] * g1 + second[1] * g2)
+        load = self.gather(first[0] * g1 + second[0] * g2, first[1] * g1 + second[1] * g2)
         d = np.zeros(self.here.w.shape, dtype=np.complex128)
         d[system.free] = system.solve(load[system.free])
         dp, dq, _ = self.here.objective.mesh.derivatives(d)
@@ -160,6 +167,14 @@ class _Model:
         alpha, beta = (k22 * y1 - k12 * y2) / det, (k11 * y2 - k12 * y1) / det
         predicted = -0.5 * float((self.g[0] * alpha + self.g[1] * beta).sum())
         return (alpha + 1j * beta) * self.unit, predicted
+
+    def gather(self, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
+        """Derivatives by p and q as derivatives by the vertices' positions; (n,) complex128."""
+        mesh = self.here.objective.mesh
+        g = 0.5 * mesh.gamma
+        parts = (by_p * g + by_q * g.conj()).ravel()
+        corner = mesh.F.T.ravel()
+        return np.bincount(corner, parts.real, mesh.n) + 1j * np.bincount(corner, parts.imag, mesh.n)
 
 
 def _less_squares(form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArray]) -> QuadraticForm:
@@ -172,12 +187,3 @@ def _less_squares(form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArra
         p2, q2 = p2 - 0.5 * cp**2, q2 - 0.5 * cq**2
         pq, pqc = pq - cp * cq, pqc - cp * bq
     return QuadraticForm(pp, qq, p2, q2, pq, pqc)
-
-
-def _gather(here: Iterate, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
-    """Derivatives by p and q as derivatives by the vertices' positions; (n,) complex128."""
-    mesh = here.objective.mesh
-    g = 0.5 * mesh.gamma
-    parts = (by_p * g + by_q * g.conj()).ravel()
-    corner = mesh.F.T.ravel()
-    return np.bincount(corner, parts.real, mesh.n) + 1j * np.bincount(corner, parts.imag, mesh.n)

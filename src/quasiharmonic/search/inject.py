@@ -8,28 +8,24 @@ handed back.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import check_finite, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, map_array, named, whole_number
 from quasiharmonic.certificate import certify
 from quasiharmonic.energies import Energy
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.mesh.topology import named
 from quasiharmonic.objective import Objective
 from quasiharmonic.polishing import energy_named, polished
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.result import MapResult, Status, Step
-from quasiharmonic.search import Search
-from quasiharmonic.strategy import Descent, stages_of, whole_number
+from quasiharmonic.search.stages import Search, Stages
+from quasiharmonic.search.strategy import stages_of
 from quasiharmonic.tensor import TANH
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 def injective_map(
@@ -39,7 +35,7 @@ def injective_map(
     target: ArrayLike,
     *,
     reference: Reference | None = None,
-    strategy: str | Sequence[Descent] = "speed",
+    strategy: str | Stages = "speed",
     polish: str | Energy | None = None,
     start: ArrayLike | None = None,
     max_iterations: int = 2000,
@@ -125,7 +121,7 @@ def injective_map(
 def solve(
     problem: Problem,
     *,
-    strategy: str | Sequence[Descent] = "speed",
+    strategy: str | Stages = "speed",
     polish: str | Energy | None = None,
     start: ArrayLike | None = None,
     max_iterations: int = 2000,
@@ -163,7 +159,7 @@ def solve(
         search = Search(own, linear_solver, callback, max_iterations, record, first)
         status = search.run(stages_of(strategy, own))
     uv = problem.positions(search.best_map)
-    certificate = certify(problem.F, uv, loops=problem.loops)
+    certificate = certify(problem.F, uv, loops=problem.domain.loops)
     field = search.best_field
     result = MapResult(
         uv=uv,
@@ -229,8 +225,5 @@ def quasi_harmonic_map(
 
 def _first_map(problem: Problem, start: ArrayLike) -> ComplexArray:
     """The caller's first map, checked, as complex numbers in a frame of its own: only its tensors count."""
-    uv = real_array("start", start)
-    if uv.shape != (problem.n, 2):
-        raise ValueError(f"start must have shape ({problem.n}, 2), a place for every vertex, not {uv.shape}")
-    check_finite("start", "vertex", "vertices", uv)
+    uv = map_array("start", start, problem.n)
     return Frame(uv).inward(uv)

@@ -1,0 +1,245 @@
+"""What every way to descend is: a few settings, and a generator of maps.
+
+A method is one file with one frozen class. Its fields are its settings, `Descent.iterates` yields map after map, and
+whoever runs it (`quasiharmonic.search`) looks at each and stops when it has seen enough.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_type_hints
+
+import numpy as np
+
+from quasiharmonic.arrays import ComplexArray, whole_number
+from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.problem import Problem
+
+Iterates: TypeAlias = Generator[Iterate, None, bool]
+
+
+@dataclass(frozen=True)
+class SoFar:
+    """What a search has found before a stage begins.
+
+    Attributes
+    ----------
+    given : (n,) complex128 or None
+        The caller's first map, for the very first stage.
+    best_map : (n,) complex128
+        The map of the fewest inverted triangles.
+    deepest : Iterate or None
+        The one of the lowest V₃ among those that tensors were descended to.
+    """
+
+    given: ComplexArray | None
+    best_map: ComplexArray
+    deepest: Iterate | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Descent(ABC):
+    """One stage of a search, on the mesh itself.
+
+    Attributes
+    ----------
+    resume : bool
+        Start from the best so far instead of ξ = 0.
+
+    Raises
+    ------
+    ValueError
+        When a setting has no such value.
+    """
+
+    resume: bool = False
+
+    #: How reports call the method.
+    word: ClassVar[str]
+    #: Whether positions are what moves, and tensors only follow.
+    moves_vertices: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        for name, words in _choices(type(self)):
+            given = getattr(self, name)
+            if given not in words:
+                raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return self.word
+
+    @property
+    def patience(self) -> tuple[int, float] | None:
+        """The stage has settled when within so many iterates none was righted and the energy fell by less.
+
+        As a fraction of itself. None for methods that know by themselves when to end.
+        """
+        return None
+
+    def objective(self, problem: Problem, linear_solver: str) -> Objective:
+        """What is descended, or what the maps are judged by."""
+        return Objective(problem, linear_solver=linear_solver)
+
+    @abstractmethod
+    def start(self, objective: Objective, found: SoFar) -> Iterate:
+        """Where the stage begins.
+
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When rounding leaves no positive definite Laplacian.
+        """
+
+    @abstractmethod
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """Descend.
+
+        Parameters
+        ----------
+        objective : Objective
+        start : Iterate
+
+        Yields
+        ------
+        Iterate
+            Every map on the way, ``start`` excepted.
+
+        Returns
+        -------
+        bool
+            Whether the method has come to rest, and not to the end of its iterations.
+
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When even short steps leave no positive definite Laplacian.
+        """
+
+
+class Steps:
+    """The iterates of a descent, and when they have ended whether it came to rest.
+
+    Attributes
+    ----------
+    at_rest : bool
+    """
+
+    def __init__(self, iterates: Iterates) -> None:
+        self._iterates = iterates
+        self.at_rest = False
+
+    def __iter__(self) -> Iterator[Iterate]:
+        self.at_rest = yield from self._iterates
+
+
+@dataclass(frozen=True, kw_only=True)
+class TensorDescent(Descent):
+    """A stage that descends an objective over ξ.
+
+    Attributes
+    ----------
+    parameterization : {"tanh", "si-log"}
+        How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
+    reference : {"equilateral", "rest", "corrected"}
+        Shape of the triangles, unless the problem itself names one.
+    iterations : int
+        Steps to take at most.
+    resume : bool
+        Start from the tensors of the lowest V₃ so far instead of ξ = 0. (Not from those of the map of the fewest
+        inverted triangles, which may have been passed by early on, far from any solution.)
+    """
+
+    parameterization: Literal["tanh", "si-log"] = "tanh"
+    reference: Reference = "equilateral"
+    iterations: int = 1000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number("iterations", self.iterations, least=1)
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return f"{self.word}, {self.parameterization}"
+
+    @property
+    def patience(self) -> tuple[int, float] | None:
+        """As of `Descent`."""
+        return 300, 1e-3
+
+    def objective(self, problem: Problem, linear_solver: str) -> Objective:
+        """What is descended: V₃."""
+        return Objective(problem, "dirichlet", self.parameterization, self.reference, linear_solver)
+
+    def start(self, objective: Objective, found: SoFar) -> Iterate:
+        """At the caller's map if there is one, at the tensors of the lowest V₃ so far, or at ξ = 0."""
+        best = found.deepest if self.resume else None
+        if found.given is not None:
+            return objective.near_map(found.given)
+        if best is None:
+            mu = np.zeros(len(objective.problem.F), dtype=np.complex128)
+        elif best.objective.mesh is objective.mesh:
+            mu = best.field.mu
+        else:
+            mu = objective.own_tensor(best.w)
+        return objective.evaluate(objective.bounded(objective.parameterization.invert(mu)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FunctionalDescent(TensorDescent):
+    """A stage that descends any of the functionals.
+
+    Attributes
+    ----------
+    functional : {"dirichlet", "neumann", "sobolev", "poisson"}
+        What is descended (§7.3).
+    """
+
+    functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return f"{self.word}, {self.parameterization}, {self.functional}"
+
+    def objective(self, problem: Problem, linear_solver: str) -> Objective:
+        """What is descended."""
+        return Objective(problem, self.functional, self.parameterization, self.reference, linear_solver)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VertexDescent(Descent):
+    """A stage that moves vertices, tensors following; it knows by itself when to end.
+
+    Attributes
+    ----------
+    resume : bool
+        Start from the map to repair instead of ξ = 0.
+    """
+
+    moves_vertices: ClassVar[bool] = True
+
+    def start(self, objective: Objective, found: SoFar) -> Iterate:
+        """At the map of the fewest inverted triangles, or at Tutte's embedding."""
+        if self.resume and found.deepest is not None:
+            return objective.of_map(self.resumed(found.best_map, found.deepest))
+        if found.given is not None:
+            return objective.near_map(found.given)
+        return objective.evaluate(np.zeros(len(objective.problem.F), dtype=np.complex128))
+
+    def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:
+        """Which of two maps to go on from."""
+        return best_map
+
+
+@cache
+def _choices(kind: type[Any]) -> list[tuple[str, tuple[str, ...]]]:
+    """The settings of a method that are one of several words, and those words."""
+    hints = [(name, get_args(hint)) for name, hint in get_type_hints(kind).items()]
+    return [(name, words) for name, words in hints if words and all(isinstance(word, str) for word in words)]

@@ -1,0 +1,89 @@
+"""What is tried, in which order: the strategy of §9.2 and §10.1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from quasiharmonic.descent import Descent, Newton, Patches, RandomRestarts, Untangling, VectorAdam
+from quasiharmonic.problem import Problem
+from quasiharmonic.search.stages import CoarseToFine, Stages
+
+# Vertices from which on a coarse mesh, made, solved and refined again, is quicker than ten iterations on the mesh.
+_LARGE = 6000
+
+
+def speed(problem: Problem) -> Stages:
+    """The stages that find a map soonest, the first of which usually suffices.
+
+    Boundaries alone want tanh, pins want si-log: the spike that a pinned point draws needs distortion that
+    grows slowly towards it, and tanh never gets there. What is left then are a few triangles in tight places,
+    which moving vertices rights sooner than moving tensors does; or else the map is far from any solution in
+    parts, and Newton's method brings it nearer. All of this is tried on a coarse mesh first if the mesh is large,
+    and soon if it is not.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    list of Descent or CoarseToFine
+        In the order in which they are run.
+    """
+    if problem.domain.pins.size:
+        first: Descent = VectorAdam(parameterization="si-log", iterations=400)
+        newton = Newton(parameterization="si-log", iterations=60, resume=True)
+    else:
+        first, newton = VectorAdam(iterations=100), Newton(iterations=300, resume=True)
+    # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
+    coarse, patches = CoarseToFine(first), Patches(tries=30, resume=True)
+    soon: Stages = (coarse, first, patches) if problem.n >= _LARGE else (first, patches, coarse)
+    return [
+        *soon,
+        Untangling(iterations=300, resume=True),
+        RandomRestarts(in_vain=30, resume=True),
+        newton,
+        Untangling(iterations=600, resume=True),
+        RandomRestarts(in_vain=30),
+        RandomRestarts(in_vain=60, resume=True),
+    ]
+
+
+def quality(problem: Problem) -> Stages:
+    """The stages that keep angles: si-log on the rest mesh's own triangles, then whatever finds a map (§10.1).
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    list of Descent or CoarseToFine
+    """
+    return [
+        VectorAdam(parameterization="si-log", reference="corrected", iterations=1000),
+        Newton(parameterization="si-log", reference="corrected", iterations=60, resume=True),
+        *speed(problem),
+    ]
+
+
+STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "quality": quality}
+
+
+def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
+    """The stages that a strategy's name, or the user's own list, stands for.
+
+    Raises
+    ------
+    ValueError
+        When there is no such strategy.
+    """
+    if isinstance(strategy, str):
+        if strategy not in STRATEGIES:
+            raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+        return STRATEGIES[strategy](problem)
+    given = list(strategy) if isinstance(strategy, Sequence) else []
+    stages = [stage for stage in given if isinstance(stage, (Descent, CoarseToFine))]
+    if not stages or len(stages) < len(given):
+        raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+    return stages
