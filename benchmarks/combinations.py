@@ -19,7 +19,7 @@ import numpy as np
 
 from quasiharmonic import Problem, io, solve
 from quasiharmonic.descent import LBFGS, Descent, Newton, VectorAdam
-from quasiharmonic.measures import distortion
+from quasiharmonic.energy.measures import distortion
 
 FUNCTIONALS = "neumann", "sobolev", "dirichlet", "poisson"
 PARAMETERIZATIONS = "tanh", "si-log"

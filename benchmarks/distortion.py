@@ -25,10 +25,10 @@ import numpy as np
 
 from quasiharmonic import Problem, distortion, io, solve, surfaces, targets
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.harmonising import harmonise_map
+from quasiharmonic.energy.polishing import ENERGIES, polish_map
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.polishing import ENERGIES, polish_map
+from quasiharmonic.search.harmonising import harmonise_map
 
 Found = tuple[FloatArray, float]
 

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
-from quasiharmonic import domain, laplacian
-from quasiharmonic.linsolve import base
+from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.linsolve import base, laplacian
 from quasiharmonic.mesh import reference
-from quasiharmonic.objective import Iterate, Objective
+from quasiharmonic.problem import domain
 from quasiharmonic.search import coarse, inject, stages
 
 NAMES = (

@@ -11,8 +11,8 @@ from scipy.spatial import Delaunay
 
 from quasiharmonic import surfaces
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, components, edges
-from quasiharmonic.refinement import refine
 
 Generator = np.random.Generator
 Plane = tuple[ComplexArray, IntArray]

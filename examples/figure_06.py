@@ -25,7 +25,7 @@ import numpy as np
 from common import frames, inverted_area, panels, ring, run, save, show
 from quasiharmonic import Problem, solve
 from quasiharmonic.descent import VectorAdam
-from quasiharmonic.objective import Objective
+from quasiharmonic.field.objective import Objective
 
 HOLE = (-0.25, -0.25, 0.25, 0.25)
 NAMES = {"dirichlet": "V₃", "neumann": "V₁", "sobolev": "V₂", "poisson": "V₄"}

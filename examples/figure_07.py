@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from common import COLORS, panels, run, save
-from quasiharmonic.tensor import PARAMETERIZATIONS
+from quasiharmonic.field.tensor import PARAMETERIZATIONS
 
 
 def main(output: Path) -> dict[str, Any]:

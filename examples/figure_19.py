@@ -17,8 +17,8 @@ import numpy as np
 
 from common import flips, panels, run, save, show
 from quasiharmonic import solve
-from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
-from quasiharmonic.harmonising import ENERGIES, harmonise_map
+from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.search.harmonising import ENERGIES, harmonise_map
 from sculptures import seven
 
 NAMES = {

@@ -16,7 +16,7 @@ import numpy as np
 
 from common import first_map, flips, mips, onto, panels, run, save, show
 from quasiharmonic import distortion, solve, surfaces, targets
-from quasiharmonic.harmonising import harmonise_map
+from quasiharmonic.search.harmonising import harmonise_map
 from sculptures import sculpture
 
 SURFACES = "cat", "angel", "gargoyle", "rabbit", "bust", "hand"

@@ -20,8 +20,8 @@ from scipy.optimize import minimize
 from common import flips, panels, run, save, show
 from quasiharmonic import Problem, solve
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
-from quasiharmonic.harmonising import ENERGIES, harmonise_map
+from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.search.harmonising import ENERGIES, harmonise_map
 from sculptures import seven
 
 COLUMNS = "rabbit onto R", "bust onto A", "hand onto P", "gargoyle onto H"

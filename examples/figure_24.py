@@ -28,9 +28,9 @@ from matplotlib.colors import LogNorm
 from common import INK, RED, colorbar, first_map, flips, mips, panels, run, save
 from quasiharmonic import Problem, distortion, solve
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.energies import conformal_area_blend
-from quasiharmonic.harmonising import harmonise_map
-from quasiharmonic.polishing import polish_map
+from quasiharmonic.energy.energies import conformal_area_blend
+from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.search.harmonising import harmonise_map
 from sculptures import seven
 
 COLUMNS = "bust onto A", "rabbit onto R", "gargoyle onto H"

@@ -31,8 +31,8 @@ from typing import Any
 
 from common import colorbar, first_map, flips, mips, panels, run, save, show_ratios
 from quasiharmonic import distortion, solve
-from quasiharmonic.harmonising import harmonise_map
-from quasiharmonic.polishing import polish_map
+from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.search.harmonising import harmonise_map
 from sculptures import seven
 
 COLUMNS = ("SBP's energy", "si-log", "tanh + MIPS")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from meshes import boundary_of
+from quasiharmonic.exact.predicates import SegmentRelation, segment_relation
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.predicates import SegmentRelation, segment_relation
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
 

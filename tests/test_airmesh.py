@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("shapely", minversion="2.1")
 
 from quasiharmonic import AirMesh, surfaces
-from quasiharmonic.airmesh import air_between, thickened
-from quasiharmonic.measures import mean_ratio
+from quasiharmonic.apply.airmesh import air_between, thickened
+from quasiharmonic.energy.measures import mean_ratio
 
 
 def square(side, x=0.0, y=0.0, count=8):

@@ -31,8 +31,8 @@ from quasiharmonic import (
     refine_problem,
 )
 from quasiharmonic.cli import main
+from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.predicates import orientation
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from test_io_fuzz import VALID, damaged
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.certificate import Obstacle, certify, flipped_triangles, is_injective
-from quasiharmonic.predicates import SegmentRelation
+from quasiharmonic.exact.certificate import Obstacle, certify, flipped_triangles, is_injective
+from quasiharmonic.exact.predicates import SegmentRelation
 from test_predicates import exact_orientation, exact_relation
 
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
@@ -135,7 +135,7 @@ def test_the_three_verdicts_on_a_triangle():
 
 
 def test_predicate_and_locator_agree_with_the_certificate(rng, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.certificate._TRIANGLE_CHUNK", 7)
+    monkeypatch.setattr("quasiharmonic.exact.certificate._TRIANGLE_CHUNK", 7)
     F = strip(6, rows=5)
     flat = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0), indexing="ij"), axis=-1).reshape(-1, 2)
     for noise in (0.0, 0.1, 0.4, 1.0):

@@ -15,7 +15,7 @@ import pytest
 from meshes import boundary_of, lift, signed_areas
 from quasiharmonic import io
 from quasiharmonic.cli import main
-from quasiharmonic.measures import distortion
+from quasiharmonic.energy.measures import distortion
 from quasiharmonic.surfaces import random_delaunay
 from test_inject import star_problem, turned_ring
 
@@ -238,7 +238,7 @@ class TestReportFails:
         def interrupt(self, xi):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("quasiharmonic.objective.Objective.evaluate", interrupt)
+        monkeypatch.setattr("quasiharmonic.field.objective.Objective.evaluate", interrupt)
         assert run("map", star, "-o", tmp_path / "o.obj") == 2
         assert "nothing was written" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
@@ -347,9 +347,10 @@ class TestPolish:
         assert not (tmp_path / "o.obj").exists()
 
     def test_names_are_those_of_the_library(self):
-        from quasiharmonic import harmonising, linsolve
+        from quasiharmonic import linsolve
         from quasiharmonic.cli import arguments
-        from quasiharmonic.polishing import ENERGIES
+        from quasiharmonic.energy.polishing import ENERGIES
+        from quasiharmonic.search import harmonising
 
         assert set(arguments.ENERGIES) == set(ENERGIES)
         assert set(arguments.HARMONISED) == set(harmonising.ENERGIES)

@@ -12,8 +12,8 @@ from meshes import boundary_of, lift, random_annulus, signed_areas
 from quasiharmonic import Problem, Status, distortion, flipped_triangles, is_injective, solve
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.mesh.coarsening import coarsen, touching
+from quasiharmonic.mesh.prolongation import _places, prolong
 from quasiharmonic.mesh.topology import boundary_loops, edges
-from quasiharmonic.prolongation import _places, prolong
 from quasiharmonic.search import stages
 from quasiharmonic.search.coarse import coarse_mesh
 from quasiharmonic.search.stages import CoarseToFine

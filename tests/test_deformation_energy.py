@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, lift, surfaces
-from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
-from quasiharmonic.derivatives import derivative_error
-from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet
+from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energy.derivatives import derivative_error
+from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet
+from quasiharmonic.energy.measures import distortion
+from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.measures import distortion
-from quasiharmonic.newton_system import NewtonSystem
-from quasiharmonic.springs import MassSpring
 from quasiharmonic.surfaces import grid, random_delaunay
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from obstructed import HOUSE, OBSTRUCTED, circle, loose_wheel, moved, onto, two_wheels
-from quasiharmonic.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.problem import Problem
-from quasiharmonic.refinement import refine
 from quasiharmonic.search.inject import injective_map
 from quasiharmonic.surfaces import disk
 

@@ -8,9 +8,9 @@ from scipy.spatial import Delaunay
 
 from meshes import bend, boundary_of
 from obstructed import OBSTRUCTED, circle, loose_wheel, moved, onto, spiral, wheel
-from quasiharmonic.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.topology import edges
-from quasiharmonic.predicates import orientation
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 

@@ -10,13 +10,13 @@ import pytest
 
 from meshes import boundary_of
 from obstructed import OBSTRUCTED, U, circle, onto, random_polygon, spiral
-from quasiharmonic.boundary_curves import contacts, winding
-from quasiharmonic.diagnosis import Kind, diagnose, examine, shortcuts
-from quasiharmonic.diagnosis.clearance import clear
-from quasiharmonic.diagnosis.clipping import Lattice
-from quasiharmonic.diagnosis.triangulation import triangulate
-from quasiharmonic.diagnosis.views import Views
-from quasiharmonic.predicates import SegmentRelation, orientation, segment_relation
+from quasiharmonic.exact.diagnosis import Kind, diagnose, examine, shortcuts
+from quasiharmonic.exact.diagnosis.clearance import clear
+from quasiharmonic.exact.diagnosis.clipping import Lattice
+from quasiharmonic.exact.diagnosis.triangulation import triangulate
+from quasiharmonic.exact.diagnosis.views import Views
+from quasiharmonic.exact.loops import contacts, winding
+from quasiharmonic.exact.predicates import SegmentRelation, orientation, segment_relation
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
 
@@ -154,7 +154,7 @@ def winding_number(x, corners):
 
 @pytest.mark.parametrize("chunk", [1, 1 << 18])
 def test_winding_numbers(rng, monkeypatch, chunk):
-    monkeypatch.setattr("quasiharmonic.boundary_curves._PAIR_CHUNK", chunk)
+    monkeypatch.setattr("quasiharmonic.exact.loops._PAIR_CHUNK", chunk)
     for n in (3, 8, 30):
         corners = rng.integers(0, 9, (n, 2)).astype(float)
         points = np.concatenate([rng.integers(0, 9, (40, 2)), rng.integers(0, 18, (40, 2)) / 2, corners])

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from quasiharmonic import laplacian, surfaces
-from quasiharmonic.laplacian import Laplacian
-from quasiharmonic.linsolve import mkl
+from quasiharmonic import surfaces
+from quasiharmonic.linsolve import laplacian, mkl
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh import dissection
 from quasiharmonic.mesh.dissection import nested_dissection
 from quasiharmonic.mesh.topology import boundary_loops

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from meshes import lift
-from quasiharmonic.derivatives import check_energy, derivative_error, random_deformation
-from quasiharmonic.energies import (
+from quasiharmonic.energy.derivatives import check_energy, derivative_error, random_deformation
+from quasiharmonic.energy.energies import (
     ARAP,
     MIPS,
     AreaBarrier,
@@ -18,9 +18,9 @@ from quasiharmonic.energies import (
     SymmetricDirichlet,
     conformal_area_blend,
 )
+from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import edges
-from quasiharmonic.springs import MassSpring
 from quasiharmonic.surfaces import random_delaunay
 
 ISOTROPIC = [

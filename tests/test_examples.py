@@ -72,6 +72,16 @@ def test_figure_07(example):
     assert numbers["si-log"]["|ξ| at |μ| = 0.9"] == pytest.approx(8102.1, abs=0.1)
 
 
+def test_general_tensor(example):
+    numbers = example("general_tensor", rings=8)
+    assert numbers["Tutte"]["edges with s < 0"] > 0
+    assert numbers["injective"]["edges with s < 0"] == 0
+    least, most = numbers["conjugate map"]["det A"]
+    assert least < 0.6
+    assert most > 1.5
+    assert numbers["conjugate map"]["distance"] < 1e-9
+
+
 def test_figure_08(example):
     numbers = example("figure_08", size=16)
     for row in numbers.values():

@@ -22,7 +22,7 @@ from quasiharmonic import (
     refine_problem,
 )
 from quasiharmonic.cli import main
-from quasiharmonic.diagnosis import Kind
+from quasiharmonic.exact.diagnosis import Kind
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from test_inject import star_problem
 

@@ -8,12 +8,12 @@ import pytest
 from meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 from quasiharmonic import solve
 from quasiharmonic.descent import LBFGS, Newton
-from quasiharmonic.functionals import FUNCTIONALS, neumann_target
+from quasiharmonic.field.functionals import FUNCTIONALS, neumann_target
+from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.operators import operators
-from quasiharmonic.objective import Objective
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, random_delaunay
-from quasiharmonic.tensor import TANH
 
 MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]

@@ -13,11 +13,11 @@ import pytest
 from meshes import lift
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.descent import VectorAdam
+from quasiharmonic.field.objective import Objective
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.mesh.coarsening import coarsen
+from quasiharmonic.mesh.prolongation import prolong
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.objective import Objective
-from quasiharmonic.prolongation import prolong
 from quasiharmonic.surfaces import disk
 from quasiharmonic.targets import arc_length, letter, rectangle
 

@@ -7,17 +7,17 @@ import pytest
 
 from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
-from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
-from quasiharmonic.derivatives import check_energy, derivative_error
 from quasiharmonic.descent import LBFGS
 from quasiharmonic.descent.base import Steps
-from quasiharmonic.energies import MIPS, AreaPreserving, Combination, Energy
-from quasiharmonic.harmonised import Harmonised
-from quasiharmonic.harmonising import ENERGIES, ETA, harmonise_map
-from quasiharmonic.measures import distortion
+from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energy.derivatives import check_energy, derivative_error
+from quasiharmonic.energy.energies import MIPS, AreaPreserving, Combination, Energy
+from quasiharmonic.energy.measures import distortion
+from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.regularizers import Conformal
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.objective import Objective
-from quasiharmonic.regularizers import Conformal
+from quasiharmonic.search.harmonised import Harmonised
+from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length
 
@@ -283,8 +283,8 @@ class TestHarmonise:
     def test_what_cannot_be_improved(self, monkeypatch):
         """Where all that is found is inverted, the given map comes back, and the status says so."""
         V, F, uv, fixed = bowl()
-        monkeypatch.setattr("quasiharmonic.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
-        monkeypatch.setattr("quasiharmonic.harmonic_descent._RIGHTING", 1)
+        monkeypatch.setattr("quasiharmonic.search.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
+        monkeypatch.setattr("quasiharmonic.search.harmonic_descent._RIGHTING", 1)
         result = harmonise(V, F, uv, fixed=fixed, energy="arap", iterations=5)
         assert result.injective
         assert result.status is not Status.POLISHED

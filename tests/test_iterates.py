@@ -7,13 +7,13 @@ import pytest
 
 from meshes import bend, lift, random_annulus, random_xi
 from quasiharmonic import Problem
-from quasiharmonic.deformation_energy import DeformationEnergy
-from quasiharmonic.energies import MIPS
-from quasiharmonic.functionals import FUNCTIONALS
-from quasiharmonic.harmonised import Harmonised
+from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.energies import MIPS
+from quasiharmonic.field.functionals import FUNCTIONALS
+from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.regularizers import Conformal
 from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.objective import Objective
-from quasiharmonic.regularizers import Conformal
+from quasiharmonic.search.harmonised import Harmonised
 
 
 def posed():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from obstructed import U, circle, spiral
-from quasiharmonic.diagnosis.clipping import Lattice
-from quasiharmonic.diagnosis.links import Polygon
-from quasiharmonic.predicates import orientation
+from quasiharmonic.exact.diagnosis.clipping import Lattice
+from quasiharmonic.exact.diagnosis.links import Polygon
+from quasiharmonic.exact.predicates import orientation
 
 
 def polygon(corners):

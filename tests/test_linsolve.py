@@ -575,7 +575,7 @@ import os, sys
 import numpy as np
 from quasiharmonic.linsolve import make_solver, mkl
 from quasiharmonic.surfaces import grid
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import Laplacian
 mkl.load_mkl()
 V, F = grid(200, 200)
 rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))
@@ -614,7 +614,7 @@ def test_limits_to_the_number_of_threads_are_respected(way):
 
 _CHANGES = """
 import numpy as np
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.linsolve import mkl
 from quasiharmonic.surfaces import grid
 library = mkl.load_mkl()
@@ -641,7 +641,7 @@ def test_pardiso_survives_changes_of_threads_between_its_phases():
 
 _TEAM = """
 import numpy as np
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.surfaces import grid
 V, F = grid(200, 200)
 rim = np.flatnonzero((V == 0).any(axis=1) | (V == 1).any(axis=1))

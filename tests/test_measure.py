@@ -12,7 +12,7 @@ from matplotlib.image import imread
 from quasiharmonic import distortion, io, surfaces
 from quasiharmonic.cli import main
 from quasiharmonic.cli.arguments import MEASURES as OFFERED
-from quasiharmonic.measures import MEASURES
+from quasiharmonic.energy.measures import MEASURES
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from meshes import bend, lift, surfaces
-from quasiharmonic.certificate import flipped_triangles
-from quasiharmonic.measures import MEASURES, distortion
+from quasiharmonic.energy.measures import MEASURES, distortion
+from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.surfaces import grid, random_delaunay
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from quasiharmonic import Status, morph, surfaces
 from quasiharmonic.cli import main
+from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.fem import read_fem, write_fem
-from quasiharmonic.measures import mean_ratio
 from quasiharmonic.mesh.topology import boundary_edges
 
 

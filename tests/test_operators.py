@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from meshes import bend, lift, random_xi, signed_areas, surfaces
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.field.tensor import TANH
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.surfaces import annulus, random_delaunay
-from quasiharmonic.tensor import TANH
 
 MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]

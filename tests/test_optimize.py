@@ -10,8 +10,6 @@ import pytest
 
 from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Problem, solve
-from quasiharmonic.deformation_energy import signed_areas
-from quasiharmonic.derivatives import check_energy, random_deformation
 from quasiharmonic.descent import (
     LBFGS,
     Alternating,
@@ -27,13 +25,15 @@ from quasiharmonic.descent.patches import Patch
 from quasiharmonic.descent.random_restarts import _left_of, _nearest
 from quasiharmonic.descent.reweighting import reweighted
 from quasiharmonic.descent.untangling import GRADINGS, Regularised, untangled
-from quasiharmonic.energies import Deformation
-from quasiharmonic.functionals import beltrami_energy
-from quasiharmonic.objective import Objective
+from quasiharmonic.energy.deformation import signed_areas
+from quasiharmonic.energy.derivatives import check_energy, random_deformation
+from quasiharmonic.energy.energies import Deformation
+from quasiharmonic.field.functionals import beltrami_energy
+from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.tensor import PARAMETERIZATIONS, TANH, own_tensor
 from quasiharmonic.search.stages import CoarseToFine
 from quasiharmonic.search.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
-from quasiharmonic.tensor import PARAMETERIZATIONS, TANH, own_tensor
 from test_inject import star_problem, turned_ring
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from quasiharmonic import flipped_triangles, surfaces
-from quasiharmonic.measures import MEASURES
+from quasiharmonic.energy.measures import MEASURES
 from quasiharmonic.plot import (
     interactive,
     plot_before_after,

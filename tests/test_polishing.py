@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from meshes import bend, boundary_of, lift
-from quasiharmonic import newton_descent
-from quasiharmonic.certificate import is_injective
-from quasiharmonic.deformation_energy import signed_areas
-from quasiharmonic.domain import Domain
-from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
+from quasiharmonic.energy import newton_descent
+from quasiharmonic.energy.deformation import signed_areas
+from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
+from quasiharmonic.energy.measures import distortion
+from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energy.polishing import ENERGIES, polish, polish_map
+from quasiharmonic.energy.springs import MassSpring
+from quasiharmonic.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.measures import distortion
-from quasiharmonic.newton_system import NewtonSystem
-from quasiharmonic.polishing import ENERGIES, polish, polish_map
+from quasiharmonic.problem import Domain
 from quasiharmonic.result import Status
-from quasiharmonic.springs import MassSpring
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
 
 

@@ -8,9 +8,10 @@ import pytest
 from meshes import boundary_of, signed_areas, surfaces
 from obstructed import OBSTRUCTED
 from quasiharmonic import Problem
-from quasiharmonic.diagnosis import diagnose
+from quasiharmonic.apply.refining import refine_problem
+from quasiharmonic.exact.diagnosis import diagnose
+from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.mesh.topology import edges
-from quasiharmonic.refinement import refine, refine_problem
 
 TWO = ([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], [[0, 1, 2], [0, 2, 3]])
 

@@ -11,7 +11,7 @@ import pytest
 from meshes import bend, boundary_of, lift, signed_areas
 from quasiharmonic import certify, distortion, flipped_triangles, io, repair
 from quasiharmonic.cli import main
-from quasiharmonic.seams import fans, islands
+from quasiharmonic.mesh.seams import fans, islands
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.tensor import PARAMETERIZATIONS, SI_LOG, TANH
+from quasiharmonic.field.tensor import PARAMETERIZATIONS, SI_LOG, TANH
 
 BOTH = list(PARAMETERIZATIONS.values())
 

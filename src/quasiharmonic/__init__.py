@@ -9,68 +9,69 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .airmesh import AirMesh, Moment
-    from .certificate import Certificate, certify, flipped_triangles, is_injective
-    from .cutting import Opened, cut_open
-    from .descent import Descent
-    from .diagnosis import Diagnosis, diagnose
-    from .energies import Energy
-    from .harmonising import harmonise
-    from .inverse import InverseMap, SurfacePoints
-    from .measures import Distortion, distortion
-    from .morphing import Morphed, morph
-    from .polishing import polish
-    from .problem import Problem
-    from .refinement import Refined, RefinedProblem, refine, refine_problem
-    from .repairing import Repaired, RepairedIsland, repair
-    from .result import MapResult, Snapshot, Stage, Status, Step
-    from .search.inject import injective_map, quasi_harmonic_map, solve
-    from .transfer import SurfaceMap
-    from .warping import Warped, warp_along, warp_by_landmarks
+    from quasiharmonic.apply.airmesh import AirMesh, Moment
+    from quasiharmonic.apply.cutting import Opened, cut_open
+    from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
+    from quasiharmonic.apply.morphing import Morphed, morph
+    from quasiharmonic.apply.refining import RefinedProblem, refine_problem
+    from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
+    from quasiharmonic.apply.transfer import SurfaceMap
+    from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
+    from quasiharmonic.descent import Descent
+    from quasiharmonic.energy.energies import Energy
+    from quasiharmonic.energy.measures import Distortion, distortion
+    from quasiharmonic.energy.polishing import polish
+    from quasiharmonic.exact.certificate import Certificate, certify, flipped_triangles, is_injective
+    from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
+    from quasiharmonic.mesh.refinement import Refined, refine
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
+    from quasiharmonic.search.harmonising import harmonise
+    from quasiharmonic.search.inject import injective_map, quasi_harmonic_map, solve
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "AirMesh": "airmesh",
-    "Certificate": "certificate",
+    "AirMesh": "apply.airmesh",
+    "Certificate": "exact.certificate",
     "Descent": "descent",
-    "Diagnosis": "diagnosis",
-    "Distortion": "measures",
-    "Energy": "energies",
-    "InverseMap": "inverse",
+    "Diagnosis": "exact.diagnosis",
+    "Distortion": "energy.measures",
+    "Energy": "energy.energies",
+    "InverseMap": "apply.inverse",
     "MapResult": "result",
-    "Moment": "airmesh",
-    "Morphed": "morphing",
-    "Opened": "cutting",
+    "Moment": "apply.airmesh",
+    "Morphed": "apply.morphing",
+    "Opened": "apply.cutting",
     "Problem": "problem",
-    "Refined": "refinement",
-    "RefinedProblem": "refinement",
-    "Repaired": "repairing",
-    "RepairedIsland": "repairing",
+    "Refined": "mesh.refinement",
+    "RefinedProblem": "apply.refining",
+    "Repaired": "apply.repairing",
+    "RepairedIsland": "apply.repairing",
     "Snapshot": "result",
     "Stage": "result",
     "Status": "result",
     "Step": "result",
-    "SurfaceMap": "transfer",
-    "SurfacePoints": "inverse",
-    "Warped": "warping",
-    "certify": "certificate",
-    "cut_open": "cutting",
-    "diagnose": "diagnosis",
-    "distortion": "measures",
-    "flipped_triangles": "certificate",
-    "harmonise": "harmonising",
+    "SurfaceMap": "apply.transfer",
+    "SurfacePoints": "apply.inverse",
+    "Warped": "apply.warping",
+    "certify": "exact.certificate",
+    "cut_open": "apply.cutting",
+    "diagnose": "exact.diagnosis",
+    "distortion": "energy.measures",
+    "flipped_triangles": "exact.certificate",
+    "harmonise": "search.harmonising",
     "injective_map": "search.inject",
-    "is_injective": "certificate",
-    "morph": "morphing",
-    "polish": "polishing",
+    "is_injective": "exact.certificate",
+    "morph": "apply.morphing",
+    "polish": "energy.polishing",
     "quasi_harmonic_map": "search.inject",
-    "refine": "refinement",
-    "refine_problem": "refinement",
-    "repair": "repairing",
+    "refine": "mesh.refinement",
+    "refine_problem": "apply.refining",
+    "repair": "apply.repairing",
     "solve": "search.inject",
-    "warp_along": "warping",
-    "warp_by_landmarks": "warping",
+    "warp_along": "apply.warping",
+    "warp_by_landmarks": "apply.warping",
 }
 
 __all__ = [

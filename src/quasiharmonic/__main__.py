@@ -1,5 +1,5 @@
 """``python -m quasiharmonic``: the command `qhm`."""
 
-from .cli import main
+from quasiharmonic.cli import main
 
 raise SystemExit(main())

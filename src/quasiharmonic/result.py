@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.certificate import Certificate
+from quasiharmonic.exact.certificate import Certificate
 
 if TYPE_CHECKING:
-    from quasiharmonic.diagnosis import Diagnosis
+    from quasiharmonic.exact.diagnosis import Diagnosis
 
 
 class Status(Enum):

@@ -172,9 +172,9 @@ def run(
 
 def _checked(settings: Settings) -> Settings:
     """Settings that no problem will stumble over, with files named such that they are found from anywhere."""
+    from quasiharmonic.energy.polishing import ENERGIES
     from quasiharmonic.linsolve import available
     from quasiharmonic.mesh.reference import Reference
-    from quasiharmonic.polishing import ENERGIES
     from quasiharmonic.search.strategy import STRATEGIES
 
     for name, words in (

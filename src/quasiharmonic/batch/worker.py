@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from quasiharmonic import __version__, io
 from quasiharmonic.batch import records
 from quasiharmonic.batch.records import Record
-from quasiharmonic.certificate import certify
-from quasiharmonic.measures import distortion
+from quasiharmonic.energy.measures import distortion
+from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.exact.certificate import certify
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.polishing import polish_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status
 from quasiharmonic.search.inject import solve

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 
-from . import (
+from quasiharmonic.cli import (
     batch,
     batch_report,
     check,
@@ -29,7 +29,7 @@ from . import (
     repair,
     view,
 )
-from .report import ReportError
+from quasiharmonic.cli.report import ReportError
 
 COMMANDS = (
     map,

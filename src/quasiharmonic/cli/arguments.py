@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-# Those of quasiharmonic.polishing, .harmonising, .linsolve and .measures, which are not imported to say them.
+# Those of quasiharmonic.energy.polishing, .harmonising, .linsolve and .measures, which are not imported to say them.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 HARMONISED = "arap", "area", "springs", "mips", "symmetric-dirichlet"
 MEASURES = (

@@ -20,7 +20,7 @@ _LIVE, _LOG = 0.1, 30.0
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments, targets
+    from quasiharmonic.cli import arguments, targets
 
     parser = commands.add_parser(
         "batch",

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "check",
@@ -38,9 +38,8 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.certificate import certify
-
-    from . import report
+    from quasiharmonic.cli import report
+    from quasiharmonic.exact.certificate import certify
 
     report.check_json(options.json, inputs=(options.input,))
     mesh = io.read_mesh(options.input)

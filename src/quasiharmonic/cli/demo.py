@@ -29,10 +29,9 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Make, map, write, judge, draw, report."""
     from quasiharmonic import io, surfaces, targets
+    from quasiharmonic.cli import map, report
     from quasiharmonic.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
-
-    from . import map, report
 
     folder: Path = options.output
     try:

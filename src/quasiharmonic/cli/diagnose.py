@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "diagnose",
@@ -34,10 +34,9 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, examine, report."""
     from quasiharmonic import io
-    from quasiharmonic.diagnosis import diagnose
+    from quasiharmonic.cli import report
+    from quasiharmonic.exact.diagnosis import diagnose
     from quasiharmonic.problem import Problem
-
-    from . import report
 
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     report.check_json(options.json, inputs=(mesh_path, fixed_path))

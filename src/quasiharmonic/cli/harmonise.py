@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.domain import Domain
+    from quasiharmonic.problem import Domain
     from quasiharmonic.result import MapResult, Step
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "harmonise",
@@ -52,10 +52,10 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, harmonise, write, judge, report."""
-    from . import polish
+    from quasiharmonic.cli import polish
 
     def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
-        from quasiharmonic.harmonising import harmonise_map
+        from quasiharmonic.search.harmonising import harmonise_map
 
         return harmonise_map(
             domain,

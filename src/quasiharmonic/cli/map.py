@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.certificate import Certificate
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
@@ -25,7 +25,7 @@ _STEPS, _LARGEST = 20, 100_000
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments, targets
+    from quasiharmonic.cli import arguments, targets
 
     parser = commands.add_parser(
         "map",
@@ -70,9 +70,8 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
+    from quasiharmonic.cli import report, targets
     from quasiharmonic.result import Status
-
-    from . import report, targets
 
     began = time.perf_counter()
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
@@ -110,9 +109,8 @@ def run(options: argparse.Namespace) -> int:
 
 def search(problem: Problem, strategy: str, polish: str | None, max_iterations: int, linear_solver: str) -> MapResult:
     """Solve with progress on the terminal."""
+    from quasiharmonic.cli import progress
     from quasiharmonic.search.inject import solve
-
-    from . import progress
 
     with progress.line() as show:
         return solve(
@@ -127,11 +125,10 @@ def search(problem: Problem, strategy: str, polish: str | None, max_iterations: 
 
 def smoothed(problem: Problem, result: MapResult) -> MapResult:
     """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
+    from quasiharmonic.cli import progress
+    from quasiharmonic.energy.polishing import polished
     from quasiharmonic.mesh.shapes import rest_shapes
-    from quasiharmonic.polishing import polished
     from quasiharmonic.result import Status
-
-    from . import progress
 
     if len(problem.F) > _LARGEST or rest_shapes(problem.V, problem.F).flat.size:
         return result
@@ -145,9 +142,8 @@ def smoothed(problem: Problem, result: MapResult) -> MapResult:
 def write(output: Path, mesh: MeshData, result: MapResult) -> Certificate:
     """Write a map and judge the file as a reader gets it."""
     from quasiharmonic import io
-    from quasiharmonic.certificate import certify
-
-    from . import report
+    from quasiharmonic.cli import report
+    from quasiharmonic.exact.certificate import certify
 
     io.write_map(output, mesh, result.uv)
     with report.after_writing(output):

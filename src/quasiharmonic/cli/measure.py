@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.measures import Distortion
+    from quasiharmonic.energy.measures import Distortion
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "measure",
@@ -34,9 +34,8 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, measure, export, report."""
     from quasiharmonic import io
-    from quasiharmonic.measures import distortion
-
-    from . import report
+    from quasiharmonic.cli import report
+    from quasiharmonic.energy.measures import distortion
 
     report.check_json(options.json, inputs=(options.input, options.export))
     if options.export is not None:

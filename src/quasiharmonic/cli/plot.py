@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "plot",
@@ -42,10 +42,9 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, draw."""
     from quasiharmonic import io
-    from quasiharmonic.certificate import flipped_triangles
+    from quasiharmonic.cli import report
+    from quasiharmonic.exact.certificate import flipped_triangles
     from quasiharmonic.plot import save_distortion_figure, save_map_figure, save_texture_figure
-
-    from . import report
 
     report.check_picture("-o", options.output, inputs=(options.input,))
     V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))

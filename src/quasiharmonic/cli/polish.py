@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.domain import Domain
-    from quasiharmonic.measures import Distortion
+    from quasiharmonic.energy.measures import Distortion
+    from quasiharmonic.problem import Domain
     from quasiharmonic.result import MapResult, Step
 
     Lower: TypeAlias = Callable[[Domain, NDArray[np.float64], Callable[[Step], None] | None], MapResult]
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "polish",
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     """Read, polish, write, judge, report."""
 
     def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
-        from quasiharmonic.polishing import polish_map
+        from quasiharmonic.energy.polishing import polish_map
 
         return polish_map(
             domain,
@@ -67,10 +67,9 @@ def run(options: argparse.Namespace) -> int:
 def improve(options: argparse.Namespace, lower: Lower) -> int:
     """Read a map, lower its distortion, write, judge, report; for every command that does so."""
     from quasiharmonic import io
-    from quasiharmonic.domain import Domain
-    from quasiharmonic.measures import distortion
-
-    from . import map, progress, report
+    from quasiharmonic.cli import map, progress, report
+    from quasiharmonic.energy.measures import distortion
+    from quasiharmonic.problem import Domain
 
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed))
     mesh = io.read_mesh(options.input)

@@ -10,15 +10,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.apply.refining import RefinedProblem
     from quasiharmonic.cli.arguments import Commands
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
-    from quasiharmonic.refinement import RefinedProblem
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "refine",
@@ -43,10 +43,9 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, split, write, report."""
     from quasiharmonic import io
+    from quasiharmonic.apply.refining import refine_problem
+    from quasiharmonic.cli import report
     from quasiharmonic.problem import Problem
-    from quasiharmonic.refinement import refine_problem
-
-    from . import report
 
     output: Path = options.output
     if output.suffix.lower() != ".obj":

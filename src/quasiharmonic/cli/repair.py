@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from . import arguments
+    from quasiharmonic.cli import arguments
 
     parser = commands.add_parser(
         "repair",
@@ -48,11 +48,10 @@ def run(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from quasiharmonic import io
-    from quasiharmonic.certificate import is_injective
-    from quasiharmonic.repairing import repair
-    from quasiharmonic.seams import islands
-
-    from . import progress, report
+    from quasiharmonic.apply.repairing import repair
+    from quasiharmonic.cli import progress, report
+    from quasiharmonic.exact.certificate import is_injective
+    from quasiharmonic.mesh.seams import islands
 
     if options.output.suffix.lower() != ".obj":
         raise ValueError(f"{options.output}: a map with seams is written as .obj")

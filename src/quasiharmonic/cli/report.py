@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quasiharmonic.certificate import Certificate
-    from quasiharmonic.domain import Domain
+    from quasiharmonic.exact.certificate import Certificate
+    from quasiharmonic.problem import Domain
     from quasiharmonic.result import MapResult
 
 

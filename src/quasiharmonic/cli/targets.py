@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from quasiharmonic.io import MeshData
     from quasiharmonic.mesh.reference import Reference
+    from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.problem import Problem
-    from quasiharmonic.refinement import Refined
 
 # That of quasiharmonic.targets.specification, which is not imported to say it.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
@@ -88,9 +88,8 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
         When options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
     from quasiharmonic import io
+    from quasiharmonic.cli import report
     from quasiharmonic.problem import Problem
-
-    from . import report
 
     if options.to is None:
         for name in ("font", "corners", "corner_angle", "cut"):
@@ -125,16 +124,15 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
 def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[NDArray[np.float64]]) -> Posed:
     """Lay the boundary along an outline."""
     from quasiharmonic.arrays import counted
+    from quasiharmonic.cli import report
     from quasiharmonic.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets import boundary_to, filled
 
-    from . import report
-
     facts: dict[str, Any] = {"to": options.to}
     notes = []
     if options.cut:
-        from quasiharmonic.cutting import cut_open
+        from quasiharmonic.apply.cutting import cut_open
 
         with report.about(mesh.source):
             opened = cut_open(mesh.V, mesh.F)
@@ -179,7 +177,8 @@ def _check_room(problem: Problem, to: str) -> None:
 
 def _refine(posed: Posed, reference: Reference | None) -> None:
     """Split edges that stand in the way of a map, until none is known."""
-    from quasiharmonic.refinement import refine, refine_problem
+    from quasiharmonic.apply.refining import refine_problem
+    from quasiharmonic.mesh.refinement import refine
     from quasiharmonic.targets import flattened_edges
 
     before = posed.problem

@@ -29,9 +29,8 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, show."""
     from quasiharmonic import io
+    from quasiharmonic.cli import report
     from quasiharmonic.plot.interactive import show
-
-    from . import report
 
     if options.screenshot is not None:
         report.check_picture("--screenshot", options.screenshot, inputs=(options.input,))

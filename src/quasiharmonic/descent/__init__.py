@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from .alternating import Alternating
-from .base import Descent
-from .lbfgs import LBFGS
-from .newton import Newton
-from .patches import Patches
-from .random_restarts import RandomRestarts
-from .untangling import Untangling
-from .vector_adam import VectorAdam
+from quasiharmonic.descent.alternating import Alternating
+from quasiharmonic.descent.base import Descent
+from quasiharmonic.descent.lbfgs import LBFGS
+from quasiharmonic.descent.newton import Newton
+from quasiharmonic.descent.patches import Patches
+from quasiharmonic.descent.random_restarts import RandomRestarts
+from quasiharmonic.descent.untangling import Untangling
+from quasiharmonic.descent.vector_adam import VectorAdam
 
 __all__ = ["LBFGS", "Alternating", "Descent", "Newton", "Patches", "RandomRestarts", "Untangling", "VectorAdam"]

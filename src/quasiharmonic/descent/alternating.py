@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from quasiharmonic.descent.base import Iterates, TensorDescent
-from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.tensor import own_tensor
+from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import own_tensor
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_type_hints
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, whole_number
+from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.problem import Problem
 
 Iterates: TypeAlias = Generator[Iterate, None, bool]

@@ -15,9 +15,9 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, work
 from quasiharmonic.descent.base import FunctionalDescent, Iterates
-from quasiharmonic.line_search import backtrack
+from quasiharmonic.energy.line_search import backtrack
+from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.objective import Iterate, Objective
 
 # Pairs of steps and changes of gradient that are remembered.
 _MEMORY = 10

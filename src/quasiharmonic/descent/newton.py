@@ -23,10 +23,10 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.descent.base import Iterates, TensorDescent
-from quasiharmonic.energies import QuadraticForm
+from quasiharmonic.energy.energies import QuadraticForm
+from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.newton_system import NewtonSystem
-from quasiharmonic.objective import Iterate, Objective
 
 _FIRST_DAMPING = 1e-2
 _MOST_DAMPING = 1e12

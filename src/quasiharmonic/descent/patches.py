@@ -13,11 +13,11 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
-from quasiharmonic.certificate import flipped_triangles
 from quasiharmonic.descent.base import Iterates, VertexDescent
 from quasiharmonic.descent.untangling import untangled
+from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.problem import Problem
 
 # More flips than this are no matter for local repair, and larger patches are no patches.

@@ -18,18 +18,18 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, whole_number
-from quasiharmonic.certificate import flipped_triangles
-from quasiharmonic.deformation_energy import signed_areas
 from quasiharmonic.descent.base import Iterates, VertexDescent
 from quasiharmonic.descent.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around
 from quasiharmonic.descent.reweighting import reweighted
 from quasiharmonic.descent.untangling import GRADINGS, untangled
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.energy.deformation import signed_areas
+from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import TANH
 from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.reference import ReferenceMesh
-from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.problem import Problem
-from quasiharmonic.tensor import TANH
 
 Generator: TypeAlias = np.random.Generator
 

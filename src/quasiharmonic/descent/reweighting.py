@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray
-from quasiharmonic.deformation_energy import signed_areas
 from quasiharmonic.descent.patches import Patch, last_untangled
 from quasiharmonic.descent.untangling import GRADINGS
+from quasiharmonic.energy.deformation import signed_areas
 
 Generator = np.random.Generator
 

@@ -22,15 +22,15 @@ from typing import ClassVar
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, whole_number
-from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.descent.base import Iterates, VertexDescent
-from quasiharmonic.energies import Deformation, Isotropic
-from quasiharmonic.laplacian import Laplacian
-from quasiharmonic.line_search import backtrack, extend
+from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energy.energies import Deformation, Isotropic
+from quasiharmonic.energy.line_search import backtrack, extend
+from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.newton_system import NewtonSystem
-from quasiharmonic.objective import Iterate, Objective
 
 # Powers of the boundary edges' lengths, tried in turn.
 GRADINGS = 0.5, 0.0, 1.0

@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 
 from quasiharmonic.descent.base import FunctionalDescent, Iterates
+from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.reference import blocks
-from quasiharmonic.objective import Iterate, Objective
 
 # Less momentum than Adam's usual 0.9 / 0.999 is the largest single gain: the landscape changes as fast as
 # the map unfolds, and old gradients point to where the folds were.

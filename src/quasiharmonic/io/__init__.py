@@ -8,16 +8,16 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from .atomic import check_writable, write_whole
-from .errors import MeshFileError, OutputError
-from .handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
-from .meshdata import MeshData, map_of, vertex_places
-from .obj import read_obj, write_obj
-from .off import read_off, write_off
-from .per_triangle import FORMATS as PER_TRIANGLE_FORMATS
-from .per_triangle import write_per_triangle
-from .refined import refined_mesh
-from .seamed import cut_at_seams, without_idle
+from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.io.errors import MeshFileError, OutputError
+from quasiharmonic.io.handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
+from quasiharmonic.io.meshdata import MeshData, map_of, vertex_places
+from quasiharmonic.io.obj import read_obj, write_obj
+from quasiharmonic.io.off import read_off, write_off
+from quasiharmonic.io.per_triangle import FORMATS as PER_TRIANGLE_FORMATS
+from quasiharmonic.io.per_triangle import write_per_triangle
+from quasiharmonic.io.refined import refined_mesh
+from quasiharmonic.io.seamed import cut_at_seams, without_idle
 
 __all__ = [
     "PER_TRIANGLE_FORMATS",

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from .errors import OutputError
+from quasiharmonic.io.errors import OutputError
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, named
-
-from .atomic import check_writable, write_whole
-from .errors import MeshFileError
-from .gmsh import read_gmsh
-from .legacy_vtk import read_legacy_vtk
-from .meshdata import is_planar
-from .meshparts import MeshParts
-from .vtu import read_vtu
+from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.gmsh import read_gmsh
+from quasiharmonic.io.legacy_vtk import read_legacy_vtk
+from quasiharmonic.io.meshdata import is_planar
+from quasiharmonic.io.meshparts import MeshParts
+from quasiharmonic.io.vtu import read_vtu
 
 _READERS = {".msh": read_gmsh, ".vtk": read_legacy_vtk, ".vtu": read_vtu}
 # What readers meet in files that are damaged.

@@ -8,9 +8,8 @@ from functools import partial
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-
-from .meshparts import MeshParts
-from .tables import Table, TableReader, replaced, stacked
+from quasiharmonic.io.meshparts import MeshParts
+from quasiharmonic.io.tables import Table, TableReader, replaced, stacked
 
 _LINE, _TRIANGLE, _POINT = 1, 2, 15
 _CORNERS = {_LINE: 2, _TRIANGLE: 3, _POINT: 1}

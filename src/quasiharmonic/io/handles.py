@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.meshdata import MeshData, vertex_places
+from quasiharmonic.io.obj import read_obj
+from quasiharmonic.io.textual import integer, read_text
 from quasiharmonic.mesh.topology import boundary_edges
-
-from .errors import MeshFileError
-from .meshdata import MeshData, vertex_places
-from .obj import read_obj
-from .textual import integer, read_text
 
 
 class ProblemArrays(NamedTuple):

@@ -8,10 +8,9 @@ from functools import partial
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-
-from .meshparts import MeshParts
-from .tables import Table, TableReader, replaced
-from .vtk_cells import triangles
+from quasiharmonic.io.meshparts import MeshParts
+from quasiharmonic.io.tables import Table, TableReader, replaced
+from quasiharmonic.io.vtk_cells import triangles
 
 _KINDS = {
     b"char": "i1",

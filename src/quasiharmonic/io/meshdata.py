@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import FloatArray, IntArray, named
-
-from .errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import write_whole
-from .meshdata import MeshData
-from .objlines import REFUSED, read_obj_lines
-from .textual import integer_table, number_table, read_text
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.meshdata import MeshData
+from quasiharmonic.io.objlines import REFUSED, read_obj_lines
+from quasiharmonic.io.textual import integer_table, number_table, read_text
 
 # Kinds of line, for the reader that takes all lines of a kind at once.
 _BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)

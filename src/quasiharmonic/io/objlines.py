@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import MeshFileError
-from .meshdata import MeshData
-from .textual import integer, number, shown
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.meshdata import MeshData
+from quasiharmonic.io.textual import integer, number, shown
 
 # Statements whose geometry would be lost, and elements that point to vertices in ways not kept.
 REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"call"}

@@ -11,11 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-
-from .atomic import write_whole
-from .errors import MeshFileError
-from .meshdata import MeshData
-from .textual import integer, integer_table, number, number_table, read_text, shown
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.meshdata import MeshData
+from quasiharmonic.io.textual import integer, integer_table, number, number_table, read_text, shown
 
 # Texture coordinates, colours and normals stand behind the coordinates, so they can be passed over.
 _HEADER = re.compile(rb"(?:ST)?C?N?OFF")

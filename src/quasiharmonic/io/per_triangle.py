@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import FloatArray
-
-from .atomic import write_whole
-from .errors import OutputError
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.errors import OutputError
 
 #: Suffixes that `write_per_triangle` knows.
 FORMATS = (".csv", ".npz", ".ply")

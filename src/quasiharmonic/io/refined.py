@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-
-from .meshdata import MeshData
+from quasiharmonic.io.meshdata import MeshData
 
 if TYPE_CHECKING:
-    from quasiharmonic.refinement import Refined
+    from quasiharmonic.mesh.refinement import Refined
 
 
 def refined_mesh(mesh: MeshData, refined: Refined, uv: FloatArray) -> tuple[MeshData, IntArray]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.seams import islands
-
-from .meshdata import MeshData, check_mapped, map_of, vertex_places
+from quasiharmonic.io.meshdata import MeshData, check_mapped, map_of, vertex_places
+from quasiharmonic.mesh.seams import islands
 
 
 def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:

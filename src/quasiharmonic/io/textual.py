@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError
 
 # What each kind of file that is not text begins with.
 _FOREIGN = {

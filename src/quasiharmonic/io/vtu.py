@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import FloatArray
-
-from .meshparts import MeshParts
-from .tables import TableReader, replaced
-from .vtk_cells import triangles
+from quasiharmonic.io.meshparts import MeshParts
+from quasiharmonic.io.tables import TableReader, replaced
+from quasiharmonic.io.vtk_cells import triangles
 
 _KINDS = {
     **{f"Int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},

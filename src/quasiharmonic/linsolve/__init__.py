@@ -15,8 +15,8 @@ from importlib import import_module
 
 from numpy.typing import ArrayLike
 
-from .base import LinearSolver
-from .errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver
+from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver"]
 

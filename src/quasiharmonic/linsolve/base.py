@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import FloatArray
-
-from .errors import NotPositiveDefinite
-from .guard import ResidualTest
+from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.linsolve.guard import ResidualTest
 
 Pattern = NDArray[np.int32]
 

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray
-
-from .base import LinearSolver
-from .errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver
+from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
 # Up to this many unknowns of a planar mesh the supernodal code does not repay its overhead (18 ms against 30 at 20k).
 _SIMPLICIAL_BELOW = 50_000

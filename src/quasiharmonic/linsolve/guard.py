@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import FloatArray
-
-from .errors import NotPositiveDefinite
+from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
 # Largest residual that a backward stable factorisation can be held responsible for, relative to |A||x| + |b| after
 # scaling the diagonal to one. Cholesky stays near 1e-15; a factor that is wrong is wrong in the first digits.

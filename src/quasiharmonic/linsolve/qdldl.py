@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray
-
-from .base import LinearSolver
-from .errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver
+from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
 
 class Qdldl(LinearSolver):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.measures import Distortion, distortion
+from quasiharmonic.energy.measures import Distortion, distortion
 from quasiharmonic.plot.canvas import INK, RED, as_map, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
 from quasiharmonic.plot.shading import lit, view
 
@@ -89,7 +89,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     uv : (n, 2) float
         The map.
     measure : str
-        One of `quasiharmonic.measures.MEASURES`; `quasiharmonic.Distortion` says what each is.
+        One of `quasiharmonic.energy.measures.MEASURES`; `quasiharmonic.Distortion` says what each is.
 
     Returns
     -------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.measures import distortion
+from quasiharmonic.energy.measures import distortion
 from quasiharmonic.plot.canvas import RED, as_map, as_mesh
 
 #: Measures of distortion that the window offers as colours.

@@ -12,11 +12,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.domain import Domain
 from quasiharmonic.mesh.coarsening import coarsen
+from quasiharmonic.mesh.prolongation import prolong
 from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.problem import Problem
-from quasiharmonic.prolongation import prolong
+from quasiharmonic.problem import Domain, Problem
 
 # The coarse mesh has an eighth of the vertices or so many, whichever is less, but some for every fixed vertex: as many
 # as it takes to grade the mesh from the boundary, whose vertices all stay, to the inside.

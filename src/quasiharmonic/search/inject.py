@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, map_array, named, whole_number
-from quasiharmonic.certificate import certify
-from quasiharmonic.energies import Energy
+from quasiharmonic.energy.energies import Energy
+from quasiharmonic.energy.polishing import energy_named, polished
+from quasiharmonic.exact.certificate import certify
+from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.objective import Objective
-from quasiharmonic.polishing import energy_named, polished
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.stages import Search, Stages
 from quasiharmonic.search.strategy import stages_of
-from quasiharmonic.tensor import TANH
 
 
 def injective_map(

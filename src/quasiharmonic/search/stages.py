@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
-from quasiharmonic.certificate import flipped_triangles
 from quasiharmonic.descent import Descent, Newton, Patches, Untangling, VectorAdam
 from quasiharmonic.descent.base import SoFar, Steps
+from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import TANH, TensorField, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.objective import Iterate, Objective
-from quasiharmonic.polishing import polish_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import Snapshot, Stage, Status, Step
 from quasiharmonic.search.coarse import coarse_mesh
-from quasiharmonic.tensor import TANH, TensorField, own_tensor
 
 if TYPE_CHECKING:
-    from quasiharmonic.diagnosis import Diagnosis
+    from quasiharmonic.exact.diagnosis import Diagnosis
 
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
@@ -207,7 +207,7 @@ class Search:
 
     def _examine(self) -> Diagnosis:
         """Whether anything forbids a map; found out once."""
-        from quasiharmonic.diagnosis import diagnose
+        from quasiharmonic.exact.diagnosis import diagnose
 
         if self.diagnosis is None:
             self.diagnosis = diagnose(self.problem)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.boundary_curves import judge_loops, listed
-from quasiharmonic.domain import Domain
+from quasiharmonic.exact.loops import judge_loops, listed
+from quasiharmonic.problem import Domain
 from quasiharmonic.targets.chords import chords_of
 from quasiharmonic.targets.contours import from_corner, in_unit
 from quasiharmonic.targets.correspondence import arc, seen_flat

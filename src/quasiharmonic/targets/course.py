@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.boundary_curves import contacts
+from quasiharmonic.exact.loops import contacts
 from quasiharmonic.targets.chords import STRAIGHT, flat_chords
 from quasiharmonic.targets.correspondence import Held, at, best_start, off, places_along
 from quasiharmonic.targets.room import make_room

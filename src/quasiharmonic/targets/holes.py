@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
-from quasiharmonic.domain import Domain
-from quasiharmonic.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.problem import Domain
 from quasiharmonic.targets.contours import as_complex
 
 # Choices for a loop that are looked into closely.

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.boundary_curves import contacts, winding
-from quasiharmonic.predicates import SegmentRelation, orientation
+from quasiharmonic.exact.loops import contacts, winding
+from quasiharmonic.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.targets.contours import checked, distinct, in_unit, signed_area
 
 # Meeting sides that are looked for; the first of them is told.

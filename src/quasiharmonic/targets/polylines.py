@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.boundary_curves import listed
+from quasiharmonic.exact.loops import listed
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import number, read_text
 from quasiharmonic.targets.contours import MOST_POINTS, distinct

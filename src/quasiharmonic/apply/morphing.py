@@ -1,0 +1,163 @@
+"""Morphing of planar meshes: the boundary has moved, give me a valid interior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.energy.energies import Energy
+from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.problem import Problem
+from quasiharmonic.result import MapResult, Step
+from quasiharmonic.search.inject import solve
+
+
+@dataclass(frozen=True, eq=False)
+class Morphed:
+    """A planar mesh after its boundary has moved.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        All vertices, those in no triangle where they were.
+    result : MapResult
+        The search: status, certificate, stages, seconds. Its ``uv`` has the vertices that triangles use, in
+        their order.
+    quality_before, quality_after : (f,) float64
+        `quasiharmonic.energy.measures.mean_ratio` of every triangle: 1 where it is equilateral, 0 where it has no
+        area, negative where it is inverted.
+    """
+
+    points: FloatArray
+    result: MapResult
+    quality_before: FloatArray
+    quality_after: FloatArray
+
+    @property
+    def valid(self) -> bool:
+        """Whether every triangle is strictly positive, decided exactly."""
+        return self.result.injective
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        sides = (("quality_before", self.quality_before), ("quality_after", self.quality_after))
+        return {
+            **self.result.to_dict(),
+            **{
+                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
+                for name, quality in sides
+            },
+        }
+
+
+def morph(
+    points: ArrayLike,
+    F: ArrayLike,
+    moved: ArrayLike,
+    positions: ArrayLike,
+    *,
+    energy: str | Energy | None = "symmetric-dirichlet",
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> Morphed:
+    """Move some vertices of a planar mesh and place the others such that no triangle is inverted.
+
+    Parameters
+    ----------
+    points : (n, 2) array
+        The mesh as it is, valid.
+    F : (f, 3) array of int
+        Triangles, wound either way.
+    moved : (k,) array of int
+        Vertices that go somewhere else: of the boundary, or inside. Boundary vertices not among them stay.
+    positions : (k, 2) array
+        Where they go.
+    energy : str, Energy or None
+        What the placement minimises; see `quasiharmonic.polish`. The default keeps shapes and sizes of the
+        triangles, so that a graded mesh stays graded. None takes the first valid mesh.
+    max_iterations : int
+        Linear solves to spend at most on finding a valid mesh.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every iteration.
+
+    Returns
+    -------
+    Morphed
+        When no valid mesh was found, ``result.status`` says why.
+
+    Raises
+    ------
+    ValueError
+        When the input is malformed (see `Problem`), a triangle has no area, or a vertex to move is in none.
+
+    Examples
+    --------
+    The upper side of a square pushed halfway down in its middle:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import morph
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(12, 12)
+    >>> upper = np.flatnonzero(points[:, 1] == 1)
+    >>> x = points[upper, 0]
+    >>> morphed = morph(points, F, upper, np.stack([x, 1 - 0.5 * np.sin(np.pi * x) ** 4], axis=1))
+    >>> morphed.valid, bool(morphed.quality_after.min() > 0.25)
+    (True, True)
+    """
+    points, F = np.array(points, dtype=np.float64), np.asarray(F)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points must have shape (n, 2), not {points.shape}")
+    if F.ndim != 2 or F.shape[1] != 3 or F.dtype.kind not in "iu" or not F.size:
+        raise ValueError(f"F must be an integer array of shape (f, 3) with f > 0, not {F.dtype} of shape {F.shape}")
+    if F.min() < 0 or F.max() >= len(points):
+        raise ValueError(f"F refers to vertices beyond the {len(points)} that there are")
+    F = F.astype(np.int64)
+    before = mean_ratio(points, F)
+    flat = np.flatnonzero(before == 0)
+    if flat.size:
+        raise ValueError(f"{named('triangle', 'triangles', flat)} without area: repair the mesh first")
+    turned = before < 0
+    F[turned] = F[turned][:, [0, 2, 1]]
+
+    fixed, target = _placed(points, F, moved, positions)
+    used = np.unique(F)
+    problem = Problem(points[used], np.searchsorted(used, F), np.searchsorted(used, fixed), target)
+    result = solve(
+        problem,
+        # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
+        strategy="quality",
+        polish=energy,
+        max_iterations=max_iterations,
+        linear_solver=linear_solver,
+        callback=callback,
+    )
+    after = points.copy()
+    after[used] = result.uv
+    return Morphed(after, result, np.abs(before), mean_ratio(after, F))
+
+
+def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayLike) -> tuple[IntArray, FloatArray]:
+    """Return the vertices that are given, those moved and the rest of the boundary, and where they go."""
+    given, target = np.asarray(moved), np.asarray(positions, dtype=np.float64)
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+        raise ValueError(f"moved must be a list of vertex indices, not {given.dtype} of shape {given.shape}")
+    given = given.astype(np.int64)
+    if target.shape != (len(given), 2):
+        raise ValueError(f"positions must have shape ({len(given)}, 2), not {target.shape}")
+    wrong = np.flatnonzero((given < 0) | (given >= len(points)))
+    if wrong.size:
+        raise ValueError(f"moved refers to vertex {given[wrong[0]]}, but there are {len(points)}")
+    idle = given[~np.isin(given, F)]
+    if idle.size:
+        raise ValueError(f"{named('vertex', 'vertices', idle)} to be moved in no triangle")
+    rest = np.setdiff1d(boundary_edges(F, len(points)), given)
+    return np.concatenate([given, rest]), np.concatenate([target, points[rest]])

@@ -1,0 +1,259 @@
+"""Repair of a map with inverted triangles: its boundary stays, and as much of its interior as can.
+
+A map comes apart into islands at its seams, and each is repaired on its own (`IslandRepair`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apply.island_repair import IslandRepair
+from quasiharmonic.arrays import FloatArray, IntArray, counted, named, whole_number
+from quasiharmonic.exact.certificate import certify
+from quasiharmonic.exact.diagnosis import Diagnosis
+from quasiharmonic.mesh.seams import Island, islands
+from quasiharmonic.result import Step
+
+
+@dataclass(frozen=True, eq=False)
+class RepairedIsland:
+    """What became of an island; numbers are the mesh's, from 0.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Its triangles, ascending.
+    inverted_before, inverted : (a,), (b,) int64
+        Those that were not strictly positive, and those that are still not.
+    moved : (c,) int64
+        Vertices that are in another place than before.
+    bijective : bool
+        Whether the island, as it now is, covers no place twice. What its boundary overlaps stays so.
+    reason : str
+        Why triangles are still inverted; empty where none is.
+    diagnosis : Diagnosis or None
+        What forbids a map with this boundary, examined where triangles are still inverted.
+    """
+
+    triangles: IntArray
+    inverted_before: IntArray
+    inverted: IntArray
+    moved: IntArray
+    bijective: bool
+    reason: str = ""
+    diagnosis: Diagnosis | None = None
+
+    @property
+    def injective(self) -> bool:
+        """Whether every triangle is strictly positive."""
+        return not self.inverted.size
+
+    def summary(self) -> str:
+        """Say in a sentence what was done."""
+        where = f"island at triangle {self.triangles[0]} ({counted('triangle', 'triangles', len(self.triangles))})"
+        overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
+        if not self.inverted_before.size:
+            return f"{where}: nothing to repair{overlap}"
+        done = (
+            f"{len(self.inverted_before)} inverted before, {len(self.inverted)} now; "
+            f"{counted('vertex', 'vertices', len(self.moved))} moved"
+        )
+        left = f"; {named('triangle', 'triangles', self.inverted)} left. {self.reason}" if self.inverted.size else ""
+        return f"{where}: {done}{overlap}{left}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; of the triangles, the first and how many there are."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "inverted_before": self.inverted_before.tolist(),
+            "inverted": self.inverted.tolist(),
+            "moved": self.moved.tolist(),
+            "reason": self.reason,
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Repaired:
+    """A repaired map.
+
+    Attributes
+    ----------
+    uv : (m, 2) float64
+        Places. Those that no vertex moved from are as they were, to the last bit.
+    FT : (f, 3) int64
+        For every corner the row of ``uv`` it is at: as given, unless a vertex moved from a row that others use.
+        Then it has a new row at the end.
+    islands : tuple of RepairedIsland
+        By their first triangle.
+    """
+
+    uv: FloatArray
+    FT: IntArray
+    islands: tuple[RepairedIsland, ...]
+
+    @property
+    def injective(self) -> bool:
+        """Whether every triangle that has a place is strictly positive, and there is one."""
+        return bool(self.islands) and all(island.injective for island in self.islands)
+
+    @property
+    def moved(self) -> IntArray:
+        """Vertices of the mesh that are in another place than before, ascending."""
+        return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *(island.moved for island in self.islands)]))
+
+    def summary(self) -> str:
+        """What was done, in all and for each island that needed it."""
+        before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
+        lines = [
+            f"{counted('island', 'islands', len(self.islands))}: "
+            f"{counted('triangle', 'triangles', before)} inverted before, {now} now; "
+            f"{counted('vertex', 'vertices', len(self.moved))} moved"
+        ]
+        return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: everything but the map itself."""
+        return {
+            "injective": self.injective,
+            "inverted_before": sum(len(island.inverted_before) for island in self.islands),
+            "inverted": sum(len(island.inverted) for island in self.islands),
+            "moved": len(self.moved),
+            "islands": [island.to_dict() for island in self.islands],
+        }
+
+
+def repair(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    FT: ArrayLike | None = None,
+    whole: bool = False,
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> Repaired:
+    """Right the inverted triangles of a map; the boundary stays, and as much of the interior as can.
+
+    Around inverted triangles, patches of growing size are mapped anew with their boundary held. Of a patch that
+    comes out with all triangles positive, vertices return to where they were as far as that inverts nothing, and the
+    others go where the distortion (symmetric Dirichlet) is least. What a patch cannot do the whole island may.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        The surface.
+    F : (f, 3) array of int
+        Triangles.
+    uv : (m, 2) array
+        The map: places. Interior vertices may be anywhere, even at NaN.
+    FT : (f, 3) array of int, optional
+        For a map with seams, the row of ``uv`` that each corner is at; a triangle with a corner at -1 has no place
+        and is left alone. By default ``F``. See `quasiharmonic.mesh.seams.islands` for what counts as a seam.
+    whole : bool
+        Map every island that has inverted triangles anew as a whole, and polish it.
+    max_iterations : int
+        Linear solves to spend at most on an island as a whole.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every iteration.
+
+    Returns
+    -------
+    Repaired
+        With the map and, island by island, what changed, certified exactly; and why, where triangles are still
+        inverted: that is no exception.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape or dtype, or indices that refer to nothing.
+    KeyboardInterrupt
+        By Ctrl-C.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> uv = V.copy()
+    >>> uv[0] = [0.4, 0.1]
+    >>> result = repair(V, F, uv)
+    >>> len(result.islands[0].inverted_before), result.injective, result.moved.tolist()
+    (2, True, [0])
+    """
+    whole_number("max_iterations", max_iterations, least=1)
+    surface = np.asarray(V, dtype=np.float64)
+    if surface.ndim != 2 or surface.shape[1] not in (2, 3) or not np.isfinite(surface).all():
+        raise ValueError(f"V must be a finite array of shape (n, 2) or (n, 3), not one of {surface.shape}")
+    triangles = np.asarray(F)
+    if triangles.size and triangles.max() >= len(surface):
+        bad = np.flatnonzero((triangles >= len(surface)).any(axis=1))
+        raise ValueError(f"{named('triangle', 'triangles', bad)} refer to vertices outside 0 … {len(surface) - 1}")
+    places = np.array(uv, dtype=np.float64)
+    parts = islands(triangles, places, FT)
+    done = []
+    for island in parts:
+        one = IslandRepair(
+            surface, island, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback
+        )
+        before = island.triangles[one.inverted]
+        if before.size:
+            one.run(whole)
+        certificate = certify(island.F, one.uv)
+        done.append(
+            (
+                one.uv,
+                RepairedIsland(
+                    triangles=island.triangles,
+                    inverted_before=before,
+                    inverted=island.triangles[one.inverted],
+                    moved=np.unique(island.vertices[one.moved]),
+                    bijective=bool(certificate.bijective),
+                    reason="" if certificate.injective else one.reason,
+                    diagnosis=None if certificate.injective else one.diagnosis,
+                ),
+            )
+        )
+    rows = np.array(triangles if FT is None else FT, dtype=np.int64)
+    places, rows = _written(places, rows, parts, [new for new, _ in done])
+    return Repaired(places, rows, tuple(report for _, report in done))
+
+
+def _written(
+    uv: FloatArray, FT: IntArray, parts: Sequence[Island], places: Sequence[FloatArray]
+) -> tuple[FloatArray, IntArray]:
+    """Bring the islands' places into the rows of the map, new rows where others use the same."""
+    # Each vertex of each island by a number of its own; the last one is for corners that have a place alone.
+    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    owner = np.full(FT.shape, start[-1])
+    for offset, part in zip(start, parts, strict=False):
+        owner[part.triangles] = part.F + offset
+    nowhere = np.full((1, 2), np.nan)
+    before = np.concatenate([*(part.uv for part in parts), nowhere])
+    now = np.concatenate([*places, nowhere])
+    given = FT >= 0
+    row, vertex = np.unique(np.stack([FT[given], owner[given]], axis=1), axis=0).T
+    moved = (now[vertex] != before[vertex]).any(axis=1) & np.isfinite(now[vertex]).all(axis=1)
+    # A row goes along where all that use it go to the same place.
+    first = np.searchsorted(row, row)
+    apart = (now[vertex] != now[vertex[first]]).any(axis=1)
+    together = ~np.isin(row, row[apart])
+    uv, FT = uv.copy(), FT.copy()
+    uv[row[moved & together]] = now[vertex[moved & together]]
+    row, vertex = row[moved & ~together], vertex[moved & ~together]
+    if row.size:
+        # Row and vertex in one number, ascending.
+        wanted, corner = row * len(now) + vertex, FT * len(now) + owner
+        at = np.minimum(np.searchsorted(wanted, corner), row.size - 1)
+        FT = np.where(wanted[at] == corner, len(uv) + at, FT)
+    return np.concatenate([uv, now[vertex]]), FT

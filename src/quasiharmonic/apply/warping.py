@@ -1,0 +1,307 @@
+"""Warping of pictures by landmarks, with their border or along any planar map, with no folds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.apply.inverse import InverseMap
+from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.energy.energies import Energy
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.result import MapResult
+from quasiharmonic.search.inject import injective_map
+
+# Cells along the longer side of a picture, and at least along the shorter, so that there is a way past landmarks.
+_ALONG, _ACROSS = 48, 6
+# Pixels drawn at a time: what is in work stays in the cache.
+_PIXELS = 1 << 15
+# Triangles with more pixels than this on average are filled one by one.
+_LARGE = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Warped:
+    """A warped picture and the map that warped it.
+
+    Attributes
+    ----------
+    image : array
+        Of the picture's shape and dtype.
+    points : (n, 2) float64
+        Vertices of a mesh of the picture, x to the right and y down, in pixels.
+    F : (f, 3) int64
+        Its triangles.
+    moved : (n, 2) float64
+        Where they go.
+    result : MapResult
+        With the certificate; the warp folds nowhere if it is bijective.
+    """
+
+    image: NDArray[Any]
+    points: FloatArray
+    F: IntArray
+    moved: FloatArray
+    result: MapResult
+
+
+def warp_by_landmarks(
+    image: ArrayLike,
+    landmarks: ArrayLike,
+    moved: ArrayLike,
+    *,
+    energy: str | Energy = "symmetric-dirichlet",
+) -> Warped:
+    """Warp a picture such that landmarks go where they are told and nothing folds.
+
+    The border stays, unless landmarks are on it: then it goes along, straight between one and the next. Corners count
+    as landmarks that stay, if they are not given.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, channels) array
+        Any real dtype.
+    landmarks : (k, 2) array
+        Points of the picture, x to the right and y down; the centre of the first pixel is (0, 0), and of the last
+        (width − 1, height − 1).
+    moved : (k, 2) array
+        Where they go. The picture keeps its size: what goes beyond is cut off, what nothing comes to is 0.
+    energy : str or Energy
+        Distortion that is lowered once the map is free of folds; see `quasiharmonic.polish`.
+
+    Returns
+    -------
+    Warped
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape, a landmark is outside of the picture, before or after, or stands for two,
+        or the moved border meets itself.
+    RuntimeError
+        When no map without folds was found.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import warp_by_landmarks
+    >>> image = np.zeros((40, 60), dtype=np.uint8)
+    >>> image[20, 30] = 255
+    >>> warped = warp_by_landmarks(image, [[30, 20]], [[45, 10]])
+    >>> np.unravel_index(warped.image.argmax(), image.shape)
+    (np.int64(10), np.int64(45))
+    """
+    picture = _picture(image)
+    height, width = picture.shape[:2]
+    before, after = _landmarks(landmarks, "landmarks"), _landmarks(moved, "moved")
+    if before.shape != after.shape:
+        raise ValueError(f"moved must have as many rows as landmarks, {len(before)}, not {len(after)}")
+    size = np.array((width - 1, height - 1))
+    _check_inside("landmarks", before, ((before >= 0) & (before <= size)).all(axis=1), size)
+    edge = ((before == 0) | (before == size)).any(axis=1)
+    if np.array_equal(before[edge], after[edge]):
+        _check_inside("moved", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
+    points, F = _mesh(before, width, height)
+    own = len(points) - len(before) + np.arange(len(before))
+    border = np.setdiff1d(boundary_edges(F, len(points)), own)
+    target = np.concatenate([points[border] + _carried(points[border], before[edge], after[edge], size), after])
+    # Landmarks can pass each other: si-log on the picture's own triangles spreads what that costs.
+    result = injective_map(points, F, np.concatenate([border, own]), target, strategy="quality", polish=energy)
+    if result.certificate.crossings.size:
+        raise ValueError("moved: the border that goes along with the landmarks on it crosses itself")
+    if not result.injective:
+        raise RuntimeError(
+            "no warp without folds was found: landmarks that go far past each other or the border leave no room "
+            f"between them. Move them less far, or give more of them along the way. ({result.status.value})"
+        )
+    return Warped(warp_along(picture, points, F, result.uv), points, F, result.uv, result)
+
+
+def warp_along(
+    image: ArrayLike, points: ArrayLike, F: ArrayLike, moved: ArrayLike, *, shape: tuple[int, int] | None = None
+) -> NDArray[Any]:
+    """Draw a picture where a planar map takes it.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, channels) array
+        Any real dtype.
+    points : (n, 2) array
+        A mesh over the picture or a part of it, in pixels.
+    F : (f, 3) array of int
+        Its triangles.
+    moved : (n, 2) array
+        Where the mesh goes, bijectively.
+    shape : (int, int), optional
+        Height and width of the result; the picture's by default.
+
+    Returns
+    -------
+    array
+        Of the picture's dtype. Each pixel is taken from where it comes from, between pixels linearly; those
+        outside the moved mesh are 0.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape, a point is not finite, or the map is not bijective: the message says
+        which and why.
+    """
+    from scipy.ndimage import map_coordinates
+
+    picture = _picture(image)
+    height, width = picture.shape[:2] if shape is None else shape
+    if height < 1 or width < 1:
+        raise ValueError(f"shape must be positive, not {shape}")
+    for name, rows in (("points", points), ("moved", moved)):
+        lost = np.flatnonzero(
+            ~np.isfinite(np.asarray(rows, dtype=np.float64)).reshape(len(np.asarray(rows)), -1).all(1)
+        )
+        if lost.size:
+            raise ValueError(f"{name} is not finite at {named('vertex', 'vertices', lost)}")
+    inverse = InverseMap(points, F, moved)
+    source = _sources(inverse, height, width)
+    channels = picture.reshape(*picture.shape[:2], -1)
+    layers = [np.ascontiguousarray(channels[..., k], dtype=_drawable(picture.dtype)) for k in range(channels.shape[2])]
+    drawn = np.zeros((height * width, len(layers)), dtype=picture.dtype)
+    for start in range(0, height * width, _PIXELS):
+        here = source[start : start + _PIXELS]
+        found = np.flatnonzero(np.isfinite(here[:, 0]))
+        places = np.ascontiguousarray(here[found, ::-1].T)
+        for channel, layer in enumerate(layers):
+            values = map_coordinates(layer, places, output=np.float64, order=1, mode="nearest")
+            if picture.dtype.kind in "iub":
+                values = np.rint(values)
+            drawn[start + found, channel] = values.astype(picture.dtype)
+    return drawn.reshape(height, width, *picture.shape[2:])
+
+
+def _picture(image: ArrayLike) -> NDArray[Any]:
+    picture = np.asarray(image)
+    if picture.ndim not in (2, 3) or min(picture.shape) < 1 or min(picture.shape[:2]) < 2:
+        raise ValueError(
+            f"image must have shape (height, width) or (height, width, channels), at least 2 × 2, not {picture.shape}"
+        )
+    if picture.dtype.kind not in "iubf":
+        raise ValueError(f"image must hold real numbers, not {picture.dtype}")
+    return picture
+
+
+def _sources(inverse: InverseMap, height: int, width: int) -> FloatArray:
+    """Where each pixel comes from, row by row, NaN where from nowhere; (height · width, 2)."""
+    filled = np.full((height, width, 2), np.nan)
+    if height * width > _LARGE * len(inverse.F):
+        _fill(inverse, filled)
+    source = filled.reshape(-1, 2)
+    # What is left lies on edges, so close to one that rounding could tell either side, or outside: decided exactly.
+    left = np.flatnonzero(np.isnan(source[:, 0]))
+    for start in range(0, left.size, _PIXELS):
+        here = left[start : start + _PIXELS]
+        y, x = np.divmod(here, width)
+        source[here] = inverse.surface(inverse.locate(np.stack([x, y], axis=1)))
+    return source
+
+
+def _fill(inverse: InverseMap, source: FloatArray) -> None:
+    """Enter where pixels come from that lie inside triangles beyond any doubt; on each the map is affine."""
+    height, width = source.shape[:2]
+    corners, origins = inverse.uv[inverse.F], inverse.V[inverse.F]
+    first = np.clip(np.ceil(corners.min(axis=1)), 0, (width, height)).astype(np.int64)
+    last = np.clip(np.floor(corners.max(axis=1)), -1, (width - 1, height - 1)).astype(np.int64)
+    sides = corners[:, 1:] - corners[:, :1]
+    area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
+    # Of a barycentric coordinate, by twice as much as rounding can do.
+    extent = np.abs(sides).max(axis=1) * 2
+    doubt = 2.0**-48 * extent[:, 0] * extent[:, 1] / area
+    for t in np.flatnonzero((first <= last).all(axis=1) & (doubt < 2.0**-30)).tolist():
+        (x0, y0), (x1, y1) = first[t].tolist(), last[t].tolist()
+        dx = np.arange(x0, x1 + 1) - corners[t, 0, 0]
+        dy = (np.arange(y0, y1 + 1) - corners[t, 0, 1])[:, None]
+        (ax, ay), (bx, by) = (sides[t] / area[t]).tolist()
+        second, third = dx * by - dy * bx, dy * ax - dx * ay
+        inside = (second > doubt[t]) & (third > doubt[t]) & (second + third < 1 - 2 * doubt[t])
+        along, across = origins[t, 1:] - origins[t, 0]
+        place = source[y0 : y1 + 1, x0 : x1 + 1]
+        place[inside] = origins[t, 0] + second[inside][:, None] * along + third[inside][:, None] * across
+
+
+def _drawable(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """A type that SciPy draws from, without loss."""
+    return kind if kind.kind in "iu" or kind in (np.float32, np.float64) else np.dtype(np.float64)
+
+
+def _landmarks(points: ArrayLike, name: str) -> FloatArray:
+    """Landmarks, checked to be points apart."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.shape == (0,):
+        array = array.reshape(0, 2)
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"{name} must have shape (k, 2), a row (x, y) for each, not {array.shape}")
+    lost = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if lost.size:
+        raise ValueError(f"{name}: {named('point', 'points', lost)} not finite")
+    _, first, count = np.unique(array, axis=0, return_index=True, return_counts=True)
+    if (count > 1).any():
+        place = array[first[count > 1][0]]
+        same = np.flatnonzero((array == place).all(axis=1))
+        raise ValueError(f"{name}: {named('point', 'points', same)} are at the same place, {tuple(place.tolist())}")
+    return array
+
+
+def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) -> None:
+    """Refuse landmarks outside of a picture."""
+    outside = np.flatnonzero(~inside)
+    if outside.size:
+        raise ValueError(
+            f"{name}: {named('point', 'points', outside)} not inside the picture, 0 < x < {size[0]} to the right and "
+            f"0 < y < {size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
+        )
+
+
+def _carried(border: FloatArray, before: FloatArray, after: FloatArray, size: IntArray) -> FloatArray:
+    """How far points of a picture's border go along with landmarks on it; (m, 2)."""
+    corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=np.float64)
+    given = (corners[:, None] == before).all(axis=2).any(axis=1)
+    knots = np.concatenate([corners[~given], before])
+    way = np.concatenate([np.zeros((np.count_nonzero(~given), 2)), after - before])
+    around = 2.0 * size.sum()
+    at, where = _along(knots, size), _along(border, size)
+    return np.stack([np.interp(where, at, way[:, axis], period=around) for axis in (0, 1)], axis=1)
+
+
+def _along(border: FloatArray, size: IntArray) -> FloatArray:
+    """How far around a picture points of its border are, from the first pixel to the right; (m,)."""
+    (x, y), (width, height) = border.T, size
+    return np.select(
+        [y == 0, x == width, y == height], [x, width + y, 2 * width + height - x], 2 * (width + height) - y
+    )
+
+
+def _mesh(landmarks: FloatArray, width: int, height: int) -> tuple[FloatArray, IntArray]:
+    """Triangulate a picture by a grid that makes room for landmarks, which come last."""
+    from scipy.spatial import Delaunay, cKDTree
+
+    spacing = max(width - 1, height - 1) / _ALONG
+    size = (width - 1, height - 1)
+    x, y = (np.linspace(0, side, max(_ACROSS, round(side / spacing)) + 1) for side in size)
+    grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
+    sides, landmark_sides = ((p == 0) | (p == size) for p in (grid, landmarks))
+    near = np.zeros(len(grid), dtype=bool)
+    if len(landmarks):
+        near = cKDTree(landmarks).query(grid)[0] < 0.5 * spacing
+    # Points of the border make room only for landmarks that are on it themselves, corners only for one at the corner.
+    if landmark_sides.any():
+        distance = cKDTree(landmarks[landmark_sides.any(axis=1)]).query(grid)[0]
+        near &= ~sides.any(axis=1) | (distance < np.where(sides.all(axis=1), 1e-300, 0.5 * spacing))
+    else:
+        near &= ~sides.any(axis=1)
+    kept = grid[~near]
+    points = np.concatenate([kept, landmarks])
+    F = Delaunay(points).simplices.astype(np.int64)
+    a, b, c = points[F].transpose(1, 0, 2)
+    turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
+    F[turned] = F[turned, ::-1]
+    return points, F

@@ -1,0 +1,1 @@
+"""Deformation energies: densities, their integral over a surface, and Newton steps down it."""

@@ -1,0 +1,170 @@
+"""A deformation energy integrated over a surface, as a function of the map (§11).
+
+The mean density, weighted by area (and by triangle, if asked), with the map brought to the surface's
+scale:  ``E(w) = Σⱼ cⱼ mⱼ φ(pⱼ, qⱼ) / Σⱼ mⱼ``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.arrays import ComplexArray, FloatArray, named, real_array
+from quasiharmonic.energy.energies import Deformation, Energy, QuadraticForm
+from quasiharmonic.mesh.shapes import rest_shapes
+
+
+class DeformationEnergy:
+    """An energy on a mesh.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles
+        are counterclockwise: the rest shapes have no sign.
+    F : (f, 3) array of int
+        Triangles.
+    energy : Energy
+    area : float, optional
+        Area of the maps to come, which scales them to the surface's area as the paper does: p and q are
+        multiplied by ``√(Σ m / area)``. It does not change while the boundary is fixed. By default maps
+        are measured as they are.
+    weights : (f,) array, optional
+        A factor for each triangle's energy, not negative; 1 by default.
+    rest_F : (f, 3) array of int, optional
+        Rows of ``V`` between which each triangle lies at rest, where it is not those of ``F``: rest triangles
+        need not fit together.
+
+    Raises
+    ------
+    ValueError
+        When rest triangles have no area, which leaves their distortion undefined; when weights have the
+        wrong shape or are negative or not finite; when ``area`` is not positive.
+
+    Attributes
+    ----------
+    g : (3, f) complex128
+        Half the gradients of the hat functions, scaled: ``p = Σ conj(gᵢ) wᵢ`` and ``q = Σ gᵢ wᵢ``.
+    share : (f,) float64
+        ``cⱼ mⱼ / Σ m``.
+    """
+
+    def __init__(
+        self,
+        V: ArrayLike,
+        F: ArrayLike,
+        energy: Energy,
+        *,
+        area: float | None = None,
+        weights: ArrayLike | None = None,
+        rest_F: ArrayLike | None = None,
+    ) -> None:
+        self.energy = energy
+        self.F = np.asarray(F, dtype=np.int64)
+        shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))
+        if shapes.flat.size:
+            raise ValueError(
+                f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
+                "distortion is undefined there"
+            )
+        if area is not None and not 0 < area < np.inf:
+            raise ValueError(f"the area of the map must be positive, not {area}")
+        total = float(shapes.m.sum())
+        scale = 1 / shapes.unit if area is None else float(np.sqrt(total / area))
+        self.g: ComplexArray = scale * shapes.half_gradients()
+        self.share: FloatArray = shapes.m / total
+        if weights is not None:
+            self.share = self.share * _weights(weights, len(self.F))
+        self._det_per_area = scale**2 / shapes.m
+        self._corners = np.ascontiguousarray(self.F.T)
+
+    def deform(self, w: ComplexArray) -> Deformation:
+        """The Jacobian of a map ``w = u + i v`` (n,) complex128 on every triangle.
+
+        Determinants come from the images' areas. An area too small to be told from its own rounding is
+        taken to be that rounding: it is positive if the map has been certified, and the energy huge.
+        """
+        d1, d2 = _edges(self._corners, w)
+        left, right = d1.real * d2.imag, d1.imag * d2.real
+        area, noise = left - right, 2.0**-51 * (np.abs(left) + np.abs(right))
+        area = 0.5 * np.where(np.abs(area) <= noise, noise, area)
+        g1, g2 = self.g[1], self.g[2]
+        return Deformation(d1 * g1.conj() + d2 * g2.conj(), d1 * g1 + d2 * g2, area * self._det_per_area)
+
+    def value(self, w: ComplexArray) -> float:
+        """The mean energy of a map; ``inf`` where the energy is a barrier and a triangle is inverted."""
+        return self.value_of(self.deform(w))
+
+    def value_of(self, d: Deformation) -> float:
+        """The mean energy of a deformation at hand."""
+        return float(np.sum(self.share * self.energy.density(d)))
+
+    def gradient(self, w: ComplexArray) -> ComplexArray:
+        """Its derivative by the positions, ``∂E/∂u + i ∂E/∂v`` at every vertex; (n,) complex128."""
+        return self.gradient_of(self.deform(w), w.size)
+
+    def gradient_of(self, d: Deformation, n: int) -> ComplexArray:
+        """The derivative by ``n`` positions for a deformation at hand."""
+        by_p, by_q = self.energy.gradient(d)
+        by_p, by_q = self.share * by_p, self.share * by_q
+        pull = (by_p * self.g + by_q * self.g.conj()).ravel()
+        at = self._corners.ravel()
+        return np.bincount(at, pull.real, minlength=n) + 1j * np.bincount(at, pull.imag, minlength=n)
+
+    def curvature_of(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivatives by (p, q) on every triangle, weights and areas included.
+
+        Parameters
+        ----------
+        d : Deformation
+        negative : float
+            What negative eigenvalues are multiplied by; see `Energy.curvature`.
+        """
+        return self.energy.curvature(d, negative=negative).scaled(self.share)
+
+    def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
+        """How far along a direction each triangle's area first vanishes.
+
+        The area of ``w + t · direction`` is a quadratic in t; its first positive zero is taken from
+        whichever form of the formula adds numbers of one sign.
+
+        Returns
+        -------
+        (f,) float64
+            Positive; ``inf`` where it never does, and where the area of ``w`` itself is lost in rounding, so
+            that only the exact test can say.
+        """
+        d1, d2 = _edges(self._corners, w)
+        e1, e2 = _edges(self._corners, direction)
+        c0 = d1.real * d2.imag - d1.imag * d2.real
+        c1 = d1.real * e2.imag - d1.imag * e2.real + e1.real * d2.imag - e1.imag * d2.real
+        c2 = e1.real * e2.imag - e1.imag * e2.real
+        root = np.sqrt(np.maximum(c1**2 - 4 * c0 * c2, 0))
+        real = c1**2 >= 4 * c0 * c2
+        falls = real & (c1 < 0)
+        rises = real & (c1 >= 0) & (c2 < 0)
+        first = np.full(c0.shape, np.inf)
+        first[falls] = 2 * c0[falls] / (root - c1)[falls]
+        first[rises] = (c1 + root)[rises] / (-2 * c2[rises])
+        return np.where(c0 > 0, first, np.inf)
+
+
+def signed_areas(F: NDArray[np.integer], w: ComplexArray) -> FloatArray:
+    """Signed areas of the images of triangles (f, 3) under a map (n,) complex128; (f,) float64."""
+    d1, d2 = _edges(F.T, w)
+    return 0.5 * (d1.real * d2.imag - d1.imag * d2.real)
+
+
+def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    w0 = w[corners[0]]
+    return w[corners[1]] - w0, w[corners[2]] - w0
+
+
+def _weights(weights: ArrayLike, f: int) -> FloatArray:
+    array = real_array("weights", weights)
+    if array.shape != (f,):
+        raise ValueError(f"weights must have shape ({f},), one for every triangle, not {array.shape}")
+    bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))
+    if bad.size:
+        raise ValueError(f"the weight is negative or not finite at {named('triangle', 'triangles', bad)}")
+    return array

@@ -1,0 +1,142 @@
+"""Projected Newton steps down a deformation energy, each of which ends in an injective map (§10, §11).
+
+    assemble ──▶ factor ──▶ direction ──▶ t = min(1, 0.9 × first collapse) ──▶ less energy? ──▶ injective, exactly?
+       ▲                                          │ ▲            no: t/2 ◀──────────┴────────────────┘ yes
+       └──────────────────────────────────────────┼─┴── t = 1 went well: 2t, 4t, … as long as the energy falls
+                                                  └── next map
+
+The second derivative of the energy is made positive definite triangle by triangle, in closed form
+(`quasiharmonic.energy.energies`). While collapsing triangles cut the steps short, negative eigenvalues enter with
+their absolute values, which aims less far and gets further; afterwards they are clamped at zero, which
+converges faster.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
+from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.energies import Deformation
+from quasiharmonic.energy.line_search import backtrack, extend
+from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.exact.certificate import is_injective
+from quasiharmonic.result import Status
+
+# Of the step at which the first triangle would collapse.
+_FRACTION = 0.9
+# The step is halved, and then doubled, this often before the direction is given up.
+_HALVINGS = 30
+# Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
+# by the first, and where triangles span many orders of magnitude they are as small as that.
+_SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
+# A step that lowers the energy by less than this part of the tolerance is idle; after so many in a row the
+# map has come to rest short of convergence.
+_IDLE, _PATIENCE = 1e-2, 3
+# A mean energy this small is rounding: the map is an isometry, or a similarity.
+_NOTHING = 1e-12
+
+
+def in_units(uv: FloatArray, exponent: int) -> ComplexArray:
+    """Positions (n, 2) as complex numbers (n,) in units of ``2 ** exponent``."""
+    return np.ldexp(uv, -exponent).view(np.complex128).ravel()
+
+
+class NewtonDescent:
+    """The map at hand and how to get to the next.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+        A barrier, for maps in units of ``2 ** exponent``.
+    uv : (n, 2) float64
+        An injective map.
+    fixed : (k,) int64
+        Vertices that stay where they are in ``uv``, to the last bit.
+    exponent : int
+        Of the unit of computation.
+    linear_solver : str
+
+    Attributes
+    ----------
+    w : (n,) complex128
+        The map, in units.
+    first, value : float
+        The energy at the start and now.
+    """
+
+    def __init__(
+        self, energy: DeformationEnergy, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
+    ) -> None:
+        self.energy = energy
+        self._fixed, self._pinned = fixed, uv[fixed]
+        self._exponent = exponent
+        self.w: ComplexArray = in_units(uv, exponent)
+        self.system = NewtonSystem(energy.F, energy.g, len(uv), fixed, linear_solver)
+        self._deformation = self.energy.deform(self.w)
+        self.value = self.first = self.energy.value_of(self._deformation)
+        self._cut = True
+        self._idle = 0
+
+    def positions(self, w: ComplexArray) -> FloatArray:
+        """A map as the caller gets it, the fixed vertices to the last bit."""
+        uv = np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent)
+        uv[self._fixed] = self._pinned
+        return uv
+
+    def step(self, tolerance: float) -> Status | None:
+        """Take one step; a status where there is no other to take."""
+        gradient = self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
+        # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
+        for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
+            direction, promise, newton = self._direction(gradient, negative)
+            small = newton and 0.5 * promise <= tolerance * (self.value + _NOTHING)
+            if small and negative < 0 and self._cut:
+                continue  # the reflected model is pessimistic: only the clamped one may declare an end
+            before = self.value
+            moved = self._search(direction, promise)
+            if small and negative == 0:
+                return Status.POLISHED
+            if moved:
+                self._idle = 0 if before - self.value > _IDLE * tolerance * before else self._idle + 1
+                return Status.EXHAUSTED if self._idle >= _PATIENCE else None
+        return Status.EXHAUSTED
+
+    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
+        """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
+        or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
+        """
+        self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
+        found = self.system.descent(gradient, _SHIFTS)
+        if found is not None:
+            return *found, True
+        direction = self.system.solve_diagonal(-gradient)
+        return direction, -work(gradient, direction), False
+
+    def _search(self, direction: ComplexArray, promise: float) -> bool:
+        """Move along a direction, as far as is good; False where no step lowers the energy enough."""
+        if not promise > 0:
+            return False
+        full = np.zeros_like(self.w)
+        full[self.system.free] = direction
+        limit = _FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
+        start, before = self.w, self.value
+
+        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+            """Accept what is below the bound, and every triangle, exactly, positive."""
+            w = start + t * full
+            deformation = self.energy.deform(w)
+            value = self.energy.value_of(deformation)
+            accepted = value < bound and is_injective(self.energy.F, self.positions(w))
+            return value, (w, deformation) if accepted else None
+
+        taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=_HALVINGS)
+        if taken is None:
+            # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
+            doublings = int(np.count_nonzero(2.0 ** np.arange(1, _HALVINGS) <= limit))
+            taken = backtrack(trial, before, promise, longest=2.0, tries=doublings, factor=lambda t, value: 2.0)
+        if taken is None:
+            return False
+        self._cut = taken.t < 1
+        _, self.value, (self.w, self._deformation) = extend(trial, taken, limit)
+        return True

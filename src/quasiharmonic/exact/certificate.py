@@ -1,0 +1,346 @@
+"""Exact verdict on a map of a triangle mesh into the plane.
+
+A map is *injective* here when every triangle is strictly positive, which is decided exactly on the
+coordinates as stored. It is *bijective* onto its image when, in addition, no two points of the
+surface share a place. That is read off the boundary alone:
+
+    Let all triangles of a compact oriented surface be positive. Around a point of the plane that is
+    on no edge's image, the boundary's image winds as often as the point has preimages: both are the
+    degree of the map there [1]_. So the map is bijective if and only if the images of the boundary
+    loops are simple and mutually disjoint and wind 0 or 1 times around every point off them.
+
+    (*Only if*: a bijective map keeps loops simple and apart, and no point has two preimages. *If*:
+    almost no point has two preimages. Two points of the surface at one place, of which one is
+    interior, would have neighbourhoods whose images overlap in an open set, all of it covered twice;
+    two boundary points at one place are excluded by the loops being simple and disjoint. For the
+    same reason the triangles around an interior vertex wind around it once: where they wind twice,
+    as positive triangles can, the points nearby are covered twice.)
+
+Nothing in this asks how many components the surface has, nor its genus: a surface that cannot lie in
+the plane fails the test. For loops that are simple and disjoint the winding numbers are a matter of
+nesting: with none or two or four loops around it a loop must run counterclockwise, with one or three
+clockwise. For a connected surface this leaves one counterclockwise loop around all others. Which of
+its loops that is does not matter; an annulus turned inside out is as bijective as before.
+
+References
+----------
+.. [1] Y. Lipman, Bijective mappings of meshes with boundary and the degree in mesh processing.
+   SIAM Journal on Imaging Sciences 7 (2014).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed
+from quasiharmonic.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.mesh.topology import edges, trace_loops
+
+SignArray = NDArray[np.int8]
+
+# Triangles judged at a time: bounds the memory, and is large enough for the overhead not to show.
+_TRIANGLE_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What was decided exactly about a map; made by `certify`.
+
+    Attributes
+    ----------
+    triangles : int
+        Number of triangles judged.
+    flipped, degenerate, nonfinite : (k,) int64
+        Ascending indices of the triangles that are clockwise, that have exactly no area (a repeated
+        vertex included), and that have a NaN or infinite coordinate and so no orientation.
+    bijective : bool or None
+        Whether the map is injective and covers no point twice; None when it was not asked for.
+    reasons : tuple of Reason
+        Why the map is not bijective. The loops are judged also where triangles are flipped.
+    loops : tuple of (l,) int64
+        Boundary vertices, loop by loop, the surface to the left.
+    crossings : (m, 4) int64
+        Rows ``i, j, k, l``: the boundary edges ``i → j`` and ``k → l`` share a point that they should
+        not share. At most 1000 are listed.
+    overwound : (k,) int64
+        Interior vertices around which positive triangles wind more than once.
+    """
+
+    triangles: int
+    flipped: IntArray
+    degenerate: IntArray
+    nonfinite: IntArray
+    bijective: bool | None
+    reasons: tuple[Reason, ...]
+    loops: tuple[IntArray, ...]
+    crossings: IntArray
+    overwound: IntArray
+
+    def __post_init__(self) -> None:
+        for array in (self.flipped, self.degenerate, self.nonfinite, self.crossings, self.overwound, *self.loops):
+            array.flags.writeable = False
+
+    @property
+    def injective(self) -> bool:
+        """Whether there are triangles and every one is strictly positive."""
+        return self.triangles > 0 and not (self.flipped.size or self.degenerate.size or self.nonfinite.size)
+
+    def summary(self) -> str:
+        """Say in a sentence or two what is certified, or what is wrong and where."""
+        further = [r.text for r in self.reasons if r.kind is not Obstacle.NOT_INJECTIVE]
+        if self.injective:
+            all_of_them = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
+            said = f"Injective: {all_of_them} positive."
+        elif self.triangles:
+            counted = _counted(self.flipped, self.degenerate, self.nonfinite)
+            said = f"Not injective: of {self.triangles} triangles, {counted}."
+        else:
+            return "Not injective: there are no triangles."
+        if self.bijective:
+            return f"{said} Bijective: the boundary does not meet itself, and no point is covered twice."
+        if not further:
+            return said
+        more = f"; and {len(further) - 3} more" if len(further) > 3 else ""
+        return f"{said} Not bijective{'' if self.injective else ' either'}: {'; '.join(further[:3])}{more}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in plain Python types, fit for JSON; of a loop, its first vertex and its length."""
+        return {
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "triangles": self.triangles,
+            "flipped": self.flipped.tolist(),
+            "degenerate": self.degenerate.tolist(),
+            "nonfinite": self.nonfinite.tolist(),
+            "reasons": [{"kind": r.kind.value, "text": r.text, "loops": list(r.loops)} for r in self.reasons],
+            "loops": [{"start": int(loop[0]), "length": len(loop)} for loop in self.loops],
+            "crossings": self.crossings.tolist(),
+            "overwound": self.overwound.tolist(),
+            "summary": self.summary(),
+        }
+
+
+def certify(
+    F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[IntArray] | None = None
+) -> Certificate:
+    """Judge a map exactly, on its coordinates as stored.
+
+    Parameters
+    ----------
+    F : (f, 3) int
+        Triangles, any integer dtype.
+    uv : (n, 2) float
+        Place of every vertex, any dtype that double precision holds exactly. What a consumer in
+        single precision would see is ``certify(F, uv.astype(np.float32))``. Vertices of no triangle
+        are not looked at.
+    boundary : bool
+        Judge the boundary too, so that `Certificate.bijective` is known. All components count
+        together: islands that overlap are not bijective.
+    loops : sequence of (l,) int64, optional
+        The boundary loops of a mesh that is known to be a surface, as `boundary_loops` gives them. They are taken
+        on trust, and to find them is half of the work.
+
+    Returns
+    -------
+    Certificate
+        Which triangles are not positive, and why the map is not bijective where it is not.
+
+    Raises
+    ------
+    ValueError
+        When ``F`` or ``uv`` has the wrong shape or dtype, or ``F`` names vertices that are not there.
+
+    See Also
+    --------
+    is_injective, flipped_triangles : the triangles alone, as an inner loop wants them.
+
+    Examples
+    --------
+    >>> F = [[0, 1, 2], [0, 2, 3]]
+    >>> certify(F, [[0, 0], [1, 0], [1, 1], [0, 1]]).bijective
+    True
+    >>> print(certify(F, [[0, 0], [1, 0], [1, 1], [0.9, 0.5]]).summary())
+    Not injective: of 2 triangles, 1 is flipped (1).
+    """
+    F, uv = _checked(F, uv)
+    sign, nonfinite = _signs(F, uv)
+    flipped = np.flatnonzero(sign < 0)
+    degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
+    reasons: list[Reason] = []
+    if not len(F):
+        reasons.append(Reason(Obstacle.NO_TRIANGLES, "there are no triangles"))
+    if np.any(sign <= 0):
+        text = f"of {len(F)} triangles, {_counted(flipped, degenerate, nonfinite)}"
+        reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
+    known: list[IntArray] = []
+    crossings, overwound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
+    if boundary and len(F):
+        known, broken = _loops(F, len(uv)) if loops is None else (list(loops), [])
+        reasons += broken
+        if not broken:
+            overwound = _overwound(F, uv, sign, known)
+            if np.isfinite(uv[np.concatenate(known)]).all():
+                crossings, found = judge_loops(known, uv)
+                reasons += found
+        if overwound.size:
+            text = f"triangles wind more than once around {named('vertex', 'vertices', overwound)}"
+            reasons.append(Reason(Obstacle.OVERWOUND, text))
+    return Certificate(
+        triangles=len(F),
+        flipped=flipped,
+        degenerate=degenerate,
+        nonfinite=nonfinite,
+        bijective=not reasons if boundary else None,
+        reasons=tuple(reasons),
+        loops=tuple(known),
+        crossings=crossings,
+        overwound=overwound,
+    )
+
+
+def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
+    """Whether there are triangles and every one is strictly positive, decided exactly.
+
+    The predicate to the locator `flipped_triangles`.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+    uv : (n, 2) array
+        Taken as they are stored, integers and float32 too, as in `certify`.
+
+    Returns
+    -------
+    bool
+
+    Raises
+    ------
+    ValueError
+        When shapes are wrong or an index is out of range, as in `certify`.
+    """
+    F, uv = _checked(F, uv)
+    return len(F) > 0 and bool(np.all(_signs(F, uv)[0] > 0))
+
+
+def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
+    """Find the triangles that keep a map from being injective, exactly.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+    uv : (n, 2) array
+        Taken as they are stored, integers and float32 too, as in `certify`.
+
+    Returns
+    -------
+    (k,) int64
+        Ascending indices of *all* triangles that are not strictly positive: clockwise, without area
+        or not finite. `certify` tells them apart.
+
+    Raises
+    ------
+    ValueError
+        When shapes are wrong or an index is out of range, as in `certify`.
+    """
+    return np.flatnonzero(_signs(*_checked(F, uv))[0] <= 0)
+
+
+def _checked(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
+    """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
+    triangles, places = np.asarray(F), np.asarray(uv)
+    if triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ValueError(f"F has shape {triangles.shape}, expected (f, 3)")
+    if triangles.dtype.kind not in "iu":
+        raise ValueError(f"F has dtype {triangles.dtype}, expected integers")
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ValueError(f"uv has shape {places.shape}, expected (n, 2)")
+    if places.dtype.kind not in "fiu":
+        raise ValueError(f"uv has dtype {places.dtype}, expected floating-point numbers")
+    n = len(places)
+    if triangles.size and (triangles.min() < 0 or triangles.max() >= n):
+        bad = np.flatnonzero(((triangles < 0) | (triangles >= n)).any(axis=1))
+        raise ValueError(f"F refers to vertices outside 0 … {n - 1} in {named('triangle', 'triangles', bad)}")
+    with np.errstate(over="ignore"):
+        doubles = places.astype(np.float64)
+    # Of the numeric types, wide integers and extended precision have values that double has not.
+    rounded = np.zeros(places.shape, dtype=bool)
+    if places.dtype.kind != "f":
+        rounded = np.abs(doubles) >= 2.0**53
+    elif places.dtype.itemsize > 8:
+        rounded = (doubles != places) & ~np.isnan(doubles)
+    rows = np.flatnonzero(rounded.any(axis=1))
+    if rows.size:
+        raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rows)}")
+    return triangles.astype(np.int64, copy=False), doubles
+
+
+def _signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
+    """Orientation of every triangle, (f,), and the indices of those with a NaN or infinite coordinate."""
+    sign = np.empty(len(F), dtype=np.int8)
+    nonfinite = [np.empty(0, dtype=np.int64)]
+    for start in range(0, len(F), _TRIANGLE_CHUNK):
+        chunk = slice(start, start + _TRIANGLE_CHUNK)
+        corners = uv.take(F[chunk], axis=0)
+        sign[chunk], undefined = orientation_or_nonfinite(corners[:, 0], corners[:, 1], corners[:, 2])
+        nonfinite.append(undefined + start)
+    return sign, np.concatenate(nonfinite)
+
+
+def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
+    """Count and name the triangles that are not positive, by what is wrong with them."""
+    return ", ".join(
+        f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({listed(bad.tolist())})"
+        for bad, what in ((flipped, "flipped"), (degenerate, "degenerate"), (nonfinite, "not finite"))
+        if bad.size
+    )
+
+
+def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
+    """Boundary loops, or why there are none to be judged."""
+    repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
+    parts = edges(F, n)
+    wrong = (
+        (repeated.tolist(), "triangles repeat a vertex"),
+        (_dashed(parts.nonmanifold), "edges are in three or more triangles"),
+        (_dashed(parts.inconsistent), "edges are traversed twice in the same direction"),
+    )
+    broken = [f"{what} ({listed(found)})" for found, what in wrong if found]
+    if not broken:
+        try:
+            loops = trace_loops(parts.boundary)
+        except ValueError as error:
+            broken = [str(error)]
+    if broken:
+        return [], [Reason(Obstacle.NOT_A_SURFACE, f"the mesh is not a surface: {text}") for text in broken]
+    if not loops:
+        return [], [Reason(Obstacle.NO_BOUNDARY, "the surface has no boundary")]
+    return loops, []
+
+
+def _dashed(pairs: IntArray) -> list[str]:
+    return [f"{i}–{j}" for i, j in pairs.tolist()]
+
+
+def _overwound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
+    """Interior vertices, all triangles around them positive, around which these wind more than once.
+
+    Positive triangles turn counterclockwise around their vertex by less than half a turn each, so one
+    of them passes the direction of the x axis exactly if its next corner lies below the vertex and
+    its last does not; as many do as there are turns.
+    """
+    y, turns = uv[:, 1].copy(), np.zeros(len(uv), dtype=np.int64)
+    for start in range(0, len(F), _TRIANGLE_CHUNK):
+        chunk = F[start : start + _TRIANGLE_CHUNK]
+        level = y.take(chunk)
+        for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            passing = (level[:, following] < level[:, corner]) & (level[:, last] >= level[:, corner])
+            np.add.at(turns, chunk[:, corner].compress(passing), 1)
+    turns[F[sign <= 0]] = 0
+    turns[np.concatenate(loops)] = 0
+    return np.flatnonzero(turns > 1)

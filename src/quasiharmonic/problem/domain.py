@@ -1,0 +1,183 @@
+"""Where a map lives: a surface, and which of its vertices are held. Where they go is another question (`Problem`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import IntArray, check_range, index_array, named, triangle_array, vertex_array
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.mesh.reference import Reference, ReferenceMesh, rest_frames
+from quasiharmonic.mesh.surface import surface_edges
+from quasiharmonic.mesh.topology import trace_loops
+
+
+class Domain:
+    """A surface with some of its vertices held: all that does not change while they move.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions, planar or curved; any real dtype.
+    F : (f, 3) array of int
+        Triangles, 0-based and consistently oriented. Never reordered.
+    fixed : (k,) array of int
+        Vertices whose positions are given.
+
+    Raises
+    ------
+    ValueError
+        With the first offending elements: wrong shapes or dtypes, indices out of range, numbers that
+        are not finite, repeated or non-manifold elements, mixed winding, several components, isolated
+        vertices, a closed surface, a vertex held twice.
+
+    Attributes
+    ----------
+    V, F, fixed : arrays
+        As given, as float64 and int64; not writeable.
+    edges : Edges
+        The surface's, by kind.
+    loops : list of (l,) int64
+        Boundary loops, the surface to their left.
+
+    Notes
+    -----
+    Factorisations are shared by all that is asked of a domain, one thread at a time; see `exclusive`.
+    """
+
+    def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike) -> None:
+        self.V = vertex_array(V)
+        self.F = triangle_array(F, len(self.V))
+        self.edges = surface_edges(self.F, len(self.V))
+        self.loops = trace_loops(self.edges.boundary)
+        self.fixed = _fixed(fixed, len(self.V))
+        for array in (self.V, self.F, self.fixed):
+            array.flags.writeable = False
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """For what is made when it is first asked for, and kept."""
+        self._lock = Lock()
+        self._laplacians: dict[str, Laplacian] = {}
+        self._meshes: dict[Reference, ReferenceMesh] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Factorisations live in a library's memory and stay behind when a domain is pickled or copied.
+        return {name: getattr(self, name) for name in ("V", "F", "edges", "loops", "fixed")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._make_room()
+
+    @contextmanager
+    def exclusive(self) -> Iterator[Domain]:
+        """Give this domain, or a twin with factorisations of its own while somebody else is using this one's.
+
+        Two threads, or a solve within another's callback, would otherwise take turns at refactoring.
+        """
+        if not self._lock.acquire(blocking=False):
+            twin = object.__new__(Domain)
+            twin.__setstate__(self.__getstate__())
+            yield twin
+            return
+        try:
+            yield self
+        finally:
+            self._lock.release()
+
+    @property
+    def n(self) -> int:
+        """Number of vertices."""
+        return len(self.V)
+
+    @property
+    def pins(self) -> IntArray:
+        """Fixed vertices that are not on the boundary, ascending."""
+        return np.setdiff1d(self.fixed, self.edges.boundary)
+
+    def check_boundary_fixed(self) -> None:
+        """Raise a ValueError that names boundary vertices which are not held, for methods that need all of them."""
+        missing = np.setdiff1d(self.edges.boundary, self.fixed)
+        if missing.size:
+            raise ValueError(
+                f"the boundary {named('vertex', 'vertices', missing)} not in fixed: "
+                "every boundary vertex needs a position"
+            )
+
+    def check_areas(self) -> None:
+        """Raise a ValueError that names triangles without area at rest, for methods that look at their shapes."""
+        z1, z2 = rest_frames(self.V, self.F)
+        flat = np.flatnonzero((z1 == 0) | (z2.imag == 0))
+        if flat.size:
+            raise ValueError(
+                f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh; "
+                "choose the reference 'equilateral' to map it all the same"
+            )
+
+    @property
+    def analysed(self) -> bool:
+        """Whether a Laplacian of this mesh has been asked for."""
+        return bool(self._laplacians)
+
+    def laplacian(self, linear_solver: str = "auto") -> Laplacian:
+        """The Laplacian of this mesh and these fixed vertices, analysed once and kept (§6.2, eq. 12).
+
+        Parameters
+        ----------
+        linear_solver : str
+            ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+
+        Returns
+        -------
+        Laplacian
+            Shared by all that ask for it.
+
+        Raises
+        ------
+        ValueError
+            When there is no such solver.
+        ImportError
+            When its library is not installed.
+        """
+        if linear_solver not in self._laplacians:
+            made = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
+            # "auto" and the name it stands for share one analysis.
+            self._laplacians[linear_solver] = self._laplacians.setdefault(made.solver.name, made)
+        return self._laplacians[linear_solver]
+
+    def mesh(self, kind: Reference) -> ReferenceMesh:
+        """The mesh with reference triangles of some kind, built once and kept (§9.3).
+
+        Parameters
+        ----------
+        kind : {"equilateral", "rest", "corrected"}
+
+        Returns
+        -------
+        ReferenceMesh
+
+        Notes
+        -----
+        In units near the rest mesh's size, a power of two, so that no area leaves the numbers' range; the
+        functionals have no scale.
+        """
+        if kind not in self._meshes:
+            exponent = int(np.frexp(np.max(np.abs(self.V)))[1])
+            self._meshes[kind] = ReferenceMesh(np.ldexp(self.V, -exponent), self.F, kind)
+        return self._meshes[kind]
+
+
+def _fixed(fixed: ArrayLike, n: int) -> IntArray:
+    array = index_array("fixed", fixed)
+    if array.ndim != 1:
+        raise ValueError(f"fixed must have shape (k,), not {array.shape}")
+    check_range("fixed", array, n)
+    times = np.bincount(array, minlength=n)
+    if times.max(initial=0) > 1:
+        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
+    return array

@@ -1,0 +1,191 @@
+"""The question: a surface with some of its vertices held, and where these go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite, real_array
+from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.problem.domain import Domain
+from quasiharmonic.problem.frame import Frame
+
+
+class Problem:
+    """A mesh with positions in the plane for its boundary and any pinned interior vertices.
+
+    What is malformed raises; what is merely hard or hopeless (a target that crosses itself, is wound
+    the wrong way or admits no map) is accepted and ends in a result that says so.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions, planar or curved; any real dtype.
+    F : (f, 3) array of int
+        Triangles, 0-based and consistently oriented. Never reordered. A planar target is wound as the
+        mesh is: counterclockwise around a mesh whose triangles are counterclockwise.
+    fixed : (k,) array of int
+        Vertices with given positions: at least the whole boundary, and any interior vertices.
+    target : (k, 2) array
+        Their positions, in the order of ``fixed``; any real dtype.
+    reference : {"equilateral", "rest", "corrected"}, optional
+        Shape of the triangles in which gradients are taken (see `ReferenceMesh`), whatever the strategy
+        would choose.
+
+    Raises
+    ------
+    ValueError
+        With the first offending elements: what `Domain` refuses, boundary vertices without a position, and
+        triangles of zero area in the rest mesh. Those last are accepted when the reference is
+        ``"equilateral"`` or ``"corrected"`` by the caller's own word: that says that their shapes, and
+        the distortion that nobody could measure, do not matter.
+
+    Attributes
+    ----------
+    domain : Domain
+        The surface and its held vertices, shared with all problems that `moved` makes of this one.
+    target : (k, 2) float64
+        As given; not writeable.
+    """
+
+    domain: Domain
+    target: FloatArray
+    reference: Reference | None
+
+    def __init__(
+        self,
+        V: ArrayLike,
+        F: ArrayLike,
+        fixed: ArrayLike,
+        target: ArrayLike,
+        *,
+        reference: Reference | None = None,
+    ) -> None:
+        domain = Domain(V, F, fixed)
+        domain.check_boundary_fixed()
+        if reference is not None and reference not in get_args(Reference):
+            raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
+        if reference is None or reference == "rest":
+            domain.check_areas()
+        self._pose(domain, target, reference)
+
+    @classmethod
+    def on(cls, domain: Domain, target: ArrayLike, *, reference: Reference | None = None) -> Problem:
+        """A problem on a domain at hand, whose topology and symbolic factorisation it shares.
+
+        Parameters
+        ----------
+        domain : Domain
+            With its whole boundary held.
+        target : (k, 2) array
+            Where ``domain.fixed`` go.
+        reference : {"equilateral", "rest", "corrected"}, optional
+            As of `Problem`; rest areas are not looked at.
+
+        Raises
+        ------
+        ValueError
+            When there are not as many places as fixed vertices, or one is not finite.
+        """
+        problem = object.__new__(cls)
+        problem._pose(domain, target, reference)
+        return problem
+
+    def _pose(self, domain: Domain, target: ArrayLike, reference: Reference | None) -> None:
+        self.domain = domain
+        self.target = _target(target, len(domain.fixed))
+        self.target.flags.writeable = False
+        self.reference = reference
+
+    def moved(self, target: ArrayLike) -> Problem:
+        """The same problem with its fixed vertices elsewhere.
+
+        Parameters
+        ----------
+        target : (k, 2) array
+            New positions of ``fixed``.
+
+        Returns
+        -------
+        Problem
+            A new one on the same domain; this one stays as it is.
+
+        Raises
+        ------
+        ValueError
+            When there are not as many places as fixed vertices, or one is not finite.
+        """
+        return Problem.on(self.domain, target, reference=self.reference)
+
+    @contextmanager
+    def exclusive(self) -> Iterator[Problem]:
+        """Give this problem, or a twin on a domain that nobody else is using; see `Domain.exclusive`."""
+        with self.domain.exclusive() as domain:
+            yield self if domain is self.domain else Problem.on(domain, self.target, reference=self.reference)
+
+    @property
+    def V(self) -> FloatArray:
+        """The domain's rest positions (n, 2) or (n, 3) float64."""
+        return self.domain.V
+
+    @property
+    def F(self) -> IntArray:
+        """The domain's triangles (f, 3) int64."""
+        return self.domain.F
+
+    @property
+    def n(self) -> int:
+        """Number of vertices."""
+        return self.domain.n
+
+    @property
+    def fixed(self) -> IntArray:
+        """The domain's held vertices (k,) int64."""
+        return self.domain.fixed
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The coordinates in which the problem is solved."""
+        return Frame(self.target)
+
+    def positions(self, w: ComplexArray) -> FloatArray:
+        """A map of the frame as the caller gets it, the fixed vertices to the last bit.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+            Places u + iv in the frame that is solved in.
+
+        Returns
+        -------
+        (n, 2) float64
+            In the target's units.
+        """
+        uv = self.frame.outward(w)
+        uv[self.fixed] = self.target
+        return uv
+
+    @cached_property
+    def encloses_area(self) -> bool:
+        """Whether the target's boundary may enclose a positive area, as the triangles of an injective map add up to.
+
+        False only where it certainly does not: all positions are equal, or the boundary is wound the wrong way.
+        """
+        w = np.zeros(self.n, dtype=np.complex128)
+        w[self.fixed] = self.frame.inward(self.target)
+        area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in self.domain.loops)
+        # The frame is of unit size, so rounding stays far below this.
+        return area > -1e-12 and bool(np.any(self.target != self.target[0]))
+
+
+def _target(target: ArrayLike, k: int) -> FloatArray:
+    array = real_array("target", target)
+    if array.shape != (k, 2):
+        raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
+    check_finite("target", "row", "rows", array)
+    return array

@@ -1,0 +1,251 @@
+"""Injective maps of little distortion, whether or not the energy minds inversions: quasi-harmonisation (§11)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import FloatArray, IntArray, map_array, named, not_negative, real_array, whole_number
+from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet
+from quasiharmonic.energy.springs import MassSpring
+from quasiharmonic.exact.certificate import certify, flipped_triangles
+from quasiharmonic.exact.diagnosis import diagnose
+from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.regularizers import Conformal
+from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.result import MapResult, Status, Step
+from quasiharmonic.search.harmonic_descent import HarmonicDescent
+from quasiharmonic.search.harmonised import Harmonised
+
+#: What can be lowered, by name: each makes its energy from the rest mesh.
+ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
+    "arap": lambda V, F: ARAP(),
+    "area": lambda V, F: AreaPreserving(),
+    "springs": MassSpring,
+    "mips": lambda V, F: MIPS(),
+    "symmetric-dirichlet": lambda V, F: SymmetricDirichlet(),
+}
+#: η by round. Barriers keep the map injective by themselves; the others need V₃ to have the last word.
+BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
+ETA = (0.1, 0.1, 0.01, 0.001)
+
+
+def harmonise(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    fixed: ArrayLike,
+    energy: str | Energy | None = "arap",
+    eta: float | Sequence[float] | None = None,
+    conformal: float = 1e-3,
+    weights: ArrayLike | None = None,
+    iterations: int = 40,
+    tolerance: float = 1e-3,
+    reference: Reference = "rest",
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> MapResult:
+    """Lower any distortion energy within the injective maps, by quasi-harmonisation (§11).
+
+    For energies that are finite for inverted triangles, and for those of which only first derivatives are known.
+    `quasiharmonic.polish` needs barriers with second derivatives, and is faster for these.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles.
+    uv : (n, 2) array
+        A map to begin with, as `quasiharmonic.injective_map` finds it. It need not be injective unless the energy
+        is a barrier.
+    fixed : (k,) array of int
+        Vertices that stay where they are in ``uv``, to the last bit: the whole boundary and any pins.
+    energy : str, Energy or None
+        E, the mean over the surface's area:
+
+        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)², rigid where it can be;
+        - ``"area"``: (σ₁σ₂ − 1)², areas and nothing else;
+        - ``"springs"``: (l − l⁰)² summed over the mesh's edges;
+        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles and nothing else;
+        - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻² − 4, lengths.
+
+        Or any `Energy`. Lengths and areas are compared after scaling the map to the surface's area. None leaves R₁
+        alone, which is MIPS in the end and no barrier on the way.
+    eta : float or sequence of float, optional
+        η in ``V₃/|Ω| + η (E + κ R₁)``, one for each round. By default four rounds, that end at 1 for barriers and at
+        0.001 for other energies. (The paper has one, of 1e-4, for all.)
+    conformal : float
+        κ, the weight of the regulariser R₁ (eq. 35). A little of it keeps triangles from collapsing.
+    weights : (f,) array, optional
+        How much each triangle's distortion counts in E; not negative, 1 by default. R₁ counts all alike: it keeps the
+        others from collapsing.
+    iterations : int
+        Linear solves of each round at most.
+    tolerance : float
+        A round is at rest when ten steps have lowered its objective by less than this fraction. Not negative.
+    reference : {"equilateral", "rest", "corrected"}
+        Triangles in which V₃ and R₁ are taken. R₁ means the surface's angles in those of the rest mesh alone.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every map on the way; its ``energy`` is E + κR₁.
+
+    Returns
+    -------
+    MapResult
+        The injective map of least E + κR₁ on the way, ``uv`` included; certified. With status ``POLISHED`` when the
+        last round came to rest, ``STILL_FALLING`` when it did not, ``UNIMPROVED`` when no injective map on the way was
+        better than ``uv``, ``INTERRUPTED`` by Ctrl-C; or, with the map of fewest inversions, where none was injective,
+        ``IMPOSSIBLE`` if the ``diagnosis`` names what forbids one and else ``SETTLED``. The history holds E + κR₁ at
+        every map.
+
+    Raises
+    ------
+    ValueError
+        When the input is malformed (see `Problem`), a rest triangle has no area, or the energy is a barrier and
+        ``uv`` not injective; the message names the triangles. When an option has no such value.
+
+    Examples
+    --------
+    A disk whose triangles crowd at the middle, of which areas alone are to be kept:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import distortion
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(6)
+    >>> crowded = V * np.linalg.norm(V, axis=1, keepdims=True)
+    >>> result = harmonise(V, F, crowded, fixed=np.arange(len(V) - 36, len(V)), energy="area")
+    >>> result.injective, bool(distortion(V, F, result.uv).area_ratio.std() < 0.1)
+    (True, True)
+    """
+    began = time.perf_counter()
+    domain = Domain(V, F, fixed)
+    domain.check_boundary_fixed()
+    if energy is None and reference == "rest":
+        domain.check_areas()
+    result = harmonise_map(
+        domain,
+        uv,
+        energy=energy,
+        eta=eta,
+        conformal=conformal,
+        weights=weights,
+        iterations=iterations,
+        tolerance=tolerance,
+        reference=reference,
+        linear_solver=linear_solver,
+        callback=callback,
+    )
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+def harmonise_map(
+    domain: Domain,
+    uv: ArrayLike,
+    *,
+    energy: str | Energy | None = "arap",
+    eta: float | Sequence[float] | None = None,
+    conformal: float = 1e-3,
+    weights: ArrayLike | None = None,
+    iterations: int = 40,
+    tolerance: float = 1e-3,
+    reference: Reference = "rest",
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> MapResult:
+    """Harmonise a map of a `Domain` at hand; the rest as `harmonise` has it.
+
+    The domain's ``fixed`` vertices stay where they are in ``uv``.
+    """
+    began = time.perf_counter()
+    chosen = _energy(energy, domain)
+    barrier = chosen is not None and chosen.barrier
+    schedule = _schedule(eta, barrier)
+    not_negative("conformal", conformal)
+    if chosen is None and conformal == 0:
+        raise ValueError("conformal must be positive where there is no energy, not 0")
+    if weights is not None and chosen is None:
+        raise ValueError("weights are the energy's, and there is none")
+    if reference not in get_args(Reference):
+        raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
+    whole_number("iterations", iterations, least=1)
+    not_negative("tolerance", tolerance)
+    start = map_array("uv", uv, domain.n)
+    flipped = flipped_triangles(domain.F, start)
+    if barrier and flipped.size:
+        raise ValueError(
+            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area, where "
+            "this energy is infinite; begin with an injective map, or lower R₁ (energy=None)"
+        )
+    name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
+    problem = Problem.on(domain, start[domain.fixed])
+    with problem.exclusive() as own, np.errstate(all="ignore"):
+        area = float(signed_areas(own.F, own.frame.inward(start)).sum())
+        if not area > 0:
+            raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
+        deformation = None if chosen is None else DeformationEnergy(own.V, own.F, chosen, area=area, weights=weights)
+        objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
+        regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
+
+        def descended(eta: float) -> Harmonised:
+            return Harmonised(own, objective.mesh, area, deformation, regularizer, eta=eta, conformal=conformal)
+
+        descent = HarmonicDescent(objective, descended, start, callback)
+        first, status = descent.best, Status.STILL_FALLING
+        try:
+            for values in (schedule, len(schedule) * schedule[-1:]):
+                for value in values:
+                    rest = descent.run(f"harmonise, {name}, η = {value:g}", value, iterations, tolerance)
+                    status = Status.POLISHED if rest else Status.STILL_FALLING
+                if descent.right() or values == len(schedule) * schedule[-1:]:
+                    break
+                # What cannot be righted was moved too far: once more, in shorter steps.
+                descent.back()
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+    certificate = certify(domain.F, descent.uv)
+    diagnosis = None
+    if status is not Status.INTERRUPTED:
+        converged = status is Status.POLISHED and descent.history[-1].flipped == 0
+        if not certificate.injective:
+            diagnosis = diagnose(problem)
+            status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
+        elif not (descent.best < first or converged):
+            status = Status.UNIMPROVED
+    return MapResult(
+        uv=descent.uv,
+        status=status,
+        certificate=certificate,
+        stages=descent.stages,
+        history=descent.history,
+        diagnosis=diagnosis,
+        linear_solver=objective.laplacian.solver.name,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
+    """The energy of a name, made for this mesh."""
+    if energy is None or isinstance(energy, Energy):
+        return energy
+    if energy not in ENERGIES:
+        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {energy!r}")
+    return ENERGIES[energy](domain.V, domain.F)
+
+
+def _schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float, ...]:
+    if eta is None:
+        return BARRIER_ETA if barrier else ETA
+    schedule = np.atleast_1d(real_array("eta", eta))
+    if schedule.ndim != 1 or not schedule.size or not np.all((schedule > 0) & (schedule < np.inf)):
+        raise ValueError(f"eta must be a positive number, or one for every round, not {eta!r}")
+    return tuple(float(value) for value in schedule)
