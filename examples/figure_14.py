@@ -26,7 +26,7 @@ import numpy as np
 
 from common import BENCHMARKS, COLORS, panels, save
 from quasiharmonic import batch
-from quasiharmonic.batch.report.numbers import load
+from quasiharmonic.report.numbers import load
 
 sys.path.append(str(BENCHMARKS))
 from dataset import drawn, plan, write

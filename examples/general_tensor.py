@@ -353,7 +353,7 @@ def main(output: Path, rings: int = 12) -> dict[str, Any]:
         curve.plot(np.linspace(0, 1, order.size), found.s[order], label=name)
         numbers[name] = {"edges with s < 0": int(np.sum(found.s < 0))}
     curve.axhline(0, color="black", lw=0.8)
-    curve.set(xlabel="along the boundary", ylabel="s", title="the co-normal derivative's share along n̂")
+    curve.set(xlabel="along the boundary", title="s, the co-normal derivative along n̂")
     curve.legend()
     mu, nu = admitted_pair(problem, maps["injective"])
     A = beltrami_tensor(mu, nu)

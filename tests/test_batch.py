@@ -21,7 +21,7 @@ from datasets import record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch, certify, io
 from quasiharmonic.batch import keeper, records
 from quasiharmonic.batch import settings as settings_module
-from quasiharmonic.batch.keeper import Finished
+from quasiharmonic.batch.supervisor import Finished
 from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus
@@ -201,7 +201,7 @@ class TestRun:
             ("__init__.py", ""),
             ("inject.py", "a = 1"),
             ("inject.py", "a = 2"),
-            ("batch/report/page.py", "only shows"),
+            ("report/page.py", "only shows"),
         ):
             (package / file).write_text(text)
             states.append(settings_module._code.__wrapped__())

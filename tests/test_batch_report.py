@@ -15,8 +15,8 @@ import pytest
 from datasets import star_of, write_problem, write_stars
 from quasiharmonic import batch
 from quasiharmonic.batch import records
-from quasiharmonic.batch.report import figures, numbers, page
 from quasiharmonic.cli import main
+from quasiharmonic.report import figures, numbers, page, write_report
 
 VILE = '<script>alert(1)</script>"><img src=x onerror=alert(2)>&amp;\u202egnp'
 
@@ -64,7 +64,7 @@ def made(tmp_path, count=200, seed=0, name="t.csv", **more):
 
 
 def written(tmp_path, *arguments):
-    batch.write_report(tmp_path / "report.html", *arguments)
+    write_report(tmp_path / "report.html", *arguments)
     return (tmp_path / "report.html").read_text()
 
 

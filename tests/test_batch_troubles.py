@@ -14,7 +14,7 @@ import pytest
 
 from datasets import lasting, record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch
-from quasiharmonic.batch import keeper
+from quasiharmonic.batch import supervisor
 from quasiharmonic.batch.settings import Orders
 
 TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
@@ -23,7 +23,7 @@ linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks 
 
 @pytest.fixture
 def troubled(monkeypatch):
-    monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
+    monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
 
 
 def children_of(process):
@@ -98,7 +98,7 @@ class TestTroubles:
     def test_retry(self, tmp_path, monkeypatch):
         source = write_stars(tmp_path / "set", ["a", "killed", "bug"])
         (source / "a" / "handles.txt").write_text("not a number")
-        monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
+        monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
         assert batch.run(source, tmp_path / "out", jobs=1).outcomes == {"invalid": 1, "crash": 1, "error": 1}
         monkeypatch.undo()
         assert batch.run(source, tmp_path / "out", jobs=1).resumed == 3
@@ -123,7 +123,7 @@ class TestTroubles:
         stars = write_stars(tmp_path / "set", ["a", "b"])
         (tmp_path / "out").mkdir()
         orders = Orders(tmp_path / "out", batch.Settings())
-        one = keeper.Keeper(orders)
+        one = supervisor.Supervisor(orders)
         try:
             first, second = batch.find_problems(stars)
             assert one.attend(first).outcome == "injective"
@@ -146,7 +146,7 @@ def test_a_worker_that_nobody_listens_to_blames_no_problem(tmp_path):
         "settings": batch.Settings().to_dict(),
         "record": {"problem": "a"},
     }
-    with subprocess.Popen(keeper.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(supervisor.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert json.loads(process.stdout.readline()) == {"ready": True}
         process.stdout.close()
         process.stdin.write(json.dumps(job).encode() + b"\n")
@@ -163,8 +163,8 @@ def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
     command = [sys.executable, "-m", "quasiharmonic", "batch", str(source), "-j", "2", "-o"]
     out, straight = tmp_path / "killed", tmp_path / "straight"
     run = (
-        "from quasiharmonic import batch; from quasiharmonic.batch import keeper; "
-        f"keeper.COMMAND = {TROUBLED!r}; batch.run({str(source)!r}, {str(out)!r}, jobs=2)"
+        "from quasiharmonic import batch; from quasiharmonic.batch import supervisor; "
+        f"supervisor.COMMAND = {TROUBLED!r}; batch.run({str(source)!r}, {str(out)!r}, jobs=2)"
     )
     driver = subprocess.Popen([sys.executable, "-c", run])
     while len(list(out.rglob("record.json"))) < 5:
@@ -201,8 +201,8 @@ def test_an_orphan_that_hangs_ends_by_itself(tmp_path, monkeypatch):
     write_stars(tmp_path / "set", ["spin"])
     script = f"import sys, quasiharmonic.batch.worker as w; w._GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
     run = (
-        "import sys; from quasiharmonic import batch; from quasiharmonic.batch import keeper; "
-        f"keeper.COMMAND = [sys.executable, '-c', {script!r}]; "
+        "import sys; from quasiharmonic import batch; from quasiharmonic.batch import supervisor; "
+        f"supervisor.COMMAND = [sys.executable, '-c', {script!r}]; "
         f"batch.run({str(tmp_path / 'set')!r}, {str(tmp_path / 'out')!r}, jobs=1, time_limit=1.5)"
     )
     driver = subprocess.Popen([sys.executable, "-c", run])

@@ -48,7 +48,7 @@ def test_a_name_is_all_that_goes_into_a_problem(family):
 
 def test_pins_lie_inside():
     case = problems.make("pins", 1, 0.5, triangles=200)
-    assert Problem(case.V, case.F, case.fixed, case.target).pins.size > 0
+    assert Problem(case.V, case.F, case.fixed, case.target).domain.pins.size > 0
 
 
 def test_rest_meshes_come_with_slivers_and_wild_areas():

@@ -266,7 +266,7 @@ class TestTargetsThatCrossThemselves:
 
     def test_are_impossible_where_they_turn_too_little(self):
         V, F = random_delaunay(60, seed=1)
-        (loop,) = onto((V, F), circle(len(boundary_of(F)))).loops
+        (loop,) = onto((V, F), circle(len(boundary_of(F)))).domain.loops
         t = 2 * np.pi * (np.arange(len(loop)) + 0.3) / len(loop)
         result = injective_map(V, F, loop, np.stack([np.sin(t), np.sin(2 * t)], axis=1))
         assert result.status is Status.IMPOSSIBLE

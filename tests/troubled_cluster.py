@@ -6,13 +6,13 @@ import os
 import signal
 import time
 
-from quasiharmonic.batch.keeper import Keeper
+from quasiharmonic.batch.supervisor import Supervisor
 from quasiharmonic.io.errors import OutputError
 
-_attend = getattr(Keeper.attend, "plain", Keeper.attend)
+_attend = getattr(Supervisor.attend, "plain", Supervisor.attend)
 
 
-def attend(keeper, files):
+def attend(supervisor, files):
     if "poison" in files.name:
         os.kill(os.getpid(), signal.SIGKILL)
     if "hang" in files.name:
@@ -20,10 +20,10 @@ def attend(keeper, files):
     if files.name == "full":
         raise OutputError("cannot write full: No space left on device")
     if files.name == "mistake":
-        return attend(keeper, files)
-    return _attend(keeper, files)
+        return attend(supervisor, files)
+    return _attend(supervisor, files)
 
 
 # Dask loads this file more than once.
 attend.plain = _attend
-Keeper.attend = attend
+Supervisor.attend = attend

@@ -1,11 +1,10 @@
 """Data sets: thousands of problems, on one machine or on a cluster, none lost; their records and a report of them."""
 
 from quasiharmonic.batch.driver import Progress, run
-from quasiharmonic.batch.keeper import WorkerError
 from quasiharmonic.batch.problems import ProblemFiles, find_problems
 from quasiharmonic.batch.records import COLUMNS, OUTCOMES, read_table, write_table
-from quasiharmonic.batch.report import write_report
 from quasiharmonic.batch.settings import Settings
+from quasiharmonic.batch.supervisor import WorkerError
 
 __all__ = [
     "COLUMNS",
@@ -17,6 +16,5 @@ __all__ = [
     "find_problems",
     "read_table",
     "run",
-    "write_report",
     "write_table",
 ]

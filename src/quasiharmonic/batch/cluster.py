@@ -8,9 +8,9 @@ from collections.abc import Generator, Iterator
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from quasiharmonic.batch.keeper import Finished, Keeper, lost
 from quasiharmonic.batch.problems import MARKER, ProblemFiles
 from quasiharmonic.batch.settings import Orders
+from quasiharmonic.batch.supervisor import Finished, Supervisor, lost
 
 # Problems given out for every thread of the cluster: enough that none waits for the next, few to be lost with a driver.
 _AHEAD = 3
@@ -48,7 +48,7 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
     ConnectionError
         When the scheduler is not there or not there any more.
     OutputError, WorkerError
-        As a `Keeper` on a worker raised it.
+        As a `Supervisor` on a worker raised it.
     """
     try:
         from distributed import Client
@@ -135,12 +135,12 @@ def attend(files: ProblemFiles, orders: Orders) -> Finished | Exception:
             "machines share, under the same paths"
         )
     try:
-        keeper = getattr(_mine, "keeper", None)
-        if keeper is None or keeper.orders != orders:
-            if keeper is not None:
-                keeper.close()
-            keeper = _mine.keeper = Keeper(orders)
-        return keeper.attend(files)
+        supervisor = getattr(_mine, "supervisor", None)
+        if supervisor is None or supervisor.orders != orders:
+            if supervisor is not None:
+                supervisor.close()
+            supervisor = _mine.supervisor = Supervisor(orders)
+        return supervisor.attend(files)
     except OSError as error:
         return type(error)(str(error))
     except Exception as error:

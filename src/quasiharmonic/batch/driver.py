@@ -15,10 +15,10 @@ from typing import Any, get_args
 
 from quasiharmonic import __version__
 from quasiharmonic.batch import records
-from quasiharmonic.batch.keeper import ClosedError, Finished, Keeper, resident
 from quasiharmonic.batch.lock import alone
 from quasiharmonic.batch.problems import MARKER, ProblemFiles, find_problems
 from quasiharmonic.batch.settings import Orders, Settings
+from quasiharmonic.batch.supervisor import ClosedError, Finished, Supervisor, resident
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import OutputError
 
@@ -266,24 +266,24 @@ def _cores() -> int:
 
 def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator[Finished | None]:
     """Solve problems in processes of this machine; yields None now and then while nothing is finished."""
-    keepers = [Keeper(orders) for _ in range(jobs)]
+    supervisors = [Supervisor(orders) for _ in range(jobs)]
     lock, finished = threading.Lock(), SimpleQueue[Finished | BaseException | None]()
 
-    def attend(keeper: Keeper) -> None:
+    def attend(supervisor: Supervisor) -> None:
         try:
             while True:
                 with lock:
                     files = next(todo, None)
                 if files is None:
                     break
-                finished.put(keeper.attend(files))
+                finished.put(supervisor.attend(files))
         except ClosedError:
             pass
         except BaseException as error:
             finished.put(error)
         finished.put(None)
 
-    threads = [threading.Thread(target=attend, args=(keeper,), daemon=True) for keeper in keepers]
+    threads = [threading.Thread(target=attend, args=(supervisor,), daemon=True) for supervisor in supervisors]
     for thread in threads:
         thread.start()
     working = jobs
@@ -301,7 +301,7 @@ def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator
             else:
                 yield item
     finally:
-        for keeper in keepers:
-            keeper.close()
+        for supervisor in supervisors:
+            supervisor.close()
         for thread in threads:
             thread.join()

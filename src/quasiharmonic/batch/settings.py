@@ -98,7 +98,7 @@ def _code() -> str:
     digest = blake2b(digest_size=16)
     for path in sorted(package.rglob("*.py")):
         place = path.relative_to(package).as_posix()
-        if not place.startswith(("cli/", "plot/", "batch/report/")):
+        if not place.startswith(("cli/", "plot/", "report/")):
             contents = path.read_bytes()
             digest.update(f"{place}\0{len(contents)}\0".encode())
             digest.update(contents)

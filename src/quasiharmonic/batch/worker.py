@@ -1,7 +1,7 @@
 """One process that solves problems one after another: jobs come on standard input, answers go to standard output.
 
 Both are lines of JSON. Nothing a problem does is let out: it ends in a record, which is written next to the
-map before the answer is given, or in the death of this process, which `quasiharmonic.batch.keeper` records.
+map before the answer is given, or in the death of this process, which `quasiharmonic.batch.supervisor` records.
 """
 
 from __future__ import annotations

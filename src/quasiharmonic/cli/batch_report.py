@@ -34,7 +34,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the page."""
-    from quasiharmonic.batch import write_report
+    from quasiharmonic.report import write_report
 
     folder: Path = options.records if options.records.is_dir() else options.records.parent
     output = options.output or folder / "report.html"

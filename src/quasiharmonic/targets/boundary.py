@@ -13,10 +13,10 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.targets.chords import chords_of
 from quasiharmonic.targets.contours import from_corner, in_unit
 from quasiharmonic.targets.correspondence import arc, seen_flat
-from quasiharmonic.targets.course import Course
 from quasiharmonic.targets.holes import least_stretch, match_holes
 from quasiharmonic.targets.nesting import Arranged, arranged
 from quasiharmonic.targets.pins import Corners, Pins
+from quasiharmonic.targets.placement import Placement
 
 
 def boundary_to(
@@ -91,14 +91,14 @@ def boundary_to(
         to[free[int(np.argmax([np.linalg.norm(_vector_area(space[loops[i]])) for i in free]))]] = 0
     outer = next(i for i, contour in to.items() if contour == 0)
 
-    def course(i: int) -> Course:
+    def placement(i: int) -> Placement:
         chords = chords_of(loops[i], surface.edges.interior, count)
-        return Course(arc(space[loops[i]]), contours[to[i]], pins.along(i, to[i]), chords, loops[i], corner_angle)
+        return Placement(arc(space[loops[i]]), contours[to[i]], pins.along(i, to[i]), chords, loops[i], corner_angle)
 
-    places = {outer: course(outer).fitted(seen_flat(space[loops[outer]], contours[0]))}
+    places = {outer: placement(outer).fitted(seen_flat(space[loops[outer]], contours[0]))}
     if len(loops) > 1:
         to |= match_holes(surface, outer, places[outer], contours, to)
-        places |= least_stretch(surface, places, {i: course(i).choices() for i in to if i != outer})
+        places |= least_stretch(surface, places, {i: placement(i).choices() for i in to if i != outer})
     target = np.ldexp(np.concatenate([places[i] for i in range(len(loops))]), exponent)
     _check_simple(loops, target, count)
     return np.concatenate(loops), target

@@ -51,14 +51,14 @@ class Finished(NamedTuple):
 
 
 class ClosedError(Exception):
-    """The keeper was closed while a problem was being solved."""
+    """The supervisor was closed while a problem was being solved."""
 
 
 class WorkerError(OSError):
     """A process that solves problems could not be started."""
 
 
-class Keeper:
+class Supervisor:
     """Solves one problem at a time in a process of its own.
 
     Parameters
@@ -154,7 +154,7 @@ class Keeper:
 
 
 def lost(files: ProblemFiles, orders: Orders, why: str) -> Finished:
-    """Record a problem as a crash that has taken its keeper along.
+    """Record a problem as a crash that has taken its supervisor along.
 
     Raises
     ------

@@ -11,11 +11,11 @@ from math import isfinite, isnan
 import numpy as np
 
 from quasiharmonic.batch.records import OUTCOMES, Record
-from quasiharmonic.batch.report import figures, numbers
-from quasiharmonic.batch.report.numbers import PHASES, Run
-from quasiharmonic.batch.report.style import STYLE
-from quasiharmonic.batch.report.thumbnails import thumbnail
 from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.report import figures, numbers
+from quasiharmonic.report.numbers import PHASES, Run
+from quasiharmonic.report.style import STYLE
+from quasiharmonic.report.thumbnails import thumbnail
 
 # Problems shown with a picture in each list, and failures named in all.
 _PICTURES, _FAILURES, _NAMED = 12, 24, 500

@@ -55,7 +55,7 @@ def make_room(
         here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
         spare = _between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
         straight = _between(wanted, stretch.within(t, left)[1]) == 0
-        room = _Room(_reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
+        room = _ChordRoom(_reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
         chosen = _choose(stretch.along, wanted, room)
         if chosen is None:
             return None
@@ -65,7 +65,7 @@ def make_room(
 
 
 @dataclass(frozen=True)
-class _Room:
+class _ChordRoom:
     """What the convex corners of a stretch must leave between them, side by side.
 
     Attributes
@@ -103,7 +103,7 @@ def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
     return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")
 
 
-def _choose(along: FloatArray, wanted: FloatArray, room: _Room) -> IntArray | None:
+def _choose(along: FloatArray, wanted: FloatArray, room: _ChordRoom) -> IntArray | None:
     """Vertices for wanted places with the least sum of squared distances that leaves room; None if none does.
 
     Row j of ``cost`` holds, for every vertex, the best that can be done for the places up to j when j

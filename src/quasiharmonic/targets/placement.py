@@ -8,9 +8,9 @@ import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.exact.loops import contacts
+from quasiharmonic.targets.chord_room import make_room
 from quasiharmonic.targets.chords import STRAIGHT, flat_chords
 from quasiharmonic.targets.correspondence import Held, at, best_start, off, places_along
-from quasiharmonic.targets.room import make_room
 
 # Starts that are tried, nearest to the best fit first, where chords have no room.
 _MOST_STARTS = 256
@@ -21,7 +21,7 @@ _STRAY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class Placement:
     """One boundary loop and the contour that it goes to.
 
     Attributes
