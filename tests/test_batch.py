@@ -19,7 +19,7 @@ import pytest
 import quasiharmonic
 from datasets import record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch, certify, io
-from quasiharmonic.batch import keeper, records
+from quasiharmonic.batch import records, supervisor
 from quasiharmonic.batch import settings as settings_module
 from quasiharmonic.batch.supervisor import Finished
 from quasiharmonic.cli import main
@@ -43,7 +43,7 @@ def stars(tmp_path):
 
 @pytest.fixture
 def troubled(monkeypatch):
-    monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
+    monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
 
 
 class TestFinding:
@@ -239,7 +239,7 @@ class TestRun:
 
     def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
         batch.run(stars, tmp_path / "out", jobs=1)
-        monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
+        monkeypatch.setattr(supervisor, "COMMAND", ["/nonexistent"])
         assert batch.run(stars, tmp_path / "out").resumed == 4
 
     def test_plain_meshes_onto_an_outline(self, stars, tmp_path):
@@ -302,19 +302,19 @@ class TestRun:
             batch.run(stars, tmp_path / "file")
 
     def test_worker_that_does_not_start(self, stars, tmp_path, monkeypatch, capsys):
-        monkeypatch.setattr(keeper, "COMMAND", [sys.executable, "-c", "raise SystemExit('no such luck')"])
+        monkeypatch.setattr(supervisor, "COMMAND", [sys.executable, "-c", "raise SystemExit('no such luck')"])
         with pytest.raises(batch.WorkerError, match="no such luck"):
             batch.run(stars, tmp_path / "out")
-        monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
+        monkeypatch.setattr(supervisor, "COMMAND", ["/nonexistent"])
         assert main(["batch", str(stars), "-o", str(tmp_path / "out")]) == 2
         assert "cannot start /nonexistent" in capsys.readouterr().err
 
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
         """Thousands of folders with a file each that nobody looks into."""
 
-        def attend(keeper, files):
-            records.clear(keeper.orders.folder(files.name))
-            records.write_record(keeper.orders.folder(files.name), {"problem": files.name, "outcome": "injective"})
+        def attend(supervisor, files):
+            records.clear(supervisor.orders.folder(files.name))
+            records.write_record(supervisor.orders.folder(files.name), {"problem": files.name, "outcome": "injective"})
             return Finished(files.name, "injective", 0.0)
 
         def look(progress):
@@ -322,7 +322,7 @@ class TestRun:
                 held = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/batch/*.py")])
                 sizes[progress.done] = sum(trace.size for trace in held.traces)
 
-        monkeypatch.setattr(keeper.Keeper, "attend", attend)
+        monkeypatch.setattr(supervisor.Keeper, "attend", attend)
         for k in range(1000):
             folder = tmp_path / "set" / f"{k // 50}" / f"{k}"
             folder.mkdir(parents=True)

@@ -1,0 +1,42 @@
+"""The recipes in CONTRIBUTING.md run as they stand, and what they name is there."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+RECIPES = dict(re.findall(r"^### ([^\n]*)\n\n```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL))
+PAGES = "CONTRIBUTING.md", "docs/architecture.md"
+
+
+def test_there_is_one_for_each():
+    assert set(RECIPES) == {
+        "An energy",
+        "A linear solver",
+        "A way to descend",
+        "A file format",
+        "An outline",
+        "A subcommand",
+    }
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipe_runs(name, tmp_path):
+    assert "assert" in RECIPES[name]
+    done = subprocess.run([sys.executable, "-c", RECIPES[name]], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_path_named_is_there(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:src|tests|docs|benchmarks|examples|[a-z]+/)[\w./]*\.\w+|[a-z]+/[\w./]+\.py)`", text))
+    missing = [name for name in named if not any((base / name).exists() for base in (ROOT, ROOT / "src/quasiharmonic"))]
+    assert named
+    assert missing == []
