@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 import quasiharmonic
-from datasets import record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch, certify, io
 from quasiharmonic.batch import keeper, records
 from quasiharmonic.batch import settings as settings_module
@@ -26,8 +25,9 @@ from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus
 from quasiharmonic.targets import outline, signed_area
+from shared.datasets import record_of, star_of, write_problem, write_stars
 
-TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
+TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("shared") / "troubled_worker.py")]
 linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
 
 

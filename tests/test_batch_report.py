@@ -12,11 +12,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from datasets import star_of, write_problem, write_stars
 from quasiharmonic import batch
 from quasiharmonic.batch import records
 from quasiharmonic.batch.report import figures, numbers, page
 from quasiharmonic.cli import main
+from shared.datasets import star_of, write_problem, write_stars
 
 VILE = '<script>alert(1)</script>"><img src=x onerror=alert(2)>&amp;\u202egnp'
 

@@ -1,21 +1,17 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, certify, solve
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.strategy import stages_of
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
 import campaign
 import problems
 import speed
+from quasiharmonic import Problem, certify, solve
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.strategy import stages_of
 
 FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"]
 

@@ -7,17 +7,14 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from meshes import lift, signed_areas
-from obstructed import OBSTRUCTED
 from quasiharmonic import io
 from quasiharmonic.cli import main
-
-CASES = Path(__file__).parents[2] / "shared" / "cases"
+from shared.meshes import lift, signed_areas
+from shared.obstructed import OBSTRUCTED
 
 
 def run(*arguments):
@@ -175,19 +172,6 @@ class TestRefuses:
         assert run("refine", tmp_path, "-o", tmp_path / "finer.obj") == 2
         assert "not in fixed" in capsys.readouterr().err
         assert sorted(p.name for p in tmp_path.iterdir()) == ["handles.txt", "input.obj"]
-
-
-@pytest.mark.skipif(not CASES.is_dir(), reason="the development cases are not beside this checkout")
-@pytest.mark.parametrize(("name", "vertex"), [("mask_crown", 2520), ("statue_spring", 918)])
-def test_real_cases(tmp_path, capsys, name, vertex):
-    folder, out = CASES / "hard" / name, tmp_path / "finer.obj"
-    assert run("diagnose", folder) == 1
-    assert f"Vertex {vertex} " in capsys.readouterr().out
-    assert run("refine", folder, "-o", out) == 0
-    assert run("diagnose", out, "--fixed", tmp_path / "finer.handles") == 0
-    if name == "mask_crown":
-        # The other takes some ten seconds more.
-        assert run("map", out, "--fixed", tmp_path / "finer.handles", "-o", tmp_path / "map.obj") == 0
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills outright")

@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from meshes import boundary_of, lift, random_annulus, signed_areas
 from quasiharmonic import Descent, Problem, Status, distortion, flipped_triangles, is_injective, search, solve
 from quasiharmonic.coarse_problem import coarse_problem
 from quasiharmonic.mesh.coarsening import coarsen, touching
@@ -17,6 +16,7 @@ from quasiharmonic.prolongation import _places, prolong
 from quasiharmonic.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
+from shared.meshes import boundary_of, lift, random_annulus, signed_areas
 
 
 def meshes():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, surfaces
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.derivatives import derivative_error
 from quasiharmonic.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet
@@ -14,6 +13,7 @@ from quasiharmonic.measures import distortion
 from quasiharmonic.newton_system import NewtonSystem
 from quasiharmonic.springs import MassSpring
 from quasiharmonic.surfaces import grid, random_delaunay
+from shared.meshes import bend, boundary_of, lift, surfaces
 
 
 def name_of(energy):

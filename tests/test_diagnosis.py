@@ -7,12 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from obstructed import HOUSE, OBSTRUCTED, circle, loose_wheel, moved, onto, two_wheels
 from quasiharmonic.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.inject import injective_map
 from quasiharmonic.problem import Problem
 from quasiharmonic.refinement import refine
 from quasiharmonic.surfaces import disk
+from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto
+from shared.polygons import circle
+from shared.small_meshes import loose_wheel, two_wheels
 
 
 def kinds(problem):

@@ -8,8 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from meshes import boundary_of
-from obstructed import OBSTRUCTED, U, circle, onto, random_polygon, spiral
 from quasiharmonic.boundary_curves import contacts, winding
 from quasiharmonic.diagnosis import Kind, diagnose, examine, shortcuts
 from quasiharmonic.diagnosis.clearance import clear
@@ -19,6 +17,9 @@ from quasiharmonic.diagnosis.views import Views
 from quasiharmonic.predicates import SegmentRelation, orientation, segment_relation
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
+from shared.meshes import boundary_of
+from shared.obstructed import OBSTRUCTED, onto
+from shared.polygons import U, circle, random_polygon, spiral
 
 
 def polygons():

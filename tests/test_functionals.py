@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 from quasiharmonic import Descent, solve
 from quasiharmonic.functionals import FUNCTIONALS, neumann_target
 from quasiharmonic.mesh.operators import operators
@@ -13,6 +12,7 @@ from quasiharmonic.objective import Objective
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, random_delaunay
 from quasiharmonic.tensor import TANH
+from shared.meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 
 MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]

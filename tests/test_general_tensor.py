@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 from quasiharmonic.general_tensor import (
     beltrami_pair,
     beltrami_tensor,
@@ -21,6 +20,7 @@ from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import random_delaunay
 from quasiharmonic.tensor import TANH
+from shared.meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 
 STAR = np.array([[0.0, -1.0], [1.0, 0.0]])
 MESHES = surfaces()

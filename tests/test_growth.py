@@ -10,7 +10,6 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from meshes import lift
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.mesh.coarsening import coarsen
@@ -20,6 +19,7 @@ from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.prolongation import prolong
 from quasiharmonic.surfaces import disk
 from quasiharmonic.targets import arc_length, letter, rectangle
+from shared.meshes import lift
 
 
 def posed(rings, character):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
 from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
 from quasiharmonic.derivatives import check_energy, derivative_error
@@ -20,6 +19,7 @@ from quasiharmonic.optimize.scaled_lbfgs import scaled_lbfgs
 from quasiharmonic.regularizers import Conformal
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length
+from shared.meshes import bend, boundary_of, lift, random_xi
 
 BARRIERS = {"mips", "symmetric-dirichlet"}
 

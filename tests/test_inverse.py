@@ -7,12 +7,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from meshes import bend, lift, random_annulus, signed_areas, surfaces
 from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints, distortion
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.nested_grid import NestedGrid
 from quasiharmonic.predicates import twice_area
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.meshes import bend, lift, random_annulus, signed_areas, surfaces
 
 
 def exact_areas(p, corners):

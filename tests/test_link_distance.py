@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from obstructed import U, circle, spiral
 from quasiharmonic.diagnosis.clipping import Lattice
 from quasiharmonic.diagnosis.links import Polygon
 from quasiharmonic.predicates import orientation
+from shared.polygons import U, circle, spiral
 
 
 def polygon(corners):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift
 from quasiharmonic import newton_descent
 from quasiharmonic.certificate import is_injective
 from quasiharmonic.deformation_energy import signed_areas
@@ -18,6 +17,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.result import Status
 from quasiharmonic.springs import MassSpring
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
+from shared.meshes import bend, boundary_of, lift
 
 
 def twisted(V, turns=0.2):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import boundary_of, signed_areas
 from quasiharmonic import Descent, Problem, injective_map, solve
 from quasiharmonic.surfaces import annulus
+from shared.meshes import boundary_of, signed_areas
 
 
 def turned_ring():

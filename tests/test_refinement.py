@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import boundary_of, signed_areas, surfaces
-from obstructed import OBSTRUCTED
 from quasiharmonic import Problem
 from quasiharmonic.diagnosis import diagnose
 from quasiharmonic.mesh.topology import edges
 from quasiharmonic.refinement import refine, refine_problem
+from shared.meshes import boundary_of, signed_areas, surfaces
+from shared.obstructed import OBSTRUCTED
 
 TWO = ([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], [[0, 1, 2], [0, 2, 3]])
 

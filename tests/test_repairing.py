@@ -8,11 +8,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, signed_areas
 from quasiharmonic import certify, distortion, flipped_triangles, io, repair
 from quasiharmonic.cli import main
 from quasiharmonic.seams import fans, islands
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.meshes import bend, boundary_of, lift, signed_areas
 
 
 def atlas(cells=12):
