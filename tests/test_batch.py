@@ -204,10 +204,10 @@ class TestRun:
             ("batch/report/page.py", "only shows"),
         ):
             (package / file).write_text(text)
-            states.append(settings_module._code.__wrapped__())
+            states.append(settings_module.sources_digest.__wrapped__())
         assert len(set(states)) == 3
         assert states[2] == states[3]
-        monkeypatch.setattr(settings_module, "_code", lambda: states[0])
+        monkeypatch.setattr(settings_module, "sources_digest", lambda: states[0])
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0
 
     def test_one_run_at_a_time(self, stars, tmp_path):
@@ -416,21 +416,29 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("text", "value"), [("800M", 800 << 20), ("4G", 4 << 30), ("1.5 GiB", 3 << 29), ("7k", 7168)]
     )
-    def test_sizes(self, text, value):
-        from quasiharmonic.cli.batch import _bytes
+    def test_sizes(self, text, value, monkeypatch):
+        asked = []
 
-        assert _bytes(text) == value
-        for wrong in ("", "4X", "-1G", "0", "1.2.3G", "."):
-            with pytest.raises(Exception, match="not a size"):
-                _bytes(wrong)
+        def run(*arguments, memory_limit, **options):
+            asked.append(memory_limit)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(batch, "run", run)
+        assert main(["batch", "set", "-o", "out", "--memory-limit", text]) == 2
+        assert asked == [value]
+
+    @pytest.mark.parametrize("text", ["", "4X", "-1G", "0", "1.2.3G", "."])
+    def test_what_is_no_size(self, text, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main(["batch", "set", "-o", "out", f"--memory-limit={text}"])
+        assert stop.value.code == 2
+        assert "is not a size" in capsys.readouterr().err
 
     def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
         pty = pytest.importorskip("pty")
         leader, follower = pty.openpty()
         # Told of every problem, however soon the next one is done.
-        often = (
-            "import sys; from quasiharmonic.cli import batch, main; batch._LIVE = batch._LOG = 0; main(sys.argv[1:])"
-        )
+        often = "import sys; from quasiharmonic.cli import batch, main; batch.LIVE = batch.LOG = 0; main(sys.argv[1:])"
         command = [sys.executable, "-c", often, "batch", str(stars), "-j", "1", "-o"]
         run = subprocess.Popen([*command, str(tmp_path / "1")], stdout=subprocess.DEVNULL, stderr=follower)
         os.close(follower)

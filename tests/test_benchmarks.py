@@ -102,14 +102,14 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
 
 
 def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch):
-    start = campaign._Worker._start
+    start = campaign.Worker.start
     spares = [-30.0, 30.0]
 
     def impatient(worker):
         start(worker)
         worker.spare = spares.pop(0)
 
-    monkeypatch.setattr(campaign._Worker, "_start", impatient)
+    monkeypatch.setattr(campaign.Worker, "start", impatient)
     # 45 000 triangles, not to be solved within the first second.
     todo = ["pins:96:0.831", "swirl:0:0.1"]
     first, second = campaign.campaign(todo, tmp_path / "results.jsonl", limit=30)

@@ -155,7 +155,7 @@ def winding_number(x, corners):
 
 @pytest.mark.parametrize("chunk", [1, 1 << 18])
 def test_winding_numbers(rng, monkeypatch, chunk):
-    monkeypatch.setattr("quasiharmonic.boundary_curves._PAIR_CHUNK", chunk)
+    monkeypatch.setattr("quasiharmonic.boundary_curves.PAIR_CHUNK", chunk)
     for n in (3, 8, 30):
         corners = rng.integers(0, 9, (n, 2)).astype(float)
         points = np.concatenate([rng.integers(0, 9, (40, 2)), rng.integers(0, 18, (40, 2)) / 2, corners])
@@ -214,7 +214,7 @@ def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
     problems = [*random_problems(), *(problem for problem, _ in OBSTRUCTED.values())]
     quick = [found(problem) for problem in problems]
     monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
-    monkeypatch.setattr(shortcuts.Shortcuts, "_within", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
+    monkeypatch.setattr(shortcuts.Shortcuts, "within", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
     assert quick == [found(problem) for problem in problems]
     kinds = {kind for some in quick for kind, *_ in some}
     assert {Kind.HIDDEN, Kind.HALF_PLANES, Kind.LINK_DISTANCE, Kind.CHORD} <= kinds
@@ -222,7 +222,7 @@ def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
 
 def test_what_takes_too_long_is_said_to_be_unchecked(monkeypatch):
     problem, _ = OBSTRUCTED["nothing sees all"]
-    monkeypatch.setattr(examine, "_MOST_EFFORT", 0)
+    monkeypatch.setattr(examine, "MOST_EFFORT", 0)
     diagnosis = diagnose(problem)
     assert not diagnosis.obstructions
     assert "the fixed neighbours of vertex 8" in diagnosis.unchecked[0]

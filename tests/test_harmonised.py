@@ -293,7 +293,7 @@ class TestHarmonise:
         """Where all that is found is inverted, the given map comes back, and the status says so."""
         V, F, uv, fixed = bowl()
         monkeypatch.setattr("quasiharmonic.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
-        monkeypatch.setattr("quasiharmonic.harmonic_descent._RIGHTING", 1)
+        monkeypatch.setattr("quasiharmonic.harmonic_descent.RIGHTING", 1)
         result = harmonise(V, F, uv, fixed=fixed, energy="arap", iterations=5)
         assert result.injective
         assert result.status is not Status.POLISHED

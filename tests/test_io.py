@@ -18,7 +18,7 @@ from hypothesis.extra.numpy import arrays
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
 from quasiharmonic.io.meshdata import is_planar
-from quasiharmonic.io.obj import _read_regular
+from quasiharmonic.io.obj import read_regular
 from quasiharmonic.io.objlines import read_obj_lines
 from quasiharmonic.io.textual import read_text
 from shared.datasets import write_problem
@@ -68,7 +68,7 @@ def same(a, b):
 
 def both_readers_agree(path):
     data = read_text(path)
-    regular = _read_regular(path, data)
+    regular = read_regular(path, data)
     return regular is not None and same(regular, read_obj_lines(path, data))
 
 
@@ -150,7 +150,7 @@ def test_decimal_text_is_rounded_correctly(put, regular):
     ]
     lines = "".join(f"v {t} {t} {t}\n" for t in texts) + ("" if regular else " ") + "f 1 2 3\n"
     path = put(lines)
-    assert (_read_regular(path, read_text(path)) is not None) == regular
+    assert (read_regular(path, read_text(path)) is not None) == regular
     V = io.read_mesh(path).V
 
     def nearest(x):

@@ -113,7 +113,7 @@ def obj_texts(draw):
 @given(obj_texts())
 def test_both_obj_readers_agree(data):
     data += b"" if data.endswith(b"\n") else b"\n"
-    regular = obj_module._read_regular("x", data)
+    regular = obj_module.read_regular("x", data)
     event("regular" if regular is not None else "irregular")
     careful = outcome(read_obj_lines, "x", data)
     if regular is not None:
@@ -155,7 +155,7 @@ def test_both_off_readers_agree(data):
         path = Path(folder) / "fuzz.off"
         path.write_bytes(data)
         either = outcome(io.read_off, path)
-        patch.setattr(off_module, "_read_regular", lambda *args: None)
+        patch.setattr(off_module, "read_regular", lambda *args: None)
         assert outcome(io.read_off, path) == either
 
 

@@ -15,9 +15,9 @@ from quasiharmonic.objective import Iterate, Objective
 from quasiharmonic.optimize import weighing
 from quasiharmonic.optimize.alternating import alternating, own_tensor
 from quasiharmonic.optimize.lbfgs import lbfgs
-from quasiharmonic.optimize.newton import _gather, _Model, newton
+from quasiharmonic.optimize.newton import Model, gather, newton
 from quasiharmonic.optimize.patches import Patch, last_untangled, patches
-from quasiharmonic.optimize.shaking import _left_of, _nearest, shaking
+from quasiharmonic.optimize.shaking import left_of, nearest, shaking
 from quasiharmonic.optimize.untangling import GRADINGS, Regularized, iterate_of, untangled, untangling
 from quasiharmonic.optimize.vector_adam import vector_adam
 from quasiharmonic.optimize.weighing import weighed
@@ -90,11 +90,11 @@ class TestNewton:
             ahead, behind = objective.evaluate(xi + h * d), objective.evaluate(xi - h * d)
             here = objective.evaluate(xi)
             second = (ahead.dirichlet - 2 * here.dirichlet + behind.dirichlet) / h**2
-            model = _Model(here)
+            model = Model(here)
             alpha, beta = (model.unit.conj() * d).real, (model.unit.conj() * d).imag
             bent = model.K[0] * alpha**2 + 2 * model.K[1] * alpha * beta + model.K[2] * beta**2
             along, across = model.B
-            load = _gather(here, along[0] * alpha + across[0] * beta, along[1] * alpha + across[1] * beta)
+            load = gather(here, along[0] * alpha + across[0] * beta, along[1] * alpha + across[1] * beta)
             load[objective.problem.fixed] = 0
             follow = np.vdot(load, objective.laplacian.respond(load)).real
             assert bent.sum() - follow == pytest.approx(second, rel=1e-4)
@@ -110,7 +110,7 @@ class TestNewton:
 
     def test_starts_from_zero_where_polar_coordinates_do_not(self, name, reference):
         objective = Objective(Problem(*star_problem(n=80)), parameterization=name, reference=reference)
-        model = _Model(objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex)))
+        model = Model(objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex)))
         for part in (*model.K, *model.g, *model.B[0], *model.B[1]):
             assert np.all(np.isfinite(part))
 
@@ -257,16 +257,16 @@ class TestUntangling:
 class TestShaking:
     def test_part_of_a_square_left_of_a_line(self):
         square = np.array([0, 1, 1 + 1j, 1j])
-        half = _left_of(square, 0.25 + 0j, 0.25 + 1j)
+        half = left_of(square, 0.25 + 0j, 0.25 + 1j)
         assert sorted(half.tolist(), key=lambda z: (z.real, z.imag)) == [0, 1j, 0.25, 0.25 + 1j]
-        assert len(_left_of(square, -1 - 1j, -1 + 1j)) == 0
-        np.testing.assert_array_equal(_left_of(square, 2 - 1j, 2 + 1j), square)
+        assert len(left_of(square, -1 - 1j, -1 + 1j)) == 0
+        np.testing.assert_array_equal(left_of(square, 2 - 1j, 2 + 1j), square)
 
     def test_nearest_point_of_an_outline(self):
         square = np.array([0, 1, 1 + 1j, 1j])
-        assert _nearest(square, 0.4 - 2j) == 0.4
-        assert _nearest(square, 3 + 3j) == 1 + 1j
-        assert _nearest(square, 0.9 + 0.5j) == 1 + 0.5j
+        assert nearest(square, 0.4 - 2j) == 0.4
+        assert nearest(square, 3 + 3j) == 1 + 1j
+        assert nearest(square, 0.9 + 0.5j) == 1 + 0.5j
 
     def test_goes_around_a_fold(self):
         """A free vertex must lie in a wedge behind a fold of the target, and starts in front of it."""

@@ -152,7 +152,7 @@ def test_segments_that_miss_each_other_by_a_rounding():
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
-    monkeypatch.setattr(predicates, "_PAIR_CHUNK", chunk)
+    monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
     for count in (0, 1, 2, 3, 8, 57):
         lo = rng.integers(0, 20, (count, 2)).astype(float)
         hi = lo + rng.integers(0, 5, (count, 2))
@@ -169,7 +169,7 @@ def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_between_two_kinds(rng, monkeypatch, chunk):
-    monkeypatch.setattr(predicates, "_PAIR_CHUNK", chunk)
+    monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
     for count, other in ((0, 3), (1, 1), (5, 0), (3, 40), (57, 8)):
         lo, low = rng.integers(0, 20, (count, 2)).astype(float), rng.integers(0, 20, (other, 2)).astype(float)
         hi, high = lo + rng.integers(0, 5, (count, 2)), low + rng.integers(0, 5, (other, 2))

@@ -252,7 +252,7 @@ def test_huge_drawings(read, tmp_path, monkeypatch):
     monkeypatch.setattr("quasiharmonic.targets.svgpath.MOST_POINTS", 1000)
     with pytest.raises(ValueError, match="more than 1,000 pieces"):
         read(drawing('<path d="M0 0' + "h1v1" * 600 + '"/>'))
-    monkeypatch.setattr("quasiharmonic.targets.svg._MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("quasiharmonic.targets.svg.MOST_BYTES", 1 << 20)
     with pytest.raises(ValueError, match="larger than 1 MiB; simplify"):
         read(drawing(" " * (1 << 20)))
     with pytest.raises(ValueError, match="tolerance is a share"):

@@ -14,7 +14,7 @@ from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
 from quasiharmonic.targets.correspondence import arc, at, off, places_along
 from quasiharmonic.targets.holes import least_stretch
-from quasiharmonic.targets.room import _choose, _reach, _Room, make_room
+from quasiharmonic.targets.room import Room, choose, make_room, reach
 from shared.meshes import lift
 from shared.written import written
 
@@ -298,11 +298,11 @@ def test_room_is_made_at_the_least_cost(rng):
         along = np.concatenate([[0], np.sort(rng.random(count - 1)), [1]])
         wanted = np.sort(rng.random(k))
         reach = np.minimum.accumulate(rng.integers(2, 8, count + 1)[::-1] + np.arange(count, -1, -1))[::-1]
-        room = _Room(
+        room = Room(
             np.minimum(reach, count + 1), rng.random(k + 1) < 0.7, rng.integers(0, 3, k + 1), rng.choice([0.3, 1])
         )
         cost, chosen = brute_force(along, wanted, room)
-        found = _choose(along, wanted, room)
+        found = choose(along, wanted, room)
         assert (found is None) == (chosen is None)
         if found is not None:
             solved += 1
@@ -322,7 +322,7 @@ def test_chords_across_a_pin_are_left_alone():
     ears = np.stack([np.arange(1, 11, 2) - 1, np.arange(1, 11, 2) + 1], axis=1)
     assert make_room(s, square, [(0, 0.0)], corner_angle=20, chords=ears) is None
     stretch = next(targets.correspondence.stretches(s, [(2, 0.0)]))
-    assert _reach(stretch, np.array([[3, 6], [1, 11]]), 12).tolist() == [
+    assert reach(stretch, np.array([[3, 6], [1, 11]]), 12).tolist() == [
         4,
         4,
         11,

@@ -44,7 +44,7 @@ _PROBING, _LENGTH, _MEMORY = 0.4, 0.1, 0.9
 # Of the mean stiffness that VectorAdam has learnt, the least that a triangle is given.
 _SOFTEST = 1e-3
 # Newton steps and local repairs for the last flips.
-_RIGHTING = 40
+RIGHTING = 40
 
 
 def own_xi(dw: Derivatives) -> ComplexArray:
@@ -130,7 +130,7 @@ class HarmonicDescent:
             try:
                 with self._stage(f"{name}, tanh"):
                     self._last = self.objective.evaluate(self._last.xi)
-                    method(self.objective, self._last, self._visit_to_right, iterations=_RIGHTING)
+                    method(self.objective, self._last, self._visit_to_right, iterations=RIGHTING)
             except Stop as stop:
                 if stop.status is Status.INJECTIVE:
                     return True

@@ -9,7 +9,7 @@ import time
 from quasiharmonic.batch.keeper import Keeper
 from quasiharmonic.io.errors import OutputError
 
-_attend = getattr(Keeper.attend, "plain", Keeper.attend)
+plain_attend = getattr(Keeper.attend, "plain", Keeper.attend)
 
 
 def attend(keeper, files):
@@ -21,9 +21,9 @@ def attend(keeper, files):
         raise OutputError("cannot write full: No space left on device")
     if files.name == "mistake":
         return attend(keeper, files)
-    return _attend(keeper, files)
+    return plain_attend(keeper, files)
 
 
 # Dask loads this file more than once.
-attend.plain = _attend
+attend.plain = plain_attend
 Keeper.attend = attend

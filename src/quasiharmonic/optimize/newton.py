@@ -66,7 +66,7 @@ def newton(
     mesh, problem = objective.mesh, objective.problem
     system = NewtonSystem(problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name)
     here, damping = start, _FIRST_DAMPING
-    model = _Model(here)
+    model = Model(here)
     for _ in range(iterations):
         try:
             step, predicted = model.step(system, damping)
@@ -81,12 +81,12 @@ def newton(
         if there is not None and gain > 1e-4:
             here = there
             visit(here)
-            model = _Model(here)
+            model = Model(here)
         elif damping > _MOST_DAMPING:
             raise Stop(Status.SETTLED)
 
 
-class _Model:
+class Model:
     """Second-order model of P around a quasi-harmonic map."""
 
     def __init__(self, here: Iterate) -> None:
@@ -150,7 +150,7 @@ class _Model:
 
         g1 = self.g[0] / l11
         g2 = (self.g[1] - l21 * g1) / l22
-        load = _gather(self.here, first[0] * g1 + second[0] * g2, first[1] * g1 + second[1] * g2)
+        load = gather(self.here, first[0] * g1 + second[0] * g2, first[1] * g1 + second[1] * g2)
         d = np.zeros(self.here.w.shape, dtype=np.complex128)
         d[system.free] = system.solve(load[system.free])
         dp, dq, _ = self.here.objective.mesh.derivatives(d)
@@ -174,7 +174,7 @@ def _less_squares(form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArra
     return QuadraticForm(pp, qq, p2, q2, pq, pqc)
 
 
-def _gather(here: Iterate, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
+def gather(here: Iterate, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
     """Derivatives by p and q as derivatives by the vertices' positions; (n,) complex128."""
     mesh = here.objective.mesh
     g = 0.5 * mesh.gamma
