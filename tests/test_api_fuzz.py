@@ -36,6 +36,8 @@ from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.damaged import VALID, damaged
 from shared.meshes import boundary_of, signed_areas
 
+pytestmark = pytest.mark.slow
+
 often = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 seldom = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

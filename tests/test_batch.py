@@ -223,6 +223,7 @@ class TestRun:
         assert refused[-1] == 4
         assert batch.run(stars, out).resumed == 4
 
+    @pytest.mark.slow
     def test_nothing_that_is_not_of_a_run_is_written_over(self, stars, tmp_path):
         for out in (stars, stars / "b", stars / "a"):
             with pytest.raises(ValueError, match=r"holds a problem, .*input.obj: name another folder"):
@@ -237,11 +238,13 @@ class TestRun:
         (tmp_path / "records.csv").unlink()
         assert batch.run(stars / "b", stars).solved == batch.run(stars / "b", stars).resumed == 2
 
+    @pytest.mark.slow
     def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
         batch.run(stars, tmp_path / "out", jobs=1)
         monkeypatch.setattr(keeper, "COMMAND", ["/nonexistent"])
         assert batch.run(stars, tmp_path / "out").resumed == 4
 
+    @pytest.mark.slow
     def test_plain_meshes_onto_an_outline(self, stars, tmp_path):
         io.write_off(stars / "ring.off", io.MeshData(*annulus(6)))
         settings = batch.Settings(to="letter:O")
@@ -254,6 +257,7 @@ class TestRun:
             areas = [abs(signed_area(uv[loop])) for loop in boundary_loops(written.F, len(uv))]
             np.testing.assert_allclose(sorted(areas), sorted(abs(signed_area(c)) for c in loops), rtol=0.2)
 
+    @pytest.mark.slow
     def test_a_drawing_is_part_of_the_input(self, stars, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         Path("outline.csv").write_text("0,0\n2,0\n2,1\n0,1\n")
@@ -266,6 +270,7 @@ class TestRun:
             batch.run(stars, "other", batch.Settings(to="blob:3"))
         assert not Path("other").exists()
 
+    @pytest.mark.slow
     def test_parquet(self, stars, tmp_path):
         pytest.importorskip("pyarrow")
         batch.run(stars, tmp_path / "out", jobs=1, table="parquet")
@@ -309,6 +314,7 @@ class TestRun:
         assert main(["batch", str(stars), "-o", str(tmp_path / "out")]) == 2
         assert "cannot start /nonexistent" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
         """Thousands of folders with a file each that nobody looks into."""
 
@@ -336,6 +342,7 @@ class TestRun:
         # A list of the problems would take half a megabyte.
         assert sizes[1000] < sizes[100] + 50_000
 
+    @pytest.mark.slow
     def test_an_interrupt_stops_at_once_and_keeps_what_is_done(self, stars, tmp_path, troubled):
         write_stars(stars, ["y_sleep"])
 
@@ -408,6 +415,7 @@ class TestCommand:
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_full_disk(self, tmp_path, capsys, troubled):
         write_stars(tmp_path / "set", ["full"])
         assert main(["batch", str(tmp_path / "set"), "-o", str(tmp_path / "out")]) == 2
@@ -434,6 +442,7 @@ class TestCommand:
         assert stop.value.code == 2
         assert "is not a size" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
         pty = pytest.importorskip("pty")
         leader, follower = pty.openpty()

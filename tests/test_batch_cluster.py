@@ -19,6 +19,8 @@ from quasiharmonic.batch.settings import Orders
 from quasiharmonic.cli import main
 from shared.datasets import lasting, record_of, write_stars
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("distributed")
 
 PRELOAD = Path(__file__).with_name("shared") / "troubled_cluster.py"

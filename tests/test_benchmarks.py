@@ -13,6 +13,8 @@ from quasiharmonic import Problem, certify, solve
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.strategy import stages_of
 
+pytestmark = pytest.mark.slow
+
 FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"]
 
 

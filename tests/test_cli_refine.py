@@ -174,6 +174,7 @@ class TestRefuses:
         assert sorted(p.name for p in tmp_path.iterdir()) == ["handles.txt", "input.obj"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills outright")
 def test_kill_9_leaves_each_file_old_or_new(tmp_path):
     write(tmp_path, "nothing sees all")

@@ -36,6 +36,7 @@ def test_every_kind_has_its_problem():
     assert {kind for _, (kind, _, _) in OBSTRUCTED.values()} == {kind.name for kind in Kind}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBSTRUCTED)
 def test_nothing_depends_on_scale_or_on_where_things_are(name):
     problem, _ = OBSTRUCTED[name]

@@ -87,6 +87,7 @@ def seen(here, eye, corners):
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", polygons()[:12])
 def test_wedges_hold_what_is_seen_and_no_more(corners, rng):
     n = len(corners)
@@ -210,6 +211,7 @@ def found(problem):
     ]
 
 
+@pytest.mark.slow
 def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
     problems = [*random_problems(), *(problem for problem, _ in OBSTRUCTED.values())]
     quick = [found(problem) for problem in problems]
@@ -228,6 +230,7 @@ def test_what_takes_too_long_is_said_to_be_unchecked(monkeypatch):
     assert "the fixed neighbours of vertex 8" in diagnosis.unchecked[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["wobble", "spiral", "star", "gear"])
 def test_ten_thousand_boundary_vertices(kind):
     problem = onto(grid(4980, 20), outlines(kind, 10_000))

@@ -44,6 +44,7 @@ def through_all(V, F, fixed, target, **more):
 
 
 class TestScales:
+    @pytest.mark.slow
     @pytest.mark.parametrize("scale", SCALES)
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     def test_of_the_rest_mesh(self, scale, reference):

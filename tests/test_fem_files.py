@@ -351,6 +351,7 @@ VECTORS u float
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "whole"),
     [

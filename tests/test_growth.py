@@ -164,6 +164,7 @@ class TestAllocations:
         V, F, _, _ = posed(80, "C")
         assert peak(certify, F, V[:, :2].copy())[0] / len(F) < 190
 
+    @pytest.mark.slow
     def test_grow_in_proportion(self):
         small, large = (posed(rings, "C") for rings in (60, 120))
         solve(Problem(*small))

@@ -276,6 +276,7 @@ def test_the_error_survives_pickling_and_odd_names():
     assert str(MeshFileError("\udcff.obj", "what")).encode() == b"\\udcff.obj: what"
 
 
+@pytest.mark.slow
 @posix
 def test_memory_stays_bounded_on_hostile_files(tmp_path):
     # Lines of 100 MB and of 20 MB; taken apart by the token they would need gigabytes. And indices and counts that
@@ -752,6 +753,7 @@ except OutputError as error:
     assert path.read_bytes() == b"old"
 
 
+@pytest.mark.slow
 @posix
 def test_kill_9_leaves_the_old_file_or_a_new_one(tmp_path):
     path = tmp_path / "mesh.obj"

@@ -159,6 +159,7 @@ def test_both_off_readers_agree(data):
         assert outcome(io.read_off, path) == either
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VALID)
 @quick
 @given(data=st.data())

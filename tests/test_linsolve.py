@@ -595,6 +595,7 @@ print(len(os.listdir("/proc/self/task")))
 """
 
 
+@pytest.mark.slow
 @needs_mkl
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts threads by /proc")
 @pytest.mark.parametrize("way", ["limit", "OMP_NUM_THREADS", "MKL_NUM_THREADS"])
@@ -634,6 +635,7 @@ for round in range(4):
 """
 
 
+@pytest.mark.slow
 @needs_mkl
 def test_pardiso_survives_changes_of_threads_between_its_phases():
     """Many factorisations, single and several right-hand sides; every solution's residual is examined."""
@@ -655,6 +657,7 @@ print(laplacian.solver.handle.threads)
 """
 
 
+@pytest.mark.slow
 @needs_mkl
 @pytest.mark.parametrize(
     ("name", "value", "threads"),

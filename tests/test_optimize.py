@@ -268,6 +268,7 @@ class TestShaking:
         assert nearest(square, 3 + 3j) == 1 + 1j
         assert nearest(square, 0.9 + 0.5j) == 1 + 0.5j
 
+    @pytest.mark.slow
     def test_goes_around_a_fold(self):
         """A free vertex must lie in a wedge behind a fold of the target, and starts in front of it."""
         case = problems.make(*problems.parse("jam:80:0.943"))
@@ -306,6 +307,7 @@ class TestWeighing:
         held = np.isin(np.arange(problem.n), problem.fixed)
         return Patch(problem.F, np.arange(problem.n), held), w
 
+    @pytest.mark.slow
     def test_rights_what_the_same_number_of_plain_descents_does_not(self):
         patch, start = self.stuck()
         assert signed_areas(patch.F, start).min() < 0
@@ -319,6 +321,7 @@ class TestWeighing:
             np.testing.assert_array_equal(end[patch.held], start[patch.held])
             assert np.sum(signed_areas(patch.F, end) <= 0) <= np.sum(signed_areas(patch.F, start) <= 0)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("spoilt", [False, True])
     def test_gives_back_what_it_cannot_better(self, spoilt, monkeypatch):
         """The last map of its rounds that is no worse than the one it was given; that one, where all are worse."""

@@ -203,6 +203,7 @@ def test_no_display_and_no_pyplot():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_distortion_is_drawn_for_every_measure(planar):
     V, F, folded = planar
     stretched = V * (3, 1)
@@ -224,6 +225,7 @@ def test_distortion_histogram_has_all_the_area(planar):
     assert max(heights) == pytest.approx(100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", LABELS)
 def test_colours_can_be_read_off(planar, measure):
     """Five values beside the bar, those of the histogram; open where there may be values beyond."""
@@ -248,6 +250,7 @@ def test_distortion_of_flat_triangles_and_of_no_value():
         plot_distortion(V, F, uv, "beauty")
 
 
+@pytest.mark.slow
 def test_texture_shows_the_board_and_what_is_inverted(planar, tmp_path):
     V, F, folded = planar
     figure = plot_texture(V, F, V, squares=4)
@@ -268,6 +271,7 @@ def test_texture_shows_the_board_and_what_is_inverted(planar, tmp_path):
         plot_texture(V, F, V, squares=0)
 
 
+@pytest.mark.slow
 def test_texture_shows_the_nearer_of_two_sheets():
     # Two squares over each other; only the upper one, mapped far to the right, is seen.
     V = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
@@ -332,6 +336,7 @@ def test_maps_and_triangles_that_do_not_fit_are_refused(planar, plot):
         plot(V, F + len(V), V)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-200, 1e200])
 def test_pictures_have_no_scale(planar, unit):
     V, F, folded = planar

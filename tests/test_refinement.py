@@ -156,6 +156,7 @@ def rounds_by_hand(problem):
     return V, F, values, number
 
 
+@pytest.mark.slow
 def test_problems_are_refined_until_nothing_is_named():
     most = 0
     for problem, _ in OBSTRUCTED.values():

@@ -1,4 +1,4 @@
-"""What tests share is in `shared`: no test module imports another, none reaches for private names or outside folders."""
+"""Tests share what is in `shared`: none imports another, reaches for private names, or looks outside the checkout."""
 
 from __future__ import annotations
 

@@ -71,6 +71,7 @@ def test_curves_and_their_smooth_continuations():
     assert all(np.array_equal(a, b) for a, b in zip(pieces, relative, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0, 30, -75])
 @pytest.mark.parametrize(("large", "sweep"), [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_arcs_lie_on_their_ellipse(turn, large, sweep):

@@ -352,6 +352,7 @@ def test_how_far_a_contour_is_cut_off():
     assert off(contour, np.roll(between, 3), np.roll(places, 3, axis=0)) == pytest.approx(off(contour, between, places))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("character", "GC352")
 @pytest.mark.parametrize("size", [(12, 8), (40, 20)])
 def test_corners_move_only_so_far(character, size):

@@ -70,6 +70,7 @@ def test_another_shape():
     assert drawn[0].sum() == drawn[:, :2].sum() == drawn[:, 6].sum() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(30, 1000), (1000, 30)])
 def test_narrow_pictures_leave_a_way(shape):
     size = np.array(shape[::-1]) - 1.0
@@ -79,6 +80,7 @@ def test_narrow_pictures_leave_a_way(shape):
     assert warped.moved[-1] == pytest.approx((0.5 + along) * size)
 
 
+@pytest.mark.slow
 def test_landmarks_on_the_border_take_it_along():
     image = np.tile(np.arange(1, 65, dtype=np.int16), (64, 1))
     # The lower side bends up, the right upper corner comes in; the left side stays.
@@ -124,6 +126,7 @@ def test_points_without_a_place_are_named():
             warp_along(np.zeros((4, 4)), before, [[0, 1, 2], [0, 2, 3]], after)
 
 
+@pytest.mark.slow
 def test_a_warp_that_cannot_be_says_what_to_do():
     with pytest.raises(RuntimeError, match="Move them less far"):
         warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]])
