@@ -18,7 +18,7 @@ import pytest
 
 import quasiharmonic
 from quasiharmonic import batch, certify, io
-from quasiharmonic.batch import keeper, records
+from quasiharmonic.batch import driver, keeper, records
 from quasiharmonic.batch import settings as settings_module
 from quasiharmonic.batch.keeper import Finished
 from quasiharmonic.cli import main
@@ -394,6 +394,32 @@ class TestTables:
             list(records.read_table(tmp_path / "none.csv"))
         with pytest.raises(ValueError, match=r"csv or .parquet"):
             list(records.read_table(tmp_path / "t.xls"))
+
+    def test_a_map_that_is_gone_is_made_again(self, stars, tmp_path):
+        out = tmp_path / "out"
+        batch.run(stars / "a", out)
+        (record,) = (out / "results").rglob("record.json")
+        maps = [path for path in record.parent.iterdir() if path != record]
+        assert batch.run(stars / "a", out).resumed == 1
+        for spoil in (lambda path: path.write_bytes(path.read_bytes()[:-9]), lambda path: path.unlink()):
+            whole = [path.read_bytes() for path in maps]
+            for path in maps:
+                spoil(path)
+            assert batch.run(stars / "a", out).resumed == 0
+            assert [path.read_bytes() for path in maps] == whole
+
+    def test_tables_that_are_none(self, tmp_path):
+        pytest.importorskip("pyarrow")
+        table = tmp_path / "records.parquet"
+        for text in (b"", b"PAR1 and nothing else"):
+            table.write_bytes(text)
+            with pytest.raises(ValueError, match=r"records\.parquet: cannot be read as a table"):
+                list(batch.read_table(table))
+
+    def test_a_limit_of_memory_where_it_cannot_be_told(self, stars, tmp_path, monkeypatch):
+        monkeypatch.setattr(driver, "resident", lambda pid: None)
+        with pytest.raises(ValueError, match=r"needs psutil on this system: pip install 'quasiharmonic\[batch\]'"):
+            batch.run(stars, tmp_path / "out", memory_limit=1 << 30)
 
     def test_parquet_without_pyarrow(self, stars, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "pyarrow", None)

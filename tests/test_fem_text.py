@@ -10,9 +10,11 @@ import zlib
 import numpy as np
 import pytest
 
+from quasiharmonic import surfaces
 from quasiharmonic.cli import main
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.fem import read_fem, write_fem
+from shared.meshes import boundary_of
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
 F = np.array([[0, 1, 2], [0, 2, 3]])
@@ -136,6 +138,38 @@ def test_a_binary_file_cut_short(tmp_path):
     refused(tmp_path / "bad.vtk", head + bytes(20), "ends too early")
     whole = head + POINTS.astype(">f4").tobytes() + b"\nPOINT_DATA 4\nVECTORS u double\n" + bytes(40)
     refused(tmp_path / "bad.vtk", whole, "ends too early")
+
+
+def legacy(points, faces):
+    """A planar mesh."""
+    rows = "\n".join(f"{x!r} {y!r} 0" for x, y in points.tolist())
+    cells = "\n".join(f"3 {a} {b} {c}" for a, b, c in faces.tolist())
+    lists = f"CELLS {len(faces)} {4 * len(faces)}\n{cells}\nCELL_TYPES {len(faces)}\n" + "5\n" * len(faces)
+    return HEAD + f"POINTS {len(points)} double\n{rows}\n" + lists
+
+
+def test_what_becomes_of_a_boundary_that_cannot_be_or_overlaps_itself(tmp_path, capsys):
+    mesh, table, out = tmp_path / "strip.vtk", tmp_path / "to.csv", tmp_path / "out.vtk"
+    points, faces = surfaces.grid(24, 2)
+    mesh.write_text(legacy(points, faces))
+    rim = boundary_of(faces)
+    command = ["morph", str(mesh), "-o", str(out), "--positions", str(table)]
+
+    # Once around and a little further: every triangle is right, and some lie on others.
+    turn = np.exp(8j * points[:, 0]) * (1.5 - 0.5 * points[:, 1])
+    table.write_text("".join(f"{k},{turn[k].real:.17g},{turn[k].imag:.17g}\n" for k in rim))
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "every triangle is positive" in said
+    assert "but the mesh overlaps itself" in said
+
+    # A mirror image.
+    table.write_text("".join(f"{k},{-points[k, 0]:.17g},{points[k, 1]:.17g}\n" for k in rim))
+    assert main(command) == 1
+    said = capsys.readouterr().out
+    assert f"of {len(faces)} triangles are not positive" in said
+    assert "wound against the mesh" in said
+    assert "mean-ratio quality after" in said
 
 
 # ---- VTU ------------------------------------------------------------------------------------------------------------

@@ -13,6 +13,8 @@ from matplotlib.image import imread
 from PIL import Image
 
 from quasiharmonic import flipped_triangles, surfaces
+from quasiharmonic import io as files
+from quasiharmonic.cli import main
 from quasiharmonic.measures import MEASURES
 from quasiharmonic.plot import (
     interactive,
@@ -373,6 +375,30 @@ def test_window(planar, tmp_path, monkeypatch):
     assert polyscope.get_view_camera_parameters().get_position()[2] > 1.3
     polyscope.remove_all_structures()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("V", "F", "uv", "message"),
+    [
+        (np.zeros((3, 2)), np.zeros((1, 4), dtype=int), np.zeros((3, 2)), r"F must have shape \(f, 3\), not \(1, 4\)"),
+        (np.zeros((3, 4)), [[0, 1, 2]], np.zeros((3, 2)), r"V must have shape \(n, 2\) or \(n, 3\), not \(3, 4\)"),
+    ],
+)
+def test_arrays_of_another_shape(V, F, uv, message):
+    with pytest.raises(ValueError, match=message):
+        plot_map(V, F, uv)
+
+
+def test_view_without_polyscope(planar, tmp_path, monkeypatch, capsys):
+    V, F, _ = planar
+    monkeypatch.setitem(sys.modules, "polyscope", None)
+    mesh = tmp_path / "map.obj"
+    files.write_obj(mesh, files.MeshData(V, F).with_map(V[:, :2]))
+    for more in ([], ["--screenshot", str(tmp_path / "view.png")]):
+        assert main(["view", str(mesh), *more]) == 2
+        assert "pip install 'quasiharmonic[view]'" in capsys.readouterr().err
+    assert main(["view", str(mesh), "--screenshot", str(tmp_path / "view.xyz")]) == 2
+    assert "view.xyz" in capsys.readouterr().err
 
 
 def test_window_without_polyscope(planar, monkeypatch):

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 FOLDER = Path(__file__).parent
+ROOT = FOLDER.parent
 MODULES = sorted(FOLDER.rglob("*.py"))
 TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
 # What `namedtuple` offers has an underscore so that it is no field, not because it is private.
@@ -71,3 +74,22 @@ def test_private_names_are_found(code):
 
 def test_a_test_is_found_wherever_it_is_imported():
     assert list(imports(ast.parse("def f():\n    from test_cli import run"))) == [("test_cli", "run")]
+
+
+def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
+    """Every package is of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
+    wanted = {
+        node.args[0].value
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip"
+    }
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    brought = re.search(r"\[(.*)\]", extras["test"][0]).group(1).split(",")
+    installed = " ".join(line for name in ("test", *brought) for line in extras[name])
+    optional = (ROOT / ".ci" / "optional").read_text(encoding="utf-8")
+    assert "'.[test,view]' gmsh vtk" in optional
+    assert "scikit-sparse" in optional
+    assert {"igl", "polyscope"} <= wanted
+    known = f"{installed} {' '.join(extras['view'])}"
+    assert not [name for name in wanted if name not in sys.stdlib_module_names and name not in known]

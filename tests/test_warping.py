@@ -152,6 +152,13 @@ def test_wrong_input(arguments, message):
         warp_by_landmarks(*arguments)
 
 
+@pytest.mark.parametrize("shape", [(0, 5), (5, -1)])
+def test_pictures_without_extent(shape):
+    V, F = surfaces.grid(3, 3)
+    with pytest.raises(ValueError, match=rf"shape must be positive, not \({shape[0]}, {shape[1]}\)"):
+        warp_along(np.zeros((9, 9)), V, F, V, shape=shape)
+
+
 def test_a_map_with_folds_is_refused():
     points = np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]])
     with pytest.raises(ValueError, match="no inverse"):
