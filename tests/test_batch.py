@@ -27,9 +27,6 @@ from quasiharmonic.surfaces import annulus
 from quasiharmonic.targets import outline, signed_area
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
-TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("shared") / "troubled_worker.py")]
-linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
-
 
 def names(source, **options):
     return [problem.name for problem in batch.find_problems(source, **options)]
@@ -39,11 +36,6 @@ def names(source, **options):
 def stars(tmp_path):
     """Four problems at several depths."""
     return write_stars(tmp_path / "set", ["a", "b/c", "b/d/e", "z"])
-
-
-@pytest.fixture
-def troubled(monkeypatch):
-    monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
 
 
 class TestFinding:

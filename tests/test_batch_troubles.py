@@ -15,17 +15,10 @@ import pytest
 from quasiharmonic import batch
 from quasiharmonic.batch import keeper
 from quasiharmonic.batch.settings import Orders
+from shared.commands import TROUBLED, linux
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
 pytestmark = pytest.mark.slow
-
-TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("shared") / "troubled_worker.py")]
-linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
-
-
-@pytest.fixture
-def troubled(monkeypatch):
-    monkeypatch.setattr(keeper, "COMMAND", TROUBLED)
 
 
 def children_of(process):

@@ -14,9 +14,9 @@ import pytest
 
 import problems
 from quasiharmonic import io
-from quasiharmonic.cli import main
 from quasiharmonic.measures import distortion
 from quasiharmonic.surfaces import random_delaunay
+from shared.commands import run
 from shared.meshes import boundary_of, lift, signed_areas
 from shared.solvable import star_problem, turned_ring
 from shared.written import written
@@ -34,10 +34,6 @@ def write_problem(folder, V, F, fixed, target, handles=True):
 @pytest.fixture
 def star(tmp_path):
     return write_problem(tmp_path, *star_problem())
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 class TestMap:

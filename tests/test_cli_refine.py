@@ -12,13 +12,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io
-from quasiharmonic.cli import main
+from shared.commands import run
 from shared.meshes import lift, signed_areas
 from shared.obstructed import OBSTRUCTED
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 def write(folder, name, **more):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, distortion, flipped_triangles, io, repair
-from quasiharmonic.cli import main
 from quasiharmonic.seams import fans, islands
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.commands import run
 from shared.meshes import bend, boundary_of, lift, signed_areas
 
 
@@ -54,10 +54,6 @@ def exact_signs(uv, FT):
         )
         signs.append((area > 0) - (area < 0))
     return np.array(signs)
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 class TestIslands:
