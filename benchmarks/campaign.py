@@ -108,14 +108,14 @@ def _serve(pipe: Connection, options: dict[str, Any]) -> None:
         pipe.send(run(name, **options))
 
 
-class _Worker:
+class Worker:
     """A process that solves one problem after another, and is replaced when it crashes or hangs."""
 
     def __init__(self, limit: float, options: dict[str, Any]) -> None:
         self.limit, self.options = limit, options
-        self._start()
+        self.start()
 
-    def _start(self) -> None:
+    def start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, self.options), daemon=True)
@@ -142,7 +142,7 @@ class _Worker:
 
     def _replaced(self, outcome: str, message: str) -> Record:
         self.stop()
-        self._start()
+        self.start()
         family, _, difficulty = parse(self.name)
         record = {"name": self.name, "family": family, "difficulty": difficulty, **self.options}
         return record | {"outcome": outcome, "message": message}
@@ -178,13 +178,13 @@ def campaign(
         if all(record.get(key, default) == options[key] for key, default in _DEFAULTS.items())
     }
     left = [name for name in todo if name not in done][::-1]
-    workers = [_Worker(limit, options) for _ in range(min(processes, len(left)))]
+    workers = [Worker(limit, options) for _ in range(min(processes, len(left)))]
     try:
         # A line that a kill has cut short stays alone, and is not read.
         torn = output.exists() and output.stat().st_size > 0 and output.read_bytes()[-1:] != b"\n"
         with output.open("a", encoding="utf-8") as file:
             file.write("\n" * torn)
-            idle, busy = workers[:], list[_Worker]()
+            idle, busy = workers[:], list[Worker]()
             while left or busy:
                 while left and idle:
                     busy.append(idle.pop())

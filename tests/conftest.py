@@ -1,15 +1,19 @@
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture
 def rng():
     """Random numbers, the same ones every time."""
     return np.random.default_rng(20231)
+
+
+@pytest.fixture
+def troubled(monkeypatch):
+    """Problems of a data set are solved by a process to which what their names say happens."""
+    from quasiharmonic.batch import supervisor
+    from shared.commands import TROUBLED
+
+    monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)

@@ -82,6 +82,7 @@ def test_shapes_push_each_other():
     assert right[:, 0].mean() > left[:, 0].mean() + 0.6
 
 
+@pytest.mark.slow
 def test_the_same_again_is_the_same_and_inputs_stay():
     V, F = surfaces.disk(3)
     kept = V.copy()
@@ -166,6 +167,7 @@ def test_what_touches_at_a_vertex_is_refused_by_name(offset, obstacle, names):
         AirMesh(np.concatenate([box, box + offset]), np.concatenate([F, F + 4]), [container, box + obstacle])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_a_frame_that_cannot_be_is_told_in_one_way(seed):
     rng = np.random.default_rng(seed)

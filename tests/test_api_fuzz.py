@@ -17,7 +17,6 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from meshes import boundary_of, signed_areas
 from quasiharmonic import (
     Problem,
     certify,
@@ -34,7 +33,10 @@ from quasiharmonic.cli import main
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
-from test_io_fuzz import VALID, damaged
+from shared.damaged import VALID, damaged
+from shared.meshes import boundary_of, signed_areas
+
+pytestmark = pytest.mark.slow
 
 often = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 seldom = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])

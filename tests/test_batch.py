@@ -17,18 +17,15 @@ import numpy as np
 import pytest
 
 import quasiharmonic
-from datasets import record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch, certify, io
-from quasiharmonic.batch import records, supervisor
+from quasiharmonic.batch import driver, records, supervisor
 from quasiharmonic.batch import settings as settings_module
 from quasiharmonic.batch.supervisor import Finished
 from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus
 from quasiharmonic.targets import outline, signed_area
-
-TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
-linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
+from shared.datasets import record_of, star_of, write_problem, write_stars
 
 
 def names(source, **options):
@@ -39,11 +36,6 @@ def names(source, **options):
 def stars(tmp_path):
     """Four problems at several depths."""
     return write_stars(tmp_path / "set", ["a", "b/c", "b/d/e", "z"])
-
-
-@pytest.fixture
-def troubled(monkeypatch):
-    monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
 
 
 class TestFinding:
@@ -204,10 +196,10 @@ class TestRun:
             ("report/page.py", "only shows"),
         ):
             (package / file).write_text(text)
-            states.append(settings_module._code.__wrapped__())
+            states.append(settings_module.sources_digest.__wrapped__())
         assert len(set(states)) == 3
         assert states[2] == states[3]
-        monkeypatch.setattr(settings_module, "_code", lambda: states[0])
+        monkeypatch.setattr(settings_module, "sources_digest", lambda: states[0])
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0
 
     def test_one_run_at_a_time(self, stars, tmp_path):
@@ -223,6 +215,7 @@ class TestRun:
         assert refused[-1] == 4
         assert batch.run(stars, out).resumed == 4
 
+    @pytest.mark.slow
     def test_nothing_that_is_not_of_a_run_is_written_over(self, stars, tmp_path):
         for out in (stars, stars / "b", stars / "a"):
             with pytest.raises(ValueError, match=r"holds a problem, .*input.obj: name another folder"):
@@ -237,11 +230,13 @@ class TestRun:
         (tmp_path / "records.csv").unlink()
         assert batch.run(stars / "b", stars).solved == batch.run(stars / "b", stars).resumed == 2
 
+    @pytest.mark.slow
     def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
         batch.run(stars, tmp_path / "out", jobs=1)
         monkeypatch.setattr(supervisor, "COMMAND", ["/nonexistent"])
         assert batch.run(stars, tmp_path / "out").resumed == 4
 
+    @pytest.mark.slow
     def test_plain_meshes_onto_an_outline(self, stars, tmp_path):
         io.write_off(stars / "ring.off", io.MeshData(*annulus(6)))
         settings = batch.Settings(to="letter:O")
@@ -254,6 +249,7 @@ class TestRun:
             areas = [abs(signed_area(uv[loop])) for loop in boundary_loops(written.F, len(uv))]
             np.testing.assert_allclose(sorted(areas), sorted(abs(signed_area(c)) for c in loops), rtol=0.2)
 
+    @pytest.mark.slow
     def test_a_drawing_is_part_of_the_input(self, stars, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         Path("outline.csv").write_text("0,0\n2,0\n2,1\n0,1\n")
@@ -266,6 +262,7 @@ class TestRun:
             batch.run(stars, "other", batch.Settings(to="blob:3"))
         assert not Path("other").exists()
 
+    @pytest.mark.slow
     def test_parquet(self, stars, tmp_path):
         pytest.importorskip("pyarrow")
         batch.run(stars, tmp_path / "out", jobs=1, table="parquet")
@@ -309,6 +306,7 @@ class TestRun:
         assert main(["batch", str(stars), "-o", str(tmp_path / "out")]) == 2
         assert "cannot start /nonexistent" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
         """Thousands of folders with a file each that nobody looks into."""
 
@@ -336,6 +334,7 @@ class TestRun:
         # A list of the problems would take half a megabyte.
         assert sizes[1000] < sizes[100] + 50_000
 
+    @pytest.mark.slow
     def test_an_interrupt_stops_at_once_and_keeps_what_is_done(self, stars, tmp_path, troubled):
         write_stars(stars, ["y_sleep"])
 
@@ -388,6 +387,32 @@ class TestTables:
         with pytest.raises(ValueError, match=r"csv or .parquet"):
             list(records.read_table(tmp_path / "t.xls"))
 
+    def test_a_map_that_is_gone_is_made_again(self, stars, tmp_path):
+        out = tmp_path / "out"
+        batch.run(stars / "a", out)
+        (record,) = (out / "results").rglob("record.json")
+        maps = [path for path in record.parent.iterdir() if path != record]
+        assert batch.run(stars / "a", out).resumed == 1
+        for spoil in (lambda path: path.write_bytes(path.read_bytes()[:-9]), lambda path: path.unlink()):
+            whole = [path.read_bytes() for path in maps]
+            for path in maps:
+                spoil(path)
+            assert batch.run(stars / "a", out).resumed == 0
+            assert [path.read_bytes() for path in maps] == whole
+
+    def test_tables_that_are_none(self, tmp_path):
+        pytest.importorskip("pyarrow")
+        table = tmp_path / "records.parquet"
+        for text in (b"", b"PAR1 and nothing else"):
+            table.write_bytes(text)
+            with pytest.raises(ValueError, match=r"records\.parquet: cannot be read as a table"):
+                list(batch.read_table(table))
+
+    def test_a_limit_of_memory_where_it_cannot_be_told(self, stars, tmp_path, monkeypatch):
+        monkeypatch.setattr(driver, "resident", lambda pid: None)
+        with pytest.raises(ValueError, match=r"needs psutil on this system: pip install 'quasiharmonic\[batch\]'"):
+            batch.run(stars, tmp_path / "out", memory_limit=1 << 30)
+
     def test_parquet_without_pyarrow(self, stars, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "pyarrow", None)
         with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[batch\]'"):
@@ -408,6 +433,7 @@ class TestCommand:
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_full_disk(self, tmp_path, capsys, troubled):
         write_stars(tmp_path / "set", ["full"])
         assert main(["batch", str(tmp_path / "set"), "-o", str(tmp_path / "out")]) == 2
@@ -416,21 +442,30 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("text", "value"), [("800M", 800 << 20), ("4G", 4 << 30), ("1.5 GiB", 3 << 29), ("7k", 7168)]
     )
-    def test_sizes(self, text, value):
-        from quasiharmonic.cli.batch import _bytes
+    def test_sizes(self, text, value, monkeypatch):
+        asked = []
 
-        assert _bytes(text) == value
-        for wrong in ("", "4X", "-1G", "0", "1.2.3G", "."):
-            with pytest.raises(Exception, match="not a size"):
-                _bytes(wrong)
+        def run(*arguments, memory_limit, **options):
+            asked.append(memory_limit)
+            raise KeyboardInterrupt
 
+        monkeypatch.setattr(batch, "run", run)
+        assert main(["batch", "set", "-o", "out", "--memory-limit", text]) == 2
+        assert asked == [value]
+
+    @pytest.mark.parametrize("text", ["", "4X", "-1G", "0", "1.2.3G", "."])
+    def test_what_is_no_size(self, text, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main(["batch", "set", "-o", "out", f"--memory-limit={text}"])
+        assert stop.value.code == 2
+        assert "is not a size" in capsys.readouterr().err
+
+    @pytest.mark.slow
     def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
         pty = pytest.importorskip("pty")
         leader, follower = pty.openpty()
         # Told of every problem, however soon the next one is done.
-        often = (
-            "import sys; from quasiharmonic.cli import batch, main; batch._LIVE = batch._LOG = 0; main(sys.argv[1:])"
-        )
+        often = "import sys; from quasiharmonic.cli import batch, main; batch.LIVE = batch.LOG = 0; main(sys.argv[1:])"
         command = [sys.executable, "-c", often, "batch", str(stars), "-j", "1", "-o"]
         run = subprocess.Popen([*command, str(tmp_path / "1")], stdout=subprocess.DEVNULL, stderr=follower)
         os.close(follower)

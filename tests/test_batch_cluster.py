@@ -13,15 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from datasets import lasting, record_of, write_stars
 from quasiharmonic import batch
 from quasiharmonic.batch.cluster import attend
 from quasiharmonic.batch.settings import Orders
 from quasiharmonic.cli import main
+from shared.datasets import lasting, record_of, write_stars
+
+pytestmark = pytest.mark.slow
 
 pytest.importorskip("distributed")
 
-PRELOAD = Path(__file__).with_name("troubled_cluster.py")
+PRELOAD = Path(__file__).with_name("shared") / "troubled_cluster.py"
 
 
 @contextmanager

@@ -12,18 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from datasets import lasting, record_of, star_of, write_problem, write_stars
 from quasiharmonic import batch
 from quasiharmonic.batch import supervisor
 from quasiharmonic.batch.settings import Orders
+from shared.commands import TROUBLED, linux
+from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
-TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
-linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
-
-
-@pytest.fixture
-def troubled(monkeypatch):
-    monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
+pytestmark = pytest.mark.slow
 
 
 def children_of(process):
@@ -119,7 +114,14 @@ class TestTroubles:
         monkeypatch.undo()
         assert batch.run(source, tmp_path / "out", jobs=2).solved == 4
 
-    def test_a_process_that_dies_idle_is_replaced(self, tmp_path):
+    def test_a_process_that_dies_idle_is_replaced(self, tmp_path, monkeypatch):
+        begin, begun = subprocess.Popen, []
+
+        def recorded(*arguments, **options):
+            begun.append(begin(*arguments, **options))
+            return begun[-1]
+
+        monkeypatch.setattr(supervisor.subprocess, "Popen", recorded)
         stars = write_stars(tmp_path / "set", ["a", "b"])
         (tmp_path / "out").mkdir()
         orders = Orders(tmp_path / "out", batch.Settings())
@@ -127,9 +129,11 @@ class TestTroubles:
         try:
             first, second = batch.find_problems(stars)
             assert one.attend(first).outcome == "injective"
-            one._process._process.kill()
-            one._process._process.wait()
+            (idle,) = begun
+            idle.kill()
+            idle.wait()
             assert one.attend(second).outcome == "injective"
+            assert len(begun) == 2
         finally:
             one.close()
 
@@ -199,7 +203,7 @@ def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
 def test_an_orphan_that_hangs_ends_by_itself(tmp_path, monkeypatch):
     """With the interpreter's lock held no thread sees that the driver is gone; the system ends the process."""
     write_stars(tmp_path / "set", ["spin"])
-    script = f"import sys, quasiharmonic.batch.worker as w; w._GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
+    script = f"import sys, quasiharmonic.batch.worker as w; w.GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
     run = (
         "import sys; from quasiharmonic import batch; from quasiharmonic.batch import supervisor; "
         f"supervisor.COMMAND = [sys.executable, '-c', {script!r}]; "

@@ -1,21 +1,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import campaign
+import problems
+import speed
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.search.strategy import stages_of
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-import campaign
-import problems
-import speed
+pytestmark = pytest.mark.slow
 
 FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"]
 
@@ -106,14 +104,14 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
 
 
 def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch):
-    start = campaign._Worker._start
+    start = campaign.Worker.start
     spares = [-30.0, 30.0]
 
     def impatient(worker):
         start(worker)
         worker.spare = spares.pop(0)
 
-    monkeypatch.setattr(campaign._Worker, "_start", impatient)
+    monkeypatch.setattr(campaign.Worker, "start", impatient)
     # 45 000 triangles, not to be solved within the first second.
     todo = ["pins:96:0.831", "swirl:0:0.1"]
     first, second = campaign.campaign(todo, tmp_path / "results.jsonl", limit=30)

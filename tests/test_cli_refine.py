@@ -7,21 +7,14 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from meshes import lift, signed_areas
-from obstructed import OBSTRUCTED
 from quasiharmonic import io
-from quasiharmonic.cli import main
-
-CASES = Path(__file__).parents[2] / "shared" / "cases"
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
+from shared.commands import run
+from shared.meshes import lift, signed_areas
+from shared.obstructed import OBSTRUCTED
 
 
 def write(folder, name, **more):
@@ -177,19 +170,7 @@ class TestRefuses:
         assert sorted(p.name for p in tmp_path.iterdir()) == ["handles.txt", "input.obj"]
 
 
-@pytest.mark.skipif(not CASES.is_dir(), reason="the development cases are not beside this checkout")
-@pytest.mark.parametrize(("name", "vertex"), [("mask_crown", 2520), ("statue_spring", 918)])
-def test_real_cases(tmp_path, capsys, name, vertex):
-    folder, out = CASES / "hard" / name, tmp_path / "finer.obj"
-    assert run("diagnose", folder) == 1
-    assert f"Vertex {vertex} " in capsys.readouterr().out
-    assert run("refine", folder, "-o", out) == 0
-    assert run("diagnose", out, "--fixed", tmp_path / "finer.handles") == 0
-    if name == "mask_crown":
-        # The other takes some ten seconds more.
-        assert run("map", out, "--fixed", tmp_path / "finer.handles", "-o", tmp_path / "map.obj") == 0
-
-
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills outright")
 def test_kill_9_leaves_each_file_old_or_new(tmp_path):
     write(tmp_path, "nothing sees all")

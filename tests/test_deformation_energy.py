@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, surfaces
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.derivatives import derivative_error
 from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet
@@ -14,6 +13,7 @@ from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.surfaces import grid, random_delaunay
+from shared.meshes import bend, boundary_of, lift, surfaces
 
 
 def name_of(energy):

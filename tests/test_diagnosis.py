@@ -7,12 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from obstructed import HOUSE, OBSTRUCTED, circle, loose_wheel, moved, onto, two_wheels
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.problem import Problem
 from quasiharmonic.search.inject import injective_map
 from quasiharmonic.surfaces import disk
+from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto
+from shared.polygons import circle
+from shared.small_meshes import loose_wheel, two_wheels
 
 
 def kinds(problem):
@@ -34,6 +36,7 @@ def test_every_kind_has_its_problem():
     assert {kind for _, (kind, _, _) in OBSTRUCTED.values()} == {kind.name for kind in Kind}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBSTRUCTED)
 def test_nothing_depends_on_scale_or_on_where_things_are(name):
     problem, _ = OBSTRUCTED[name]

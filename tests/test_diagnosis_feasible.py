@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from meshes import bend, boundary_of
-from obstructed import OBSTRUCTED, circle, loose_wheel, moved, onto, spiral, wheel
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.topology import edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.meshes import bend, boundary_of
+from shared.obstructed import OBSTRUCTED, moved, onto
+from shared.polygons import circle, spiral
+from shared.small_meshes import loose_wheel, wheel
 
 
 def positive(F, uv):

@@ -8,8 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from meshes import boundary_of
-from obstructed import OBSTRUCTED, U, circle, onto, random_polygon, spiral
 from quasiharmonic.exact.diagnosis import Kind, diagnose, examine, shortcuts
 from quasiharmonic.exact.diagnosis.clearance import clear
 from quasiharmonic.exact.diagnosis.clipping import Lattice
@@ -19,6 +17,9 @@ from quasiharmonic.exact.loops import contacts, winding
 from quasiharmonic.exact.predicates import SegmentRelation, orientation, segment_relation
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
+from shared.meshes import boundary_of
+from shared.obstructed import OBSTRUCTED, onto
+from shared.polygons import U, circle, random_polygon, spiral
 
 
 def polygons():
@@ -86,6 +87,7 @@ def seen(here, eye, corners):
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", polygons()[:12])
 def test_wedges_hold_what_is_seen_and_no_more(corners, rng):
     n = len(corners)
@@ -154,7 +156,7 @@ def winding_number(x, corners):
 
 @pytest.mark.parametrize("chunk", [1, 1 << 18])
 def test_winding_numbers(rng, monkeypatch, chunk):
-    monkeypatch.setattr("quasiharmonic.exact.loops._PAIR_CHUNK", chunk)
+    monkeypatch.setattr("quasiharmonic.exact.loops.PAIR_CHUNK", chunk)
     for n in (3, 8, 30):
         corners = rng.integers(0, 9, (n, 2)).astype(float)
         points = np.concatenate([rng.integers(0, 9, (40, 2)), rng.integers(0, 18, (40, 2)) / 2, corners])
@@ -209,11 +211,12 @@ def found(problem):
     ]
 
 
+@pytest.mark.slow
 def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
     problems = [*random_problems(), *(problem for problem, _ in OBSTRUCTED.values())]
     quick = [found(problem) for problem in problems]
     monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
-    monkeypatch.setattr(shortcuts.Shortcuts, "_within", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
+    monkeypatch.setattr(shortcuts.Shortcuts, "within", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
     assert quick == [found(problem) for problem in problems]
     kinds = {kind for some in quick for kind, *_ in some}
     assert {Kind.HIDDEN, Kind.HALF_PLANES, Kind.LINK_DISTANCE, Kind.CHORD} <= kinds
@@ -221,12 +224,13 @@ def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
 
 def test_what_takes_too_long_is_said_to_be_unchecked(monkeypatch):
     problem, _ = OBSTRUCTED["nothing sees all"]
-    monkeypatch.setattr(examine, "_MOST_EFFORT", 0)
+    monkeypatch.setattr(examine, "MOST_EFFORT", 0)
     diagnosis = diagnose(problem)
     assert not diagnosis.obstructions
     assert "the fixed neighbours of vertex 8" in diagnosis.unchecked[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["wobble", "spiral", "star", "gear"])
 def test_ten_thousand_boundary_vertices(kind):
     problem = onto(grid(4980, 20), outlines(kind, 10_000))

@@ -74,12 +74,12 @@ def metis(n, tail, head):
     """The order that METIS finds, asked for by way of PARDISO."""
     A = sp.csr_array(sp.triu(pattern(n, tail, head), format="csr"))
     A.sort_indices()
-    handle = mkl._Handle(A.indptr.astype(np.int32), A.indices.astype(np.int32), A.data, sequential=False, ordered=False)
+    handle = mkl.Handle(A.indptr.astype(np.int32), A.indices.astype(np.int32), A.data, sequential=False, ordered=False)
     order = np.zeros(n, dtype=np.int32)
-    handle._iparm[1], handle._iparm[4] = 2, 2
-    arguments = list(handle._head)
+    handle.iparm[1], handle.iparm[4] = 2, 2
+    arguments = list(handle.arguments)
     arguments[9] = ctypes.c_void_p(order.ctypes.data)
-    handle._head = tuple(arguments)
+    handle.arguments = tuple(arguments)
     handle.check(11)
     handle.release()
     return order
@@ -152,11 +152,11 @@ def test_poor_cuts_are_refused():
 def test_separators_separate(n, share, seed):
     """Of an arbitrary graph with an arbitrary bisection: without a separator its part falls into its two halves."""
     rng = np.random.default_rng(seed)
-    bits = 2 * dissection._BITS
+    bits = 2 * dissection.BITS
     code = rng.integers(2 ** (bits + 2), size=n).astype(np.int32)
     tail, head = rng.integers(n, size=(2, int(share * n)))
     tail, head = tail[tail != head], head[tail != head]
-    rank = dissection._separators(code, 2, tail, head)
+    rank = dissection.separators(code, 2, tail, head)
     for k in range(1, bits + 3):
         inside = (rank < k)[tail] & (rank < k)[head]
         crossing = (code[tail] >> k == code[head] >> k) & (code[tail] >> k - 1 != code[head] >> k - 1)
@@ -169,7 +169,7 @@ def test_covers_are_smallest(m, n, density, seed):
     joined = np.random.default_rng(seed).random((m, n)) < density
     joined[0, 0] = True
     u, v = np.nonzero(joined)
-    us, vs = dissection._cover(u, v + m)
+    us, vs = dissection.smallest_cover(u, v + m)
     assert (np.isin(u, us) | np.isin(v + m, vs)).all()
     assert len(us) + len(vs) == matching(joined)
 
@@ -216,7 +216,7 @@ def test_the_laplacian_is_the_same_in_any_order(monkeypatch, solver):
     w = rng.standard_normal(len(V)) + 1j * rng.standard_normal(len(V))
     answers = []
     for least in (10**9, 0):
-        monkeypatch.setattr(laplacian, "_DISSECT_FROM", least)
+        monkeypatch.setattr(laplacian, "DISSECT_FROM", least)
         operator = Laplacian(F, len(V), loop, solver, V).factor(stiffness)
         map_ = operator.extend(w)
         answers.append((map_, operator.respond(w), operator.flux(map_)))
@@ -233,14 +233,14 @@ def test_one_fixed_vertex_and_a_free_boundary(monkeypatch):
     load = np.random.default_rng(0).standard_normal(len(V)) + 0j
     answers = []
     for least in (10**9, 0):
-        monkeypatch.setattr(laplacian, "_DISSECT_FROM", least)
+        monkeypatch.setattr(laplacian, "DISSECT_FROM", least)
         operator = Laplacian(F, len(V), np.array([17]), points=V).factor(stiffness)
         answers.append(operator.respond(load))
     np.testing.assert_allclose(*answers, rtol=0, atol=1e-10)
 
 
 def test_without_good_cuts_the_order_is_left_to_the_solver(monkeypatch):
-    monkeypatch.setattr(laplacian, "_DISSECT_FROM", 0)
+    monkeypatch.setattr(laplacian, "DISSECT_FROM", 0)
     V, F = surfaces.grid(60, 60)
     (loop,) = boundary_loops(F, len(V))
     w = np.random.default_rng(0).standard_normal(len(V)) + 0j

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from datasets import star_of, write_problem
+import distortion as benchmark
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import grid
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-import distortion as benchmark
+from shared.datasets import star_of, write_problem
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import lift
 from quasiharmonic.energy.derivatives import check_energy, derivative_error, random_deformation
 from quasiharmonic.energy.energies import (
     ARAP,
@@ -22,6 +21,7 @@ from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import edges
 from quasiharmonic.surfaces import random_delaunay
+from shared.meshes import lift
 
 ISOTROPIC = [
     MIPS(),

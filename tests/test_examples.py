@@ -15,6 +15,8 @@ from PIL import Image
 
 from quasiharmonic.mesh.topology import boundary_loops, edges
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parent.parent / "examples"
 SCRIPTS = sorted({path.stem for path in FOLDER.glob("*.py")} - {"common", "sculptures"})
 

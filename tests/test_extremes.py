@@ -7,8 +7,6 @@ import json
 import numpy as np
 import pytest
 
-from meshes import boundary_of, signed_areas
-from obstructed import OBSTRUCTED, circle, eared, moved, onto
 from quasiharmonic import (
     Problem,
     Status,
@@ -24,7 +22,11 @@ from quasiharmonic import (
 from quasiharmonic.cli import main
 from quasiharmonic.exact.diagnosis import Kind
 from quasiharmonic.surfaces import disk, grid, random_delaunay
-from test_inject import star_problem
+from shared.meshes import boundary_of, signed_areas
+from shared.obstructed import OBSTRUCTED, moved, onto
+from shared.polygons import circle
+from shared.small_meshes import eared
+from shared.solvable import star_problem
 
 SCALES = [1e-300, 1e-150, 1e-12, 1.0, 1e12, 1e150, 1e300]
 
@@ -42,6 +44,7 @@ def through_all(V, F, fixed, target, **more):
 
 
 class TestScales:
+    @pytest.mark.slow
     @pytest.mark.parametrize("scale", SCALES)
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     def test_of_the_rest_mesh(self, scale, reference):

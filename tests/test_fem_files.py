@@ -13,11 +13,10 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
-import gmsh_files
-import vtk_files
 from quasiharmonic.cli import main
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.fem import read_fem, write_fem
+from shared import gmsh_files, vtk_files
 
 
 def shifted(mesh):
@@ -352,6 +351,7 @@ VECTORS u float
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "whole"),
     [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 from quasiharmonic import solve
 from quasiharmonic.descent import LBFGS, Newton
 from quasiharmonic.field.functionals import FUNCTIONALS, neumann_target
@@ -14,6 +13,7 @@ from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, random_delaunay
+from shared.meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 
 MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 from general_tensor import (
     beltrami_pair,
@@ -19,13 +14,13 @@ from general_tensor import (
     edge_conormal,
     vertex_conormal,
 )
-from meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.search.inject import quasi_harmonic_map
 from quasiharmonic.surfaces import random_delaunay
+from shared.meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 
 STAR = np.array([[0.0, -1.0], [1.0, 0.0]])
 MESHES = surfaces()

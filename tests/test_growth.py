@@ -10,7 +10,6 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from meshes import lift
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.field.objective import Objective
@@ -20,6 +19,7 @@ from quasiharmonic.mesh.prolongation import prolong
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk
 from quasiharmonic.targets import arc_length, letter, rectangle
+from shared.meshes import lift
 
 
 def posed(rings, character):
@@ -165,6 +165,7 @@ class TestAllocations:
         V, F, _, _ = posed(80, "C")
         assert peak(certify, F, V[:, :2].copy())[0] / len(F) < 190
 
+    @pytest.mark.slow
     def test_grow_in_proportion(self):
         small, large = (posed(rings, "C") for rings in (60, 120))
         solve(Problem(*small))

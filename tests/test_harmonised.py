@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, random_xi
 from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
 from quasiharmonic.descent import LBFGS
 from quasiharmonic.descent.base import Steps
@@ -20,6 +19,7 @@ from quasiharmonic.search.harmonised import Harmonised
 from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length
+from shared.meshes import bend, boundary_of, lift, random_xi
 
 BARRIERS = {"mips", "symmetric-dirichlet"}
 
@@ -284,7 +284,7 @@ class TestHarmonise:
         """Where all that is found is inverted, the given map comes back, and the status says so."""
         V, F, uv, fixed = bowl()
         monkeypatch.setattr("quasiharmonic.search.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
-        monkeypatch.setattr("quasiharmonic.search.harmonic_descent._RIGHTING", 1)
+        monkeypatch.setattr("quasiharmonic.search.harmonic_descent.RIGHTING", 1)
         result = harmonise(V, F, uv, fixed=fixed, energy="arap", iterations=5)
         assert result.injective
         assert result.status is not Status.POLISHED

@@ -7,12 +7,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from meshes import bend, lift, random_annulus, signed_areas, surfaces
 from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints, distortion
 from quasiharmonic.exact.nested_grid import NestedGrid
 from quasiharmonic.exact.predicates import twice_area
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.meshes import bend, lift, random_annulus, signed_areas, surfaces
 
 
 def exact_areas(p, corners):

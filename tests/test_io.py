@@ -1,4 +1,3 @@
-import importlib.util
 import math
 import os
 import pickle
@@ -19,12 +18,13 @@ from hypothesis.extra.numpy import arrays
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
 from quasiharmonic.io.meshdata import is_planar
-from quasiharmonic.io.obj import _read_regular
+from quasiharmonic.io.obj import read_regular
 from quasiharmonic.io.objlines import read_obj_lines
 from quasiharmonic.io.textual import read_text
+from shared.datasets import write_problem
+from shared.solvable import star_problem
+from shared.written import written
 
-SHARED = Path(__file__).parent.parent / ".." / "shared"
-CASES = sorted((SHARED / "cases").glob("*/*/input.obj"))
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX")
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -68,7 +68,7 @@ def same(a, b):
 
 def both_readers_agree(path):
     data = read_text(path)
-    regular = _read_regular(path, data)
+    regular = read_regular(path, data)
     return regular is not None and same(regular, read_obj_lines(path, data))
 
 
@@ -150,7 +150,7 @@ def test_decimal_text_is_rounded_correctly(put, regular):
     ]
     lines = "".join(f"v {t} {t} {t}\n" for t in texts) + ("" if regular else " ") + "f 1 2 3\n"
     path = put(lines)
-    assert (_read_regular(path, read_text(path)) is not None) == regular
+    assert (read_regular(path, read_text(path)) is not None) == regular
     V = io.read_mesh(path).V
 
     def nearest(x):
@@ -276,6 +276,7 @@ def test_the_error_survives_pickling_and_odd_names():
     assert str(MeshFileError("\udcff.obj", "what")).encode() == b"\\udcff.obj: what"
 
 
+@pytest.mark.slow
 @posix
 def test_memory_stays_bounded_on_hostile_files(tmp_path):
     # Lines of 100 MB and of 20 MB; taken apart by the token they would need gigabytes. And indices and counts that
@@ -752,12 +753,16 @@ except OutputError as error:
     assert path.read_bytes() == b"old"
 
 
+@pytest.mark.slow
 @posix
 def test_kill_9_leaves_the_old_file_or_a_new_one(tmp_path):
     path = tmp_path / "mesh.obj"
     script = f"""
 import numpy as np
 from quasiharmonic.io import MeshData, write_map
+from shared.written import written
+from shared.datasets import write_problem
+from shared.solvable import star_problem
 F = np.arange(3 * 3000).reshape(-1, 3)
 mesh = MeshData(np.ones((9000, 3)), F)
 print("ready", flush=True)
@@ -784,25 +789,21 @@ def test_import_is_light():
     assert not {"scipy", "matplotlib", "meshio", "trimesh"} & set(done.stdout.split())
 
 
-# Real files, where they are at hand
-
-
-@pytest.mark.skipif(not CASES, reason="needs the cases of the development tree")
-@pytest.mark.parametrize("path", CASES, ids=lambda path: path.parent.name)
-def test_real_problems(path, tmp_path):
-    spec = importlib.util.spec_from_file_location("check_map", SHARED / "tools" / "check_map.py")
-    independent = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(independent)
+def test_problems_written_and_read_in_every_way(tmp_path):
+    V, F, fixed, target = star_problem()
+    path, out = tmp_path / "star" / "input.obj", tmp_path / "out.obj"
+    write_problem(path.parent, V, F, fixed, target)
     assert both_readers_agree(path)
     mesh = io.read_mesh(path)
-    V, F, fixed, target = io.read_problem(path.parent)
+    assert all(map(np.array_equal, io.read_problem(path.parent), (V, F, fixed, target)))
     uv = io.map_of(mesh)
     assert np.array_equal(uv[fixed], target)
     moved = uv + np.random.default_rng(0).normal(size=uv.shape)
-    io.write_map(tmp_path / "out.obj", mesh, moved)
-    places, faces = independent.read(tmp_path / "out.obj")
-    assert bits(places) == bits(moved)
-    assert faces == list(map(tuple, F.tolist()))
-    again = io.read_mesh(tmp_path / "out.obj")
-    assert bits(again.V) == bits(V)
+    io.write_map(out, mesh, moved)
+    # As plain text, with nothing of the library.
+    found = written(out)
+    assert bits(found.uv) == bits(moved)
+    assert np.array_equal(found.F, F)
+    again = io.read_mesh(out)
+    assert bits(again.V) == bits(found.V) == bits(V)
     assert bits(io.map_of(again)) == bits(moved)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, lift, random_annulus, random_xi
 from quasiharmonic import Problem
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import MIPS
@@ -14,6 +13,7 @@ from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.regularizers import Conformal
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.search.harmonised import Harmonised
+from shared.meshes import bend, lift, random_annulus, random_xi
 
 
 def posed():

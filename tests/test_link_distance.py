@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from obstructed import U, circle, spiral
 from quasiharmonic.exact.diagnosis.clipping import Lattice
 from quasiharmonic.exact.diagnosis.links import Polygon
 from quasiharmonic.exact.predicates import orientation
+from shared.polygons import U, circle, spiral
 
 
 def polygon(corners):

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from meshes import bend, lift, surfaces
 from quasiharmonic.energy.measures import MEASURES, distortion
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.surfaces import grid, random_delaunay
+from shared.meshes import bend, lift, surfaces
 
 
 def jacobians(V, F, uv):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, lift, random_xi, signed_areas, surfaces
 from quasiharmonic.field.tensor import TANH
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.surfaces import annulus, random_delaunay
+from shared.meshes import bend, lift, random_xi, signed_areas, surfaces
 
 MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift
 from quasiharmonic.energy import newton_descent
 from quasiharmonic.energy.deformation import signed_areas
 from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
@@ -18,6 +17,7 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem import Domain
 from quasiharmonic.result import Status
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
+from shared.meshes import bend, boundary_of, lift
 
 
 def twisted(V, turns=0.2):

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from fractions import Fraction
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,36 +14,7 @@ from quasiharmonic.exact.predicates import (
     orientation_or_nonfinite,
     segment_relation,
 )
-
-
-def exact_orientation(a, b, c):
-    """Sign of the signed area in rational arithmetic."""
-    ax, ay, bx, by, cx, cy = (Fraction(float(x)) for x in (*a, *b, *c))
-    det = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
-    return (det > 0) - (det < 0)
-
-
-def exact_relation(p, q, r, s):
-    """What two segments share, by solving for the common point in rational arithmetic."""
-    p, q, r, s = (tuple(Fraction(float(x)) for x in point) for point in (p, q, r, s))
-    if p == q or r == s:
-        point, (a, b) = (p, (r, s)) if p == q else (r, (p, q))
-        on_line = (b[0] - a[0]) * (point[1] - a[1]) == (b[1] - a[1]) * (point[0] - a[0])
-        return SegmentRelation(2 * (on_line and min(a, b) <= point <= max(a, b)))
-    d, e, f = ((y[0] - x[0], y[1] - x[1]) for x, y in ((p, q), (r, s), (p, r)))
-    det = d[0] * e[1] - d[1] * e[0]
-    if det == 0:
-        if d[0] * f[1] != d[1] * f[0]:
-            return SegmentRelation.DISJOINT
-        # Positions along pq, which has length 1 there.
-        along = sorted(((x[0] - p[0]) * d[0] + (x[1] - p[1]) * d[1]) / (d[0] ** 2 + d[1] ** 2) for x in (r, s))
-        lo, hi = max(along[0], 0), min(along[1], 1)
-        return SegmentRelation.OVERLAPPING if lo < hi else SegmentRelation(2 * (lo == hi))
-    t = (f[0] * e[1] - f[1] * e[0]) / det
-    u = (f[0] * d[1] - f[1] * d[0]) / det
-    if 0 < t < 1 and 0 < u < 1:
-        return SegmentRelation.CROSSING
-    return SegmentRelation(2 * (0 <= t <= 1 and 0 <= u <= 1))
+from shared.exact import exact_orientation, exact_relation
 
 
 def agrees(a, b, c):
@@ -183,7 +152,7 @@ def test_segments_that_miss_each_other_by_a_rounding():
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
-    monkeypatch.setattr(predicates, "_PAIR_CHUNK", chunk)
+    monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
     for count in (0, 1, 2, 3, 8, 57):
         lo = rng.integers(0, 20, (count, 2)).astype(float)
         hi = lo + rng.integers(0, 5, (count, 2))
@@ -200,7 +169,7 @@ def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_between_two_kinds(rng, monkeypatch, chunk):
-    monkeypatch.setattr(predicates, "_PAIR_CHUNK", chunk)
+    monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
     for count, other in ((0, 3), (1, 1), (5, 0), (3, 40), (57, 8)):
         lo, low = rng.integers(0, 20, (count, 2)).astype(float), rng.integers(0, 20, (other, 2)).astype(float)
         hi, high = lo + rng.integers(0, 5, (count, 2)), low + rng.integers(0, 5, (other, 2))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import boundary_of
 from quasiharmonic import Problem
 from quasiharmonic.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.surfaces import annulus, grid, random_delaunay
+from shared.meshes import boundary_of
 
 V, F = random_delaunay(60, seed=2)
 RIM = boundary_of(F)

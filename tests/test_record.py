@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import boundary_of, signed_areas
 from quasiharmonic import Problem, injective_map, solve
 from quasiharmonic.descent import Newton, VectorAdam
 from quasiharmonic.surfaces import annulus
+from shared.meshes import boundary_of, signed_areas
 
 
 def turned_ring():
@@ -19,7 +19,7 @@ def turned_ring():
     return V, F, fixed, target
 
 
-@pytest.mark.parametrize("k", [1, 3, 7])
+@pytest.mark.parametrize("k", [pytest.param(1, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow), 7])
 def test_every_kth_map_is_kept(k):
     V, F, fixed, target = turned_ring()
     result = injective_map(V, F, fixed, target, record=k)
@@ -36,6 +36,7 @@ def test_every_kth_map_is_kept(k):
     assert len({s.uv.ctypes.data for s in result.path}) == len(result.path)
 
 
+@pytest.mark.slow
 def test_recording_changes_nothing_and_is_off_by_default():
     problem = Problem(*turned_ring())
     plain, recorded = solve(problem), solve(problem, record=2)

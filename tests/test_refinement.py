@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from meshes import boundary_of, signed_areas, surfaces
-from obstructed import OBSTRUCTED
 from quasiharmonic import Problem
 from quasiharmonic.apply.refining import refine_problem
 from quasiharmonic.exact.diagnosis import diagnose
 from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.mesh.topology import edges
+from shared.meshes import boundary_of, signed_areas, surfaces
+from shared.obstructed import OBSTRUCTED
 
 TWO = ([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], [[0, 1, 2], [0, 2, 3]])
 
@@ -157,6 +157,7 @@ def rounds_by_hand(problem):
     return V, F, values, number
 
 
+@pytest.mark.slow
 def test_problems_are_refined_until_nothing_is_named():
     most = 0
     for problem, _ in OBSTRUCTED.values():

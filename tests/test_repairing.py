@@ -8,11 +8,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from meshes import bend, boundary_of, lift, signed_areas
 from quasiharmonic import certify, distortion, flipped_triangles, io, repair
-from quasiharmonic.cli import main
 from quasiharmonic.mesh.seams import fans, islands
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.commands import run
+from shared.meshes import bend, boundary_of, lift, signed_areas
 
 
 def atlas(cells=12):
@@ -54,10 +54,6 @@ def exact_signs(uv, FT):
         )
         signs.append((area > 0) - (area < 0))
     return np.array(signs)
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 class TestIslands:
@@ -421,6 +417,7 @@ class TestCommand:
         assert f"wrote {out}: 3 islands: {facts['inverted_before']} triangles inverted before, 0 now" in said.out
         assert said.err == ""
 
+    @pytest.mark.slow
     def test_the_other_commands_take_seams(self, uv_file, tmp_path, capsys):
         out, report, faces = tmp_path / "repaired.obj", tmp_path / "report.json", tmp_path / "faces.npz"
         assert run("check", uv_file, "--json", report) == 1

@@ -71,6 +71,7 @@ def test_curves_and_their_smooth_continuations():
     assert all(np.array_equal(a, b) for a, b in zip(pieces, relative, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0, 30, -75])
 @pytest.mark.parametrize(("large", "sweep"), [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_arcs_lie_on_their_ellipse(turn, large, sweep):
@@ -252,7 +253,7 @@ def test_huge_drawings(read, tmp_path, monkeypatch):
     monkeypatch.setattr("quasiharmonic.targets.svgpath.MOST_POINTS", 1000)
     with pytest.raises(ValueError, match="more than 1,000 pieces"):
         read(drawing('<path d="M0 0' + "h1v1" * 600 + '"/>'))
-    monkeypatch.setattr("quasiharmonic.targets.svg._MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("quasiharmonic.targets.svg.MOST_BYTES", 1 << 20)
     with pytest.raises(ValueError, match="larger than 1 MiB; simplify"):
         read(drawing(" " * (1 << 20)))
     with pytest.raises(ValueError, match="tolerance is a share"):

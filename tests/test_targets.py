@@ -109,11 +109,9 @@ def test_what_is_no_letter_is_refused(character):
         targets.letter(character)
 
 
-def test_glyphs_whose_parts_overlap_are_refused_by_name(monkeypatch):
-    square = targets.rectangle(1, 1)
-    monkeypatch.setattr("quasiharmonic.targets.glyphs._contours", lambda *_: [square, square + 0.5])
-    with pytest.raises(ValueError, match="the glyph of 'x': contours 0 and 1 of the outline meet"):
-        targets.letter("x")
+def test_glyphs_whose_parts_overlap_are_refused_by_name():
+    with pytest.raises(ValueError, match="the glyph of 'Ç': contours 0 and 1 of the outline meet"):
+        targets.letter("Ç")
 
 
 def test_missing_glyph_and_missing_font(tmp_path):

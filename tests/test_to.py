@@ -8,15 +8,15 @@ import json
 import numpy as np
 import pytest
 
-from meshes import lift
 from quasiharmonic import Problem, cut_open, diagnose, injective_map, io, refine, surfaces, targets
 from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
-from quasiharmonic.targets.chord_room import _choose, _reach, _Room, make_room
+from quasiharmonic.targets.chord_room import ChordRoom, choose, make_room, reach
 from quasiharmonic.targets.correspondence import arc, at, off, places_along
 from quasiharmonic.targets.holes import least_stretch
-from test_cli import CASES
+from shared.meshes import lift
+from shared.written import written
 
 
 def holed(n, *holes, seed=0):
@@ -298,11 +298,11 @@ def test_room_is_made_at_the_least_cost(rng):
         along = np.concatenate([[0], np.sort(rng.random(count - 1)), [1]])
         wanted = np.sort(rng.random(k))
         reach = np.minimum.accumulate(rng.integers(2, 8, count + 1)[::-1] + np.arange(count, -1, -1))[::-1]
-        room = _Room(
+        room = ChordRoom(
             np.minimum(reach, count + 1), rng.random(k + 1) < 0.7, rng.integers(0, 3, k + 1), rng.choice([0.3, 1])
         )
         cost, chosen = brute_force(along, wanted, room)
-        found = _choose(along, wanted, room)
+        found = choose(along, wanted, room)
         assert (found is None) == (chosen is None)
         if found is not None:
             solved += 1
@@ -322,7 +322,7 @@ def test_chords_across_a_pin_are_left_alone():
     ears = np.stack([np.arange(1, 11, 2) - 1, np.arange(1, 11, 2) + 1], axis=1)
     assert make_room(s, square, [(0, 0.0)], corner_angle=20, chords=ears) is None
     stretch = next(targets.correspondence.stretches(s, [(2, 0.0)]))
-    assert _reach(stretch, np.array([[3, 6], [1, 11]]), 12).tolist() == [
+    assert reach(stretch, np.array([[3, 6], [1, 11]]), 12).tolist() == [
         4,
         4,
         11,
@@ -352,6 +352,7 @@ def test_how_far_a_contour_is_cut_off():
     assert off(contour, np.roll(between, 3), np.roll(places, 3, axis=0)) == pytest.approx(off(contour, between, places))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("character", "GC352")
 @pytest.mark.parametrize("size", [(12, 8), (40, 20)])
 def test_corners_move_only_so_far(character, size):
@@ -811,14 +812,15 @@ def test_calls_that_cannot_be_read(qhm, options):
     assert stop.value.code == 2
 
 
-@pytest.mark.skipif(not CASES.is_dir(), reason="the development cases are not beside this checkout")
-@pytest.mark.parametrize("case", [p.name for p in sorted((CASES / "letters").glob("*"))])
-def test_seven_letters(case, tmp_path):
-    """Each real surface onto its letter by this option alone."""
+@pytest.mark.parametrize("character", "AGHPRS")
+def test_letters_of_the_paper(character, tmp_path):
+    """A curved surface onto each by this option alone."""
     out, report = tmp_path / "out.obj", tmp_path / "report.json"
-    command = ["map", str(CASES / "letters" / case / "input.obj"), "--to", f"letter:{case[-1]}"]
+    io.write_obj(tmp_path / "cat.obj", io.MeshData(*surfaces.cat(20)))
+    command = ["map", str(tmp_path / "cat.obj"), "--to", f"letter:{character}"]
     assert main([*command, "-o", str(out), "--json", str(report)]) == 0
     facts = json.loads(report.read_text())
     assert facts["bijective"]
     assert facts["iterations"] < 100
     assert main(["check", str(out)]) == 0
+    assert written(out).signs().min() == 1

@@ -70,6 +70,7 @@ def test_another_shape():
     assert drawn[0].sum() == drawn[:, :2].sum() == drawn[:, 6].sum() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(30, 1000), (1000, 30)])
 def test_narrow_pictures_leave_a_way(shape):
     size = np.array(shape[::-1]) - 1.0
@@ -79,6 +80,7 @@ def test_narrow_pictures_leave_a_way(shape):
     assert warped.moved[-1] == pytest.approx((0.5 + along) * size)
 
 
+@pytest.mark.slow
 def test_landmarks_on_the_border_take_it_along():
     image = np.tile(np.arange(1, 65, dtype=np.int16), (64, 1))
     # The lower side bends up, the right upper corner comes in; the left side stays.
@@ -109,7 +111,7 @@ def test_filled_triangles_are_as_located_ones(shape, monkeypatch):
     moved = morph(points, F, upper, points[upper] + [0.1, -0.2]).points
     size = (299, 199)
     quick = warp_along(image, points * size, F, moved * size, shape=shape)
-    monkeypatch.setattr("quasiharmonic.apply.warping._LARGE", np.inf)
+    monkeypatch.setattr("quasiharmonic.apply.warping.LARGE", np.inf)
     slow = warp_along(image, points * size, F, moved * size, shape=shape)
     assert np.array_equal(quick == 0, slow == 0)
     assert quick == pytest.approx(slow, abs=1e-9)
@@ -124,6 +126,7 @@ def test_points_without_a_place_are_named():
             warp_along(np.zeros((4, 4)), before, [[0, 1, 2], [0, 2, 3]], after)
 
 
+@pytest.mark.slow
 def test_a_warp_that_cannot_be_says_what_to_do():
     with pytest.raises(RuntimeError, match="Move them less far"):
         warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]])
@@ -147,6 +150,13 @@ def test_a_warp_that_cannot_be_says_what_to_do():
 def test_wrong_input(arguments, message):
     with pytest.raises(ValueError, match=message):
         warp_by_landmarks(*arguments)
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (5, -1)])
+def test_pictures_without_extent(shape):
+    V, F = surfaces.grid(3, 3)
+    with pytest.raises(ValueError, match=rf"shape must be positive, not \({shape[0]}, {shape[1]}\)"):
+        warp_along(np.zeros((9, 9)), V, F, V, shape=shape)
 
 
 def test_a_map_with_folds_is_refused():

@@ -20,7 +20,7 @@ _ALONG, _ACROSS = 48, 6
 # Pixels drawn at a time: what is in work stays in the cache.
 _PIXELS = 1 << 15
 # Triangles with more pixels than this on average are filled one by one.
-_LARGE = 100
+LARGE = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ def _picture(image: ArrayLike) -> NDArray[Any]:
 def _sources(inverse: InverseMap, height: int, width: int) -> FloatArray:
     """Where each pixel comes from, row by row, NaN where from nowhere; (height · width, 2)."""
     filled = np.full((height, width, 2), np.nan)
-    if height * width > _LARGE * len(inverse.F):
+    if height * width > LARGE * len(inverse.F):
         _fill(inverse, filled)
     source = filled.reshape(-1, 2)
     # What is left lies on edges, so close to one that rounding could tell either side, or outside: decided exactly.

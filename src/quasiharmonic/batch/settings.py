@@ -73,7 +73,7 @@ class Settings:
             contents = b"" if path is None else _contents(path)
             digest.update(len(contents).to_bytes(8, "little"))
             digest.update(contents)
-        digest.update(json.dumps([__version__, _code(), self.to_dict()], sort_keys=True).encode())
+        digest.update(json.dumps([__version__, sources_digest(), self.to_dict()], sort_keys=True).encode())
         return digest.hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def _contents(path: Path) -> bytes:
 
 
 @cache
-def _code() -> str:
+def sources_digest() -> str:
     """Digest of the package's sources, as they were when first asked, but for those that only show what came out."""
     package = Path(quasiharmonic.__file__).parent
     digest = blake2b(digest_size=16)

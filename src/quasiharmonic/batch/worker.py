@@ -41,7 +41,7 @@ from quasiharmonic.search.inject import solve
 #: What a process says when it has imported what it needs.
 READY = "ready"
 # Seconds beyond the time limit after which the system ends this process, should nobody be left to do so.
-_GRACE = 10.0
+GRACE = 10.0
 
 
 def serve() -> None:
@@ -88,7 +88,7 @@ def _listen(jobs: SimpleQueue[bytes]) -> None:
 def _alarm(limit: float | None) -> None:
     """Have the system end this process some time after the limit: also if it hangs where no thread can see its end."""
     if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, 0.0 if limit is None else limit + _GRACE)
+        signal.setitimer(signal.ITIMER_REAL, 0.0 if limit is None else limit + GRACE)
 
 
 def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Record:
@@ -118,7 +118,7 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     began = time.perf_counter()
     record: Record = {**job["record"], "versions": _versions()}
     try:
-        _solve(job, folder, record, tell)
+        fill_record(job, folder, record, tell)
     except io.OutputError:
         raise
     except MemoryError as error:
@@ -133,7 +133,7 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     return record
 
 
-def _solve(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
+def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
     """Read, solve, write, judge, measure; what is found goes into the record as soon as it is known."""
     settings = job["settings"]
     with _timed(record, "read"):

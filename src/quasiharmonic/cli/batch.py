@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from quasiharmonic.cli.arguments import Commands
 
 # Seconds between two updates of the line on a terminal, and between two lines elsewhere.
-_LIVE, _LOG = 0.1, 30.0
+LIVE, LOG = 0.1, 30.0
 
 
 def add_parser(commands: Commands) -> None:
@@ -146,11 +146,11 @@ class _Display:
 
     def __init__(self) -> None:
         self._terminal = sys.stderr is not None and sys.stderr.isatty()
-        self._shown = time.monotonic() - _LIVE if self._terminal else time.monotonic()
+        self._shown = time.monotonic() - LIVE if self._terminal else time.monotonic()
 
     def __call__(self, progress: Progress) -> None:
         now = time.monotonic()
-        if sys.stderr is None or now - self._shown < (_LIVE if self._terminal else _LOG):
+        if sys.stderr is None or now - self._shown < (LIVE if self._terminal else LOG):
             return
         self._shown = now
         text = f"{progress.done}/{progress.total} done   {progress.failed} failed   {progress.rate:.3g}/s"

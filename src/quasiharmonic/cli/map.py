@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # What is done unasked. On some 10,000 triangles these steps take a few times as long as the first map, and go nearly as
 # far as convergence: a fifth of the MIPS energy, a hundredth of the worst stretch. On larger meshes they are felt.
-_STEPS, _LARGEST = 20, 100_000
+STEPS, LARGEST = 20, 100_000
 
 
 def add_parser(commands: Commands) -> None:
@@ -130,10 +130,10 @@ def smoothed(problem: Problem, result: MapResult) -> MapResult:
     from quasiharmonic.mesh.shapes import rest_shapes
     from quasiharmonic.result import Status
 
-    if len(problem.F) > _LARGEST or rest_shapes(problem.V, problem.F).flat.size:
+    if len(problem.F) > LARGEST or rest_shapes(problem.V, problem.F).flat.size:
         return result
     with progress.line() as show:
-        smoother = polished(problem, result, energy="blend", max_iterations=_STEPS, callback=show)
+        smoother = polished(problem, result, energy="blend", max_iterations=STEPS, callback=show)
     # Nobody asked for convergence, so it is not missed.
     interrupted = smoother.status is Status.INTERRUPTED
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)

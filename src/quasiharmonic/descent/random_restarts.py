@@ -143,15 +143,15 @@ def _place(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray) -> t
     low, high = complex(within.real.min(), within.imag.min()), complex(within.real.max(), within.imag.max())
     area = np.array([low, complex(high.real, low.imag), high, complex(low.real, high.imag)])
     for tail, head in zip(w[tails[both]], w[heads[both]], strict=True):
-        area = _left_of(area, tail, head)
+        area = left_of(area, tail, head)
         if len(area) < 3:
             return None
     depth = 10 ** rng.uniform(*_DEPTHS)
-    corner = rng.choice(np.append(area, _nearest(area, w[vertex])))
+    corner = rng.choice(np.append(area, nearest(area, w[vertex])))
     return vertex, complex((1 - depth) * corner + depth * area.mean())
 
 
-def _left_of(area: ComplexArray, tail: complex, head: complex) -> ComplexArray:
+def left_of(area: ComplexArray, tail: complex, head: complex) -> ComplexArray:
     """Corners of the part of a convex polygon to the left of a line."""
     side = (np.conj(head - tail) * (area - tail)).imag
     kept = []
@@ -163,7 +163,7 @@ def _left_of(area: ComplexArray, tail: complex, head: complex) -> ComplexArray:
     return np.array(kept, dtype=np.complex128)
 
 
-def _nearest(area: ComplexArray, point: complex) -> complex:
+def nearest(area: ComplexArray, point: complex) -> complex:
     """The point of a convex polygon's outline that is nearest to another."""
     side = np.roll(area, -1) - area
     square = np.maximum(np.abs(side) ** 2, np.finfo(np.float64).tiny)

@@ -45,7 +45,7 @@ from quasiharmonic.mesh.topology import edges, trace_loops
 SignArray = NDArray[np.int8]
 
 # Triangles judged at a time: bounds the memory, and is large enough for the overhead not to show.
-_TRIANGLE_CHUNK = 1 << 16
+TRIANGLE_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,8 +284,8 @@ def _signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
     """Orientation of every triangle, (f,), and the indices of those with a NaN or infinite coordinate."""
     sign = np.empty(len(F), dtype=np.int8)
     nonfinite = [np.empty(0, dtype=np.int64)]
-    for start in range(0, len(F), _TRIANGLE_CHUNK):
-        chunk = slice(start, start + _TRIANGLE_CHUNK)
+    for start in range(0, len(F), TRIANGLE_CHUNK):
+        chunk = slice(start, start + TRIANGLE_CHUNK)
         corners = uv.take(F[chunk], axis=0)
         sign[chunk], undefined = orientation_or_nonfinite(corners[:, 0], corners[:, 1], corners[:, 2])
         nonfinite.append(undefined + start)
@@ -335,8 +335,8 @@ def _overwound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArra
     its last does not; as many do as there are turns.
     """
     y, turns = uv[:, 1].copy(), np.zeros(len(uv), dtype=np.int64)
-    for start in range(0, len(F), _TRIANGLE_CHUNK):
-        chunk = F[start : start + _TRIANGLE_CHUNK]
+    for start in range(0, len(F), TRIANGLE_CHUNK):
+        chunk = F[start : start + TRIANGLE_CHUNK]
         level = y.take(chunk)
         for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             passing = (level[:, following] < level[:, corner]) & (level[:, last] >= level[:, corner])

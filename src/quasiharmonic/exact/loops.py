@@ -21,7 +21,7 @@ SignArray = NDArray[np.int8]
 # Pairs of boundary edges listed at most; a collapsed boundary has billions.
 _MOST_CROSSINGS = 1000
 # Pairs of an edge and a point at the same height that are looked at together.
-_PAIR_CHUNK = 1 << 18
+PAIR_CHUNK = 1 << 18
 
 
 class Obstacle(StrEnum):
@@ -162,7 +162,7 @@ def _passed(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Iterato
     begin = 0
     while begin < len(tails):
         done = until[begin - 1] if begin else 0
-        end = max(int(np.searchsorted(until, done + _PAIR_CHUNK, side="right")), begin + 1)
+        end = max(int(np.searchsorted(until, done + PAIR_CHUNK, side="right")), begin + 1)
         edge = np.repeat(np.arange(begin, end), count[begin:end])
         point = by_level[first[edge] + np.arange(edge.size) - (until[edge] - count[edge] - done)]
         begin = end

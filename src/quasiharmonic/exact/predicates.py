@@ -45,7 +45,7 @@ _SMALLEST_SCALED = 2.0**-440
 # Triples that stage 2 takes at a time, so that its sixteen components stay in the cache.
 _EXACT_CHUNK = 8192
 # Pairs of boxes that `box_pairs` handles at a time.
-_PAIR_CHUNK = 1 << 17
+PAIR_CHUNK = 1 << 17
 
 
 def orientation(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> SignArray:
@@ -374,6 +374,6 @@ def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArra
         )
         if one is other:
             i, j = i[i <= j], j[i <= j]
-        for start in range(0, i.size, _PAIR_CHUNK):
-            chunk = slice(start, start + _PAIR_CHUNK)
+        for start in range(0, i.size, PAIR_CHUNK):
+            chunk = slice(start, start + PAIR_CHUNK)
             waiting.append((level - 1, i[chunk], j[chunk]))

@@ -59,7 +59,7 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
         not text, or none at all.
     """
     data = read_text(path)
-    return _read_regular(path, data) or read_obj_lines(path, data)
+    return read_regular(path, data) or read_obj_lines(path, data)
 
 
 def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
@@ -85,7 +85,7 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
     write_whole(path, lambda file: file.writelines(_pieces(mesh)), durable=durable)
 
 
-def _read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
+def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
     """Read a file whose lines of one kind all have one form; None when it is not so."""
     lines = data.count(b"\n")
     # Shorter lines than any vertex or face has would cost more memory than the file is worth.

@@ -62,7 +62,7 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
     if vertices < 1 or faces < 1:
         what = f"holds {vertices} vertices and {faces} faces"
         raise MeshFileError(path, what, line, "a triangle mesh is needed")
-    arrays = _read_regular(data, line, vertices, faces) or _read_lines(path, lines, vertices, faces)
+    arrays = read_regular(data, line, vertices, faces) or _read_lines(path, lines, vertices, faces)
     return MeshData(*arrays, source=os.fspath(path))
 
 
@@ -89,7 +89,7 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
     write_whole(path, (head + points + triangles).encode())
 
 
-def _read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray] | None:
+def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray] | None:
     """Read what follows ``line`` when it is all of one form; None when it is not."""
     if data.count(b"\n") != line + vertices + faces:
         return None

@@ -21,7 +21,7 @@ from quasiharmonic.linsolve.errors import NotPositiveDefinite
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver"]
 
 # Fastest first: the order in which "auto" tries them. Each entry is the module and the class in it.
-_BACKENDS = {
+BACKENDS = {
     "pardiso": ("mkl", "Pardiso"),
     "cholmod": ("cholmod", "Cholmod"),
     "qdldl": ("qdldl", "Qdldl"),
@@ -30,14 +30,14 @@ _BACKENDS = {
 
 
 def _backend(name: str) -> type[LinearSolver]:
-    module, attribute = _BACKENDS[name]
+    module, attribute = BACKENDS[name]
     backend: type[LinearSolver] = getattr(import_module(f".{module}", __name__), attribute)
     return backend
 
 
 def available() -> tuple[str, ...]:
     """Names of the backends whose libraries are installed, best first; none of them is loaded."""
-    return tuple(name for name in _BACKENDS if _backend(name).present())
+    return tuple(name for name in BACKENDS if _backend(name).present())
 
 
 def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", ordered: bool = False) -> LinearSolver:
@@ -67,16 +67,16 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
         The backend named is not installed, or its library does not load.
     """
     if name == "auto":
-        for candidate in _BACKENDS:
+        for candidate in BACKENDS:
             backend = _backend(candidate)
             if backend.present():
                 try:
                     return backend(indptr, indices, ordered=ordered)
                 except ImportError:
                     continue  # installed but broken; the last candidate comes with SciPy and always loads
-    if name not in _BACKENDS:
+    if name not in BACKENDS:
         raise ValueError(
-            f"there is no linear solver {name!r}; the names are 'auto', {', '.join(map(repr, _BACKENDS))}, "
+            f"there is no linear solver {name!r}; the names are 'auto', {', '.join(map(repr, BACKENDS))}, "
             f"and available here are {', '.join(available())}"
         )
     backend = _backend(name)

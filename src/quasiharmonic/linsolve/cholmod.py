@@ -13,7 +13,7 @@ from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
 # Up to this many unknowns of a planar mesh the supernodal code does not repay its overhead (18 ms against 30 at 20k).
-_SIMPLICIAL_BELOW = 50_000
+SIMPLICIAL_BELOW = 50_000
 
 
 class Cholmod(LinearSolver):
@@ -36,7 +36,7 @@ class Cholmod(LinearSolver):
         # its data are the solver's values.
         self._matrix = csc_matrix((self._values, self._indices, self._indptr), shape=(self.n, self.n))
         self._values[self._indptr[:-1]] = 1.0  # 0.5 refuses to look at a matrix that is zero
-        small = self.n < _SIMPLICIAL_BELOW
+        small = self.n < SIMPLICIAL_BELOW
         mode, ordering = ("simplicial", "amd") if small else ("auto", "default")
         if self._ordered:
             ordering = "natural"

@@ -17,7 +17,7 @@ from quasiharmonic.mesh.topology import edge_keys
 
 # From this many unknowns on they are numbered by dissection. Minimum degree is as good for fewer (10k unknowns: 17 ms
 # to order and analyse, 7 to factor, for both), and there is nothing to do in parallel yet.
-_DISSECT_FROM = 30_000
+DISSECT_FROM = 30_000
 
 
 class Laplacian:
@@ -60,7 +60,7 @@ class Laplacian:
         # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
         tail, head = (corner.ravel() for corner in self._unknowns(F))
         order = None
-        if points is not None and self.free.size >= _DISSECT_FROM:
+        if points is not None and self.free.size >= DISSECT_FROM:
             once = np.flatnonzero((tail >= 0) & (tail < head))
             order = nested_dissection(points[self.free], tail[once], head[once])
         if order is not None:

@@ -28,12 +28,12 @@ _INTEL_THREADS = 0
 # three times as long to order (25 against 10 ms), and what it then saves, in parallel factorisation, is 1 ms of 4.
 # Small tasks on all threads also suffer badly when the machine is busy with something else, because MKL's threads wait
 # for each other by spinning.
-_SEQUENTIAL_BELOW = 30_000
+SEQUENTIAL_BELOW = 30_000
 
 # From 10,000 unknowns on the improved two-level algorithm takes a path that is more than twice as fast (MKL 2024.2 and
 # 2026.2, a planar mesh: 9,801 unknowns are analysed in 9.8 ms and factored in 7.6, 10,201 in 4.8 and 3.0). So matrices
 # a little smaller get unknowns of their own on top, ones on the diagonal: with 10,000 the 9,801 take 5.0 and 2.9 ms.
-_FAST_FROM, _FILL_UP_FROM = 10_000, 2_500
+FAST_FROM, FILL_UP_FROM = 10_000, 2_500
 
 _NOT_POSITIVE_DEFINITE = {-4, -7}
 _OUT_OF_MEMORY = {-2, -9}
@@ -61,42 +61,42 @@ class Pardiso(LinearSolver):
 
     def _analyse(self) -> None:
         indptr, indices, values = self._indptr, self._indices, self._values
-        self._size = _FAST_FROM if _FILL_UP_FROM <= self.n < _FAST_FROM else self.n
+        self._size = FAST_FROM if FILL_UP_FROM <= self.n < FAST_FROM else self.n
         if self._size > self.n:
             extra = np.arange(self.n, self._size, dtype=np.int32)
             indptr = np.append(indptr, self.nnz + 1 + extra - self.n)
             indices = np.append(indices, extra)
             values = np.ones(indices.size)
         self._entries = values[: self.nnz]
-        sequential = self.n < _SEQUENTIAL_BELOW
-        self._handle = self._begun(indptr, indices, values, sequential)
+        sequential = self.n < SEQUENTIAL_BELOW
+        self.handle = self._begun(indptr, indices, values, sequential)
         # With several threads and any ordering but METIS's, the improved two-level algorithm's solution of a single
         # right-hand side is wrong, of two or more right; and a solution on one thread spoils the next factorisation on
         # several, or crashes it (MKL 2026.2). So it never gets fewer than two.
-        self._fewest = 1 if sequential or not self._handle.improved else 2
+        self._fewest = 1 if sequential or not self.handle.improved else 2
         self._ones = np.ones((self._size, self._fewest), order="F")
 
-    def _begun(self, indptr: Pattern, indices: Pattern, values: FloatArray, sequential: bool) -> _Handle:
+    def _begun(self, indptr: Pattern, indices: Pattern, values: FloatArray, sequential: bool) -> Handle:
         """A pattern analysed, by as many threads as there may be now."""
-        handle = _Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
+        handle = Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
         self._release_once = weakref.finalize(self, handle.release)
         handle.check(_ANALYSE)
         return handle
 
     def _factor(self) -> None:
-        if self._handle.threads != self._handle.threads_now:
+        if self.handle.threads != self.handle.threads_now:
             # An instance that is made to work with fewer or more threads than before crashes (MKL 2026.2).
             self._release_once()
-            self._handle.threads = 0  # should memory run out now, it is begun anew the next time
-            self._handle = self._begun(*self._handle.pattern, self._handle.sequential)
+            self.handle.threads = 0  # should memory run out now, it is begun anew the next time
+            self.handle = self._begun(*self.handle.pattern, self.handle.sequential)
         if self._size > self.n:
             self._entries[:] = self._values
-        self._handle.check(_FACTOR)
+        self.handle.check(_FACTOR)
         # The improved two-level algorithm takes the root of a negative pivot and goes on. The NaN spreads to all that
         # depends on it, and half a solve with one right-hand side, 5 % of the factorisation's time, finds it.
-        if self._handle.improved:
+        if self.handle.improved:
             forward = np.empty_like(self._ones)
-            self._handle.check(_FORWARD_ONLY, self._ones, forward)
+            self.handle.check(_FORWARD_ONLY, self._ones, forward)
             if not np.isfinite(forward.sum()):
                 raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a negative pivot")
 
@@ -107,14 +107,14 @@ class Pardiso(LinearSolver):
         if columns < self._fewest:
             b = np.asfortranarray(np.repeat(b, self._fewest, axis=1))
         x = np.empty_like(b, order="F")
-        self._handle.check(_SOLVE, b, x)
+        self.handle.check(_SOLVE, b, x)
         return np.asfortranarray(x[: self.n, :columns])
 
     def _release(self) -> None:
         self._release_once()
 
 
-class _Handle:
+class Handle:
     """One PARDISO instance with its arguments laid out once, so that a call only sets the phase.
 
     It keeps the arrays alive whose addresses it holds, and does not know the solver, so that it can outlive it for the
@@ -130,27 +130,27 @@ class _Handle:
         self._library = load_mkl()
         self.threads = self.threads_now
         self._order = order
-        self._memory = np.zeros(64, dtype=np.int64)
-        self._iparm = np.zeros(64, dtype=np.int32)
-        self._iparm[0] = 1  # take nothing from the defaults
-        self._iparm[1] = _MINIMUM_DEGREE if sequential else _PARALLEL_DISSECTION
-        self._iparm[4] = ordered
+        self.memory = np.zeros(64, dtype=np.int64)
+        self.iparm = np.zeros(64, dtype=np.int32)
+        self.iparm[0] = 1  # take nothing from the defaults
+        self.iparm[1] = _MINIMUM_DEGREE if sequential else _PARALLEL_DISSECTION
+        self.iparm[4] = ordered
         # No iterative refinement: zero is off for Cholesky (a negative count refines in extended precision).
-        self._iparm[7] = 0
+        self.iparm[7] = 0
         # The plain algorithm is slower to factor and takes four times as long for two right-hand sides. The classic
         # two-level one reports negative pivots but insists on METIS's ordering. The improved one takes any; but on
         # several threads it may crash at a negative pivot when the order of elimination is a chain, as of a mesh
         # numbered row by row (MKL 2026.2; never seen in a thousand indefinite matrices ordered by dissection).
         self.improved = sequential or ordered
-        self._iparm[23] = _IMPROVED_TWO_LEVEL if self.improved else _CLASSIC_TWO_LEVEL
-        self._iparm[34] = 1  # indices count from zero
+        self.iparm[23] = _IMPROVED_TWO_LEVEL if self.improved else _CLASSIC_TWO_LEVEL
+        self.iparm[34] = 1  # indices count from zero
 
         self._phase = ctypes.c_int(0)
         self._columns = ctypes.c_int(1)
         self._error = ctypes.c_int(0)
         constant = [ctypes.byref(ctypes.c_int(value)) for value in (1, 1, 2)]  # factors, which, positive definite
-        self._head = (
-            _address(self._memory),
+        self.arguments = (
+            _address(self.memory),
             *constant,
             ctypes.byref(self._phase),
             ctypes.byref(ctypes.c_int(len(indptr) - 1)),
@@ -159,7 +159,7 @@ class _Handle:
             _address(indices),
             _address(order),
             ctypes.byref(self._columns),
-            _address(self._iparm),
+            _address(self.iparm),
             ctypes.byref(ctypes.c_int(0)),  # print nothing
         )
 
@@ -170,7 +170,7 @@ class _Handle:
 
     def check(self, phase: int, b: FloatArray | None = None, x: FloatArray | None = None) -> None:
         """Run one phase and turn its error code into an exception."""
-        code = self._call(phase, b, x)
+        code = self.call(phase, b, x)
         # Positive codes are not documented; seen where a pivot came out negative.
         if code in _NOT_POSITIVE_DEFINITE or (code > 0 and phase == _FACTOR):
             raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a pivot that is not positive")
@@ -180,16 +180,16 @@ class _Handle:
 
     def release(self) -> None:
         """Free what PARDISO allocated."""
-        self._call(_RELEASE, None, None)
+        self.call(_RELEASE, None, None)
 
-    def _call(self, phase: int, b: FloatArray | None, x: FloatArray | None) -> int:
+    def call(self, phase: int, b: FloatArray | None, x: FloatArray | None) -> int:
         self._phase.value = phase
         self._columns.value = 1 if b is None else b.shape[1]
         self._error.value = 0
         # The setting is local to the calling thread and overrides the environment's; zero takes it back.
         before = self._library.MKL_Set_Num_Threads_Local(self.threads)
         try:
-            self._library.pardiso(*self._head, _address(b), _address(x), ctypes.byref(self._error))
+            self._library.pardiso(*self.arguments, _address(b), _address(x), ctypes.byref(self._error))
         finally:
             self._library.MKL_Set_Num_Threads_Local(before)
         return self._error.value
@@ -243,10 +243,10 @@ def find_mkl() -> str | None:
     """Path of MKL's runtime library, or None."""
     if ctypes.sizeof(ctypes.c_void_p) != 8 or platform.machine().lower() not in ("x86_64", "amd64"):
         return None
-    return next(_candidates(), None)
+    return next(candidates(), None)
 
 
-def _candidates() -> Iterator[str]:
+def candidates() -> Iterator[str]:
     """Paths where MKL's runtime library lies, the likeliest first, newer versions before older ones."""
     for prefix in (sys.prefix, site.getuserbase()):
         found = [

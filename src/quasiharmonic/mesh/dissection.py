@@ -31,10 +31,10 @@ Codes = NDArray[np.int32]
 
 # Median planes are taken down to parts of about so many vertices ...
 _PART = 256
-# ... from so many random vertices for each of these parts. Within them, cuts at equal distances will do: 2^_BITS along
+# ... from so many random vertices for each of these parts. Within them, cuts at equal distances will do: 2^BITS along
 # each of the part's two longest sides.
 _SAMPLES = 8
-_BITS = 4
+BITS = 4
 # Cubes of the sizes of separators, summed, over n^(3/2): proportional to the work of a factorisation. 2.2 to 3.4 in
 # planar and gently curved meshes. At 8 (a scanned hand) a factorisation takes twice as long as with METIS's ordering,
 # and ten of them lose what was gained.
@@ -60,8 +60,8 @@ def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDA
     n = len(points)
     levels = max(0, int(np.ceil(np.log2(max(n / _PART, 1)))))
     part = _halves(points, levels)
-    code = (part << 2 * _BITS) | _cells(points, part, 1 << levels)
-    rank = _separators(code, levels, tail, head)
+    code = (part << 2 * BITS) | _cells(points, part, 1 << levels)
+    rank = separators(code, levels, tail, head)
     if _work(code, rank) > _WORST * n**1.5:
         return None
     # A part of rank k is a run of 2^k codes. Its separator follows the last of them, and those of its own parts.
@@ -102,18 +102,18 @@ def _cells(points: FloatArray, part: Codes, parts: int) -> Codes:
     code = np.zeros(n, dtype=np.int32)
     for shift, axis in zip((1, 0), axes.T, strict=True):
         side = np.take_along_axis(size, axis[:, None], axis=1)[:, 0]
-        scale = 2**_BITS * (1 - 1e-9) / np.where(side > 0, side, 1)
+        scale = 2**BITS * (1 - 1e-9) / np.where(side > 0, side, 1)
         origin = np.take_along_axis(low, axis[:, None], axis=1)[:, 0]
         along = flat[start + axis.astype(np.int32)[part]] - origin[part]
         code |= _SPREAD[(along * scale[part]).astype(np.int32)] << shift
     return code
 
 
-# Numbers below 2^_BITS with a zero between any two of their bits.
-_SPREAD = np.array([sum((k >> b & 1) << 2 * b for b in range(_BITS)) for k in range(2**_BITS)], dtype=np.int32)
+# Numbers below 2^BITS with a zero between any two of their bits.
+_SPREAD = np.array([sum((k >> b & 1) << 2 * b for b in range(BITS)) for k in range(2**BITS)], dtype=np.int32)
 
 
-def _separators(code: Codes, levels: int, tail: IntArray, head: IntArray) -> NDArray[np.uint8]:
+def separators(code: Codes, levels: int, tail: IntArray, head: IntArray) -> NDArray[np.uint8]:
     """Rank of the largest part that each vertex separates the halves of, 0 if none.
 
     A part of rank k is all vertices whose codes agree but for the last k bits.
@@ -122,7 +122,7 @@ def _separators(code: Codes, levels: int, tail: IntArray, head: IntArray) -> NDA
     rank_of_edge = np.frexp((code[tail] ^ code[head]).astype(np.float64))[1].astype(np.uint8)
     order = np.argsort(rank_of_edge, kind="stable")
     tail, head = tail[order], head[order]
-    highest = levels + 2 * _BITS
+    highest = levels + 2 * BITS
     first = np.append(0, np.cumsum(np.bincount(rank_of_edge, minlength=highest + 1)))
     rank = np.zeros(code.size, dtype=np.uint8)
     for k in range(highest, 0, -1):
@@ -132,7 +132,7 @@ def _separators(code: Codes, levels: int, tail: IntArray, head: IntArray) -> NDA
         u, v = u[left], v[left]
         swap = code[u] > code[v]
         u, v = np.where(swap, v, u), np.where(swap, u, v)
-        for chosen in _cover(u, v) if k > 2 * _BITS else _smaller_sides(u, v, code >> k):
+        for chosen in smallest_cover(u, v) if k > 2 * BITS else _smaller_sides(u, v, code >> k):
             rank[chosen] = k
     return rank
 
@@ -150,7 +150,7 @@ def _smaller_sides(u: IntArray, v: IntArray, part: Codes) -> tuple[IntArray, Int
     return sides[0][fewer[part[sides[0]]]], sides[1][~fewer[part[sides[1]]]]
 
 
-def _cover(u: IntArray, v: IntArray) -> tuple[IntArray, IntArray]:
+def smallest_cover(u: IntArray, v: IntArray) -> tuple[IntArray, IntArray]:
     """The fewest vertices that are ends of all edges u-v: a tenth less than the vertices of either side.
 
     By Kőnig's theorem. A largest matching has as many edges. From the u that it leaves out follow edges to v, and back

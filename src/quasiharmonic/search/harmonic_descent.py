@@ -34,7 +34,7 @@ _PROBING, _LENGTH, _MEMORY = 0.4, 0.1, 0.9
 # Of the mean stiffness that VectorAdam has learnt, the least that a triangle is given.
 _SOFTEST = 1e-3
 # Newton steps and local repairs for the last flips.
-_RIGHTING = 40
+RIGHTING = 40
 
 
 class HarmonicDescent:
@@ -116,7 +116,7 @@ class HarmonicDescent:
         """
         if self.history[-1].flipped == 0:
             return True
-        for method in (Newton(iterations=_RIGHTING), Patches(tries=_RIGHTING)):
+        for method in (Newton(iterations=RIGHTING), Patches(tries=RIGHTING)):
             with self._stage(f"{method.word}, tanh"):
                 self._last = self._objective.evaluate(self._last.xi)
                 for at in method.iterates(self._objective, self._last):

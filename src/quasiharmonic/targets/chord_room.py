@@ -55,8 +55,8 @@ def make_room(
         here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
         spare = _between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
         straight = _between(wanted, stretch.within(t, left)[1]) == 0
-        room = _ChordRoom(_reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
-        chosen = _choose(stretch.along, wanted, room)
+        room = ChordRoom(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
+        chosen = choose(stretch.along, wanted, room)
         if chosen is None:
             return None
         found.append((int(stretch.run[0]), stretch.begin))
@@ -65,7 +65,7 @@ def make_room(
 
 
 @dataclass(frozen=True)
-class _ChordRoom:
+class ChordRoom:
     """What the convex corners of a stretch must leave between them, side by side.
 
     Attributes
@@ -86,7 +86,8 @@ class _ChordRoom:
     farthest: float
 
 
-def _reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
+def reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
+    """`Room.reach` of a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
     count = len(stretch.run) - 1
     # Either way around the loop; what goes beyond the stretch does not matter.
     begin = (np.concatenate([chords[:, 0], chords[:, 1]]) - stretch.run[0]) % n
@@ -103,7 +104,7 @@ def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
     return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")
 
 
-def _choose(along: FloatArray, wanted: FloatArray, room: _ChordRoom) -> IntArray | None:
+def choose(along: FloatArray, wanted: FloatArray, room: ChordRoom) -> IntArray | None:
     """Vertices for wanted places with the least sum of squared distances that leaves room; None if none does.
 
     Row j of ``cost`` holds, for every vertex, the best that can be done for the places up to j when j

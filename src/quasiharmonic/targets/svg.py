@@ -23,7 +23,7 @@ from quasiharmonic.targets.nesting import arranged
 from quasiharmonic.targets.svgpath import parse_path
 
 _SVG = "http://www.w3.org/2000/svg"
-_MOST_BYTES = 64 << 20
+MOST_BYTES = 64 << 20
 _DEEPEST = 200
 # Squares of coordinates, and their sums, must neither overflow nor vanish.
 _LARGEST = 1e150
@@ -74,8 +74,8 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     """
     if not 1e-7 <= tolerance < 1:
         raise ValueError(f"the tolerance is a share of the drawing's size, from 1e-7 to below 1, not {tolerance}")
-    if os.path.isfile(path) and os.path.getsize(path) > _MOST_BYTES:
-        raise MeshFileError(path, f"is larger than {_MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
+    if os.path.isfile(path) and os.path.getsize(path) > MOST_BYTES:
+        raise MeshFileError(path, f"is larger than {MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
     with np.errstate(over="ignore", invalid="ignore"):
         subpaths = _Drawing(path).read(read_text(path))
     controls = [control for pieces in subpaths for control in pieces]

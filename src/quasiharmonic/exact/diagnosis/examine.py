@@ -24,7 +24,7 @@ from quasiharmonic.exact.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
 
 # What is spent on vertices that see too little, in about microseconds, before those left are passed over.
-_MOST_EFFORT = 3_000_000
+MOST_EFFORT = 3_000_000
 
 
 def diagnose(problem: Problem) -> Diagnosis:
@@ -126,7 +126,7 @@ def _unplaced(
     for star in map(around.__getitem__, range(len(around))):
         obstruction = half_planes(star, fixture)
         if obstruction is None and sight is not None:
-            if sight.effort < _MOST_EFFORT:
+            if sight.effort < MOST_EFFORT:
                 obstruction = sight.hidden(star)
             else:
                 passed_over.append(star.vertex)

@@ -92,7 +92,7 @@ class Shortcuts:
             i, j = i[far], j[far]
             if not i.size:
                 continue
-            hidden = ~self._within(i, j, k)
+            hidden = ~self.within(i, j, k)
             for a, b in zip(i[hidden].tolist(), j[hidden].tolist(), strict=True):
                 if self._polygon.work > budget:
                     self.unchecked = k
@@ -100,7 +100,7 @@ class Shortcuts:
                 if self._polygon.link_distance(a, b, k) > k:
                     yield self._obstruction(a, b, k)
 
-    def _within(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
+    def within(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
         """Whether corners are known to be no more than k > 2 segments apart.
 
         Known is whether one sees the other, or a third one that is less than k sides from it, and

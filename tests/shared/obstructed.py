@@ -1,95 +1,15 @@
-"""Problems without a map, each for a reason of its own, and the small meshes they are made of."""
+"""Problems without a map, each for a reason of its own."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from meshes import boundary_of
-from quasiharmonic.exact.predicates import SegmentRelation, segment_relation
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
-
-# A corridor around three sides of a square: nobody sees from one end to the other.
-U = [[0, 0], [9, 0], [9, 9], [6, 9], [6, 3], [3, 3], [3, 9], [0, 9]]
-
-
-def circle(n, radius=1.0, turns=1):
-    t = 2 * np.pi * turns * np.arange(n) / n
-    return radius * np.stack([np.cos(t), np.sin(t)], axis=1)
-
-
-def spread(polygon, n):
-    """``n`` points on a polygon: its corners, and others halfway along its longest sides."""
-    points = [np.asarray(p, dtype=float) for p in polygon]
-    while len(points) < n:
-        k = int(np.argmax([np.linalg.norm(points[k] - points[k - 1]) for k in range(len(points))]))
-        points.insert(k, (points[k] + points[k - 1]) / 2)
-    return np.array(points)
-
-
-def spiral(n, turns, width=0.6):
-    """A band that winds around itself without touching, as a polygon with ``2 n`` corners."""
-    t = np.linspace(0, 2 * np.pi * turns, n)
-    outward = np.stack([np.cos(t), np.sin(t)], axis=1)
-    middle = 1 + t[:, None] / (2 * np.pi)
-    return np.concatenate([(middle + width / 2) * outward, ((middle - width / 2) * outward)[::-1]])
-
-
-def random_polygon(rng, n, size):
-    """A simple polygon, counterclockwise, on a grid of so many points a side; often with straight angles."""
-    while True:
-        p = rng.permutation(np.stack(np.divmod(rng.permutation(size**2)[:n], size), axis=1)).astype(float)
-        for _ in range(20 * n):
-            q = np.roll(p, -1, axis=0)
-            i, j = np.triu_indices(n, 2)
-            relation = segment_relation(p[i], q[i], p[j], q[j])
-            # The first edge and the last have an end in common.
-            crossed = np.flatnonzero((relation != SegmentRelation.DISJOINT) & ((i > 0) | (j < n - 1)))
-            if not crossed.size:
-                break
-            k = rng.choice(crossed)
-            p[i[k] + 1 : j[k] + 1] = p[i[k] + 1 : j[k] + 1][::-1].copy()
-        folded = segment_relation(p, q, q, np.roll(q, -1, axis=0)) == SegmentRelation.OVERLAPPING
-        area = np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
-        if not crossed.size and not folded.any() and area:
-            return p if area > 0 else p[::-1]
-
-
-def wheel(n):
-    """A hub ``n`` in a ring of ``n``, each two neighbours of which form a triangle with it."""
-    i = np.arange(n)
-    return np.concatenate([circle(n), np.zeros((1, 2))]), np.stack([i, (i + 1) % n, np.full(n, n)], axis=1)
-
-
-def loose_wheel(n):
-    """As `wheel`, with a vertex ``n + 1 + i`` inside each triangle: the hub has none with a boundary edge."""
-    V, F = wheel(n)
-    a, b, c = F.T
-    k = n + 1 + np.arange(n)
-    parts = [np.stack(t, axis=1) for t in ((a, b, k), (b, c, k), (c, a, k))]
-    return np.concatenate([V, V[F].mean(axis=1)]), np.concatenate(parts)
-
-
-def two_wheels():
-    """A ring of 8 with the chord 0, 4 and a hub on either side, 8 to its right and 9 to its left."""
-    rings = [[0, 1, 2, 3, 4], [4, 5, 6, 7, 0]]
-    V = np.concatenate([circle(8), [circle(8)[ring].mean(axis=0) for ring in rings]])
-    return V, np.array([(r[k - 1], r[k], hub) for hub, r in enumerate(rings, start=8) for k in range(5)])
-
-
-def eared():
-    """A square whose corner 1 is an ear, behind the chord 0, 2; vertex 4 is in the middle of the rest."""
-    return np.array([[0, 0], [4, 0], [4, 4], [0, 4], [1, 3.0]]), np.array([[0, 1, 2], [0, 2, 4], [2, 3, 4], [3, 0, 4]])
-
-
-def handle(n=6):
-    """A torus of ``n`` by ``n`` cells without one cell: one boundary loop, and a handle."""
-    i, j = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
-    here, right, up, across = (((i + a) % n) * n + (j + b) % n for a, b in ((0, 0), (1, 0), (0, 1), (1, 1)))
-    F = np.stack([here, right, across, here, across, up], axis=1).reshape(-1, 3)
-    a, b = 2 * np.pi * i / n, 2 * np.pi * j / n
-    return np.stack([(2 + np.cos(b)) * np.cos(a), (2 + np.cos(b)) * np.sin(a), np.sin(b)], axis=1), F[2:]
+from shared.meshes import boundary_of
+from shared.polygons import U, circle, spiral, spread
+from shared.small_meshes import eared, handle, loose_wheel, two_wheels, wheel
 
 
 def moved(mesh, at=None, pins=()):

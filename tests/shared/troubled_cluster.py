@@ -9,7 +9,7 @@ import time
 from quasiharmonic.batch.supervisor import Supervisor
 from quasiharmonic.io.errors import OutputError
 
-_attend = getattr(Supervisor.attend, "plain", Supervisor.attend)
+plain_attend = getattr(Supervisor.attend, "plain", Supervisor.attend)
 
 
 def attend(supervisor, files):
@@ -21,9 +21,9 @@ def attend(supervisor, files):
         raise OutputError("cannot write full: No space left on device")
     if files.name == "mistake":
         return attend(supervisor, files)
-    return _attend(supervisor, files)
+    return plain_attend(supervisor, files)
 
 
 # Dask loads this file more than once.
-attend.plain = _attend
+attend.plain = plain_attend
 Supervisor.attend = attend

@@ -13,7 +13,7 @@ import time
 from quasiharmonic.batch import worker
 from quasiharmonic.io import atomic
 
-_solve = worker._solve
+fill_record = worker.fill_record
 
 
 def hog():
@@ -27,7 +27,7 @@ def full(*arguments):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def unmeasurable(problem, result):
+def unmeasurable(V, F, uv):
     raise MemoryError
 
 
@@ -48,7 +48,7 @@ TROUBLES = {
     "exit": lambda: sys.exit(3),
     "bug": lambda: {}["lost"],
     "noise": noise,
-    "late": lambda: setattr(worker, "_measured", unmeasurable),
+    "late": lambda: setattr(worker, "distortion", unmeasurable),
     "full": lambda: setattr(atomic.os, "replace", full),
 }
 
@@ -57,8 +57,8 @@ def troubled(job, folder, record, tell):
     for word, trouble in TROUBLES.items():
         if word in record["problem"]:
             trouble()
-    _solve(job, folder, record, tell)
+    fill_record(job, folder, record, tell)
 
 
-worker._solve = troubled
+worker.fill_record = troubled
 worker.serve()

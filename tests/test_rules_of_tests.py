@@ -1,0 +1,95 @@
+"""Tests share what is in `shared`: none imports another, reaches for private names, or looks outside the checkout."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent
+ROOT = FOLDER.parent
+MODULES = sorted(FOLDER.rglob("*.py"))
+TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
+# What `namedtuple` offers has an underscore so that it is no field, not because it is private.
+PUBLIC = {"_replace", "_asdict", "_fields", "_make"}
+
+
+def private(name):
+    return name.startswith("_") and not name.startswith("__") and name not in PUBLIC
+
+
+def imports(tree):
+    """(module, name or None) of everything imported, wherever in the file."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "tests are no package"
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def private_names(tree):
+    """What begins with an underscore and is imported, reached into, or replaced by `monkeypatch.setattr`."""
+    for module, name in imports(tree):
+        yield from (part for part in (*module.split("."), name or "") if private(part))
+    for node in ast.walk(tree):
+        # A class of the tests' own that fills in a protocol may call what it takes the place of.
+        if (
+            isinstance(node, ast.Attribute)
+            and private(node.attr)
+            and ast.unparse(node.value) not in ("self", "super()")
+        ):
+            yield node.attr
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("setattr", "getattr", "delattr"):
+            words = [a.value for a in node.args[:2] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            yield from (part for word in words for part in word.split(".") if private(part))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(FOLDER).as_posix())
+def test_rules(path):
+    text = path.read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    assert not [module for module, _ in imports(tree) if module.split(".")[-1] in TESTS | {"conftest"}]
+    assert not list(private_names(tree))
+    assert not re.search(r"parents\[[2-9]\]|\.parent\.parent\.parent", text), "looks outside the checkout"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from quasiharmonic.search.inject import _hidden",
+        "import quasiharmonic._hidden",
+        "result._hidden()",
+        "monkeypatch.setattr('quasiharmonic.search.inject._hidden', 1)",
+        "patch.setattr(inject, '_hidden', 1)",
+    ],
+)
+def test_private_names_are_found(code):
+    assert list(private_names(ast.parse(code))) == ["_hidden"]
+
+
+def test_a_test_is_found_wherever_it_is_imported():
+    assert list(imports(ast.parse("def f():\n    from test_cli import run"))) == [("test_cli", "run")]
+
+
+def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
+    """Every package is of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
+    wanted = {
+        node.args[0].value
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip"
+    }
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    brought = re.search(r"\[(.*)\]", extras["test"][0]).group(1).split(",")
+    installed = " ".join(line for name in ("test", *brought) for line in extras[name])
+    optional = (ROOT / ".ci" / "optional").read_text(encoding="utf-8")
+    assert "'.[test,view]' gmsh vtk" in optional
+    assert "scikit-sparse" in optional
+    assert {"igl", "polyscope"} <= wanted
+    known = f"{installed} {' '.join(extras['view'])}"
+    assert not [name for name in wanted if name not in sys.stdlib_module_names and name not in known]
