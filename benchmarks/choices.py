@@ -82,16 +82,16 @@ def functionals(problems: list[Problem]) -> str:
         "V₄ `poisson`": "poisson",
     }
     choices = {
-        name: VectorAdam(functional=word, parameterization="si-log", reference="corrected", iterations=LIMIT)
+        name: VectorAdam(functional=word, parameterisation="si-log", reference="corrected", iterations=LIMIT)
         for name, word in names.items()
     }
     return table(["functional", *HEAD], compared(problems, choices))
 
 
-def parameterizations(problems: list[Problem]) -> str:
+def parameterisations(problems: list[Problem]) -> str:
     """Both parameterisations, each on two kinds of triangles."""
     choices = {
-        f"`{word}`, {reference}": VectorAdam(parameterization=word, reference=reference, iterations=LIMIT)
+        f"`{word}`, {reference}": VectorAdam(parameterisation=word, reference=reference, iterations=LIMIT)
         for word in ("tanh", "si-log")
         for reference in ("equilateral", "corrected")
     }
@@ -103,7 +103,7 @@ def pins(_: list[Problem]) -> str:
     problem = swapped(40)
     rows = []
     for word in ("tanh", "si-log"):
-        result = solve(problem, strategy=[VectorAdam(parameterization=word, iterations=LIMIT)], max_iterations=LIMIT)
+        result = solve(problem, strategy=[VectorAdam(parameterisation=word, iterations=LIMIT)], max_iterations=LIMIT)
         rows.append([f"`{word}`", str(len(result.certificate.flipped)), str(result.iterations)])
     return table(["two points swapped", "inverted at last", "iterations"], rows)
 
@@ -179,7 +179,7 @@ def solvers(problems: list[Problem]) -> str:
     return table(["linear solver", "time"], [[f"`{name}`", f"{seconds / unit:.1f}"] for seconds, name in sorted(rows)])
 
 
-TABLES = functionals, parameterizations, pins, methods, strategies, energies, solvers
+TABLES = functionals, parameterisations, pins, methods, strategies, energies, solvers
 
 
 def main() -> None:

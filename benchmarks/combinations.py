@@ -22,7 +22,7 @@ from quasiharmonic.descent import LBFGS, Descent, Newton, VectorAdam
 from quasiharmonic.energy.measures import distortion
 
 FUNCTIONALS = "neumann", "sobolev", "dirichlet", "poisson"
-PARAMETERIZATIONS = "tanh", "si-log"
+PARAMETERISATIONS = "tanh", "si-log"
 METHODS = {"vector-adam": VectorAdam, "l-bfgs": LBFGS}
 
 
@@ -36,15 +36,15 @@ def main() -> None:
     options = parser.parse_args()
     table = csv.writer(options.output)
     table.writerow(
-        ["case", "triangles", "functional", "parameterization", "method", "flips", "iterations", "seconds", "mips"]
+        ["case", "triangles", "functional", "parameterisation", "method", "flips", "iterations", "seconds", "mips"]
     )
     folders = [path.parent for folder in options.folders for path in sorted(folder.rglob("input.obj"))]
     for folder in folders:
         problem = Problem(*io.read_problem(folder))
-        for functional, parameterization, method in itertools.product(FUNCTIONALS, PARAMETERIZATIONS, METHODS):
-            reference = "equilateral" if parameterization == "tanh" else "corrected"
+        for functional, parameterisation, method in itertools.product(FUNCTIONALS, PARAMETERISATIONS, METHODS):
+            reference = "equilateral" if parameterisation == "tanh" else "corrected"
             stage = METHODS[method](
-                parameterization=parameterization,
+                parameterisation=parameterisation,
                 functional=functional,
                 reference=reference,
                 iterations=options.iterations,
@@ -53,13 +53,13 @@ def main() -> None:
             if options.newton:
                 stages.append(
                     Newton(
-                        parameterization=parameterization, reference=reference, iterations=options.newton, resume=True
+                        parameterisation=parameterisation, reference=reference, iterations=options.newton, resume=True
                     )
                 )
             result = solve(problem, strategy=stages)
             flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
             mips = distortion(problem.V, problem.F, result.uv).summary("mips").mean if result.injective else np.nan
-            row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterization, method]
+            row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterisation, method]
             table.writerow([*row, flips, result.iterations, f"{result.seconds:.3f}", f"{mips:.3f}"])
             options.output.flush()
 

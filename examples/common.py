@@ -47,9 +47,9 @@ def onto(V: FloatArray, F: NDArray[np.int64], outline: FloatArray, start: int | 
     return Problem(V, F, loop, targets.arc_length(V[loop], outline, start=at))
 
 
-def first_map(problem: Problem, parameterization: str, iterations: int = 1000, **options: Any) -> MapResult:
+def first_map(problem: Problem, parameterisation: str, iterations: int = 1000, **options: Any) -> MapResult:
     """The first injective map that one stage of VectorAdam on V₃ comes by, from the rest triangles."""
-    stage = VectorAdam(parameterization=parameterization, reference="corrected", iterations=iterations)
+    stage = VectorAdam(parameterisation=parameterisation, reference="corrected", iterations=iterations)
     return solve(problem, strategy=[stage], max_iterations=iterations, **options)
 
 

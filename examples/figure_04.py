@@ -57,7 +57,7 @@ CASES: dict[str, tuple[int, Hole]] = {
     "strip 0.05, 5 layers": (200, rectangle(0.95, 0.95)),
 }
 NAMES = {"V₃": "dirichlet", "V₂": "sobolev", "V₁": "neumann", "V₄": "poisson"}
-COLUMNS = [f"{name} {parameterization}" for name in NAMES for parameterization in ("tanh", "si-log")]
+COLUMNS = [f"{name} {parameterisation}" for name in NAMES for parameterisation in ("tanh", "si-log")]
 # All eight on the first ring; then those that have a chance.
 USUAL = ["V₃ tanh", "V₃ si-log", "V₂ si-log", "V₁ si-log"]
 DRAWN = ["strip 0.5, 12 layers", "strip 0.2, 5 layers", "off-centre, 4 layers", "hole 1.5 × 0.5, 3 layers"]
@@ -65,9 +65,9 @@ DRAWN = ["strip 0.5, 12 layers", "strip 0.2, 5 layers", "off-centre, 4 layers", 
 
 def search(problem: Problem, column: str) -> MapResult:
     """A functional's own descent, 100 iterations for tanh and 300 for si-log; then Newton's on V₃, with tanh."""
-    name, parameterization = column.split()
-    steps = 100 if parameterization == "tanh" else 300
-    first = VectorAdam(functional=NAMES[name], parameterization=parameterization, iterations=steps)
+    name, parameterisation = column.split()
+    steps = 100 if parameterisation == "tanh" else 300
+    first = VectorAdam(functional=NAMES[name], parameterisation=parameterisation, iterations=steps)
     return solve(problem, strategy=[first, Newton(iterations=400, resume=True)])
 
 

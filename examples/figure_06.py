@@ -49,7 +49,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     numbers: dict[str, Any] = {"triangles": len(problem.F)}
     maps = {}
     for row, (functional, name) in zip(axes, NAMES.items(), strict=True):
-        stage = VectorAdam(parameterization="si-log", functional=functional)
+        stage = VectorAdam(parameterisation="si-log", functional=functional)
         result = solve(problem, strategy=[stage], max_iterations=1000, record=1)
         # Nothing unfolds while V₄ falls: there any moment is as good as another.
         still = functional == "poisson"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from common import COLORS, panels, run, save
-from quasiharmonic.field.tensor import PARAMETERIZATIONS
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 
 
 def main(output: Path) -> dict[str, Any]:
@@ -22,16 +22,16 @@ def main(output: Path) -> dict[str, Any]:
     for k, ax in enumerate(axes):
         ax.set_position((0.08 + 0.5 * k, 0.15, 0.39, 0.75))
     numbers = {}
-    for name, parameterization in PARAMETERIZATIONS.items():
+    for name, parameterisation in PARAMETERISATIONS.items():
         rho = np.linspace(0, 5, 400)
-        axes[0].plot(rho, rho * parameterization.radial(rho)[0], color=COLORS[name], lw=2, label=name)
+        axes[0].plot(rho, rho * parameterisation.radial(rho)[0], color=COLORS[name], lw=2, label=name)
         distortion = np.geomspace(1, 1000, 400)[1:]
-        far = parameterization.inverse((distortion - 1) / (distortion + 1))
+        far = parameterisation.inverse((distortion - 1) / (distortion + 1))
         shown = far < 1e12
         axes[1].plot(distortion[shown], far[shown], color=COLORS[name], lw=2, label=name)
         numbers[name] = {
-            "|μ| at |ξ| = 1": float(parameterization.radial(np.ones(1))[0][0]),
-            "|ξ| at |μ| = 0.9": float(parameterization.inverse(np.array([0.9]))[0]),
+            "|μ| at |ξ| = 1": float(parameterisation.radial(np.ones(1))[0][0]),
+            "|ξ| at |μ| = 0.9": float(parameterisation.inverse(np.array([0.9]))[0]),
         }
     axes[0].set(xlabel="|ξ|", ylabel="|μ| = r(|ξ|)", ylim=(0, 1))
     axes[1].set(xlabel="σ₁/σ₂", ylabel="|ξ| that it takes", xscale="log", yscale="log", xlim=(1, 1000))

@@ -30,14 +30,14 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
         harmonic = quasi_harmonic_map(problem, reference="rest")
         show(row[0], problem, harmonic, f"{name}: harmonic")
         numbers[name] = {"triangles": len(problem.F), "harmonic": flips(problem, harmonic)}
-        for ax, parameterization in zip(row[1:], ("tanh", "si-log"), strict=True):
-            result = first_map(problem, parameterization)
+        for ax, parameterisation in zip(row[1:], ("tanh", "si-log"), strict=True):
+            result = first_map(problem, parameterisation)
             ratio, share = ratios(problem, result.uv)
             energy = mips(problem, result.uv)
             drawn = show_ratios(
-                ax, problem, result.uv, f"{parameterization}: {result.iterations} iterations\nMIPS {energy:.2f}", 100
+                ax, problem, result.uv, f"{parameterisation}: {result.iterations} iterations\nMIPS {energy:.2f}", 100
             )
-            numbers[name][parameterization] = {
+            numbers[name][parameterisation] = {
                 "flips": len(result.certificate.flipped),
                 "iterations": result.iterations,
                 "MIPS": round(energy, 2),

@@ -29,7 +29,7 @@ def main(output: Path, size: int = 40, rows: int = 7) -> dict[str, Any]:
     figure, axes = panels(len(problems), 5, (2.7, 3.1))
     numbers: dict[str, Any] = {}
     finish = [
-        Newton(parameterization="si-log", reference="corrected", iterations=60, resume=True),
+        Newton(parameterisation="si-log", reference="corrected", iterations=60, resume=True),
         Patches(tries=60, resume=True),
     ]
     for row, (name, problem) in zip(axes, problems.items(), strict=True):
@@ -37,7 +37,7 @@ def main(output: Path, size: int = 40, rows: int = 7) -> dict[str, Any]:
         row[0].set_title(f"{name}\n{len(problem.F):,} triangles", size=9)
         numbers[name] = {}
         for ax, (symbol, functional) in zip(row[1:], NAMES.items(), strict=True):
-            own = VectorAdam(parameterization="si-log", functional=functional, reference="corrected", iterations=200)
+            own = VectorAdam(parameterisation="si-log", functional=functional, reference="corrected", iterations=200)
             result = solve(problem, strategy=[own, *finish])
             show(ax, problem, result.uv, f"{symbol}, {result.iterations} iterations", size=9)
             numbers[name][symbol] = {

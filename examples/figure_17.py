@@ -4,7 +4,7 @@
 The paper's si-log succeeds up to 140 × 140 cells and fails at 160 × 160. With larger steps and less momentum, and
 without being told which parameterisation to take, we get through at every size, and with ``--finest`` at 320 squared.
 From 80 squared on a coarse mesh is solved first: some 400 iterations, but cheap ones, and 0.6 s at 160 squared. On the
-mesh itself, with ``strategy=[VectorAdam(parameterization="si-log")]``, it is 90, 132, 151 and 192 iterations at 20, 40,
+mesh itself, with ``strategy=[VectorAdam(parameterisation="si-log")]``, it is 90, 132, 151 and 192 iterations at 20, 40,
 80 and 160 squared. That does grow, about as the logarithm of the size, since a point held in the plane is no boundary
 to a Laplacian.
 

@@ -41,9 +41,9 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
     }
     maps = {"tanh, the first map": first}
     maps |= {
-        title: harmonise_map(problem.domain, first, energy=name, iterations=60).uv for name, title in NAMES.items()
+        title: harmonise_map(problem.domain, first, energy=name, max_iterations=60).uv for name, title in NAMES.items()
     }
-    maps["R₁"] = harmonise_map(problem.domain, first, energy=None, conformal=1.0, iterations=60).uv
+    maps["R₁"] = harmonise_map(problem.domain, first, energy=None, conformal=1.0, max_iterations=60).uv
     figure, axes = panels(2, 4, (2.9, 3.2))
     numbers: dict[str, Any] = {}
     for ax, (name, uv) in zip([*axes[0], *axes[1]], maps.items(), strict=False):

@@ -24,7 +24,7 @@ from sculptures import seven
 
 STAGES = {
     "tanh": VectorAdam(iterations=1000),
-    "si-log": VectorAdam(parameterization="si-log", reference="corrected", iterations=1000),
+    "si-log": VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
 }
 
 

@@ -186,7 +186,7 @@ class TestRun:
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0
         assert batch.run(stars / "a", tmp_path / "out").resumed == 1
         package = tmp_path / "package"
-        (package / "batch" / "report").mkdir(parents=True)
+        (package / "report").mkdir(parents=True)
         monkeypatch.setattr(quasiharmonic, "__file__", str(package / "__init__.py"))
         states = []
         for file, text in (
@@ -320,7 +320,7 @@ class TestRun:
                 held = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/batch/*.py")])
                 sizes[progress.done] = sum(trace.size for trace in held.traces)
 
-        monkeypatch.setattr(supervisor.Keeper, "attend", attend)
+        monkeypatch.setattr(supervisor.Supervisor, "attend", attend)
         for k in range(1000):
             folder = tmp_path / "set" / f"{k // 50}" / f"{k}"
             folder.mkdir(parents=True)

@@ -369,7 +369,7 @@ class TestHarmonise:
     def test_options_reach_it(self, star, tmp_path):
         first, report = tmp_path / "first.obj", tmp_path / "r.json"
         assert run("map", star, "-o", first) == 0
-        arguments = "--eta", 0.5, 0.25, "--iterations", 6, "--linear-solver", "superlu", "--json", report
+        arguments = "--eta", 0.5, 0.25, "--max-iterations", 6, "--linear-solver", "superlu", "--json", report
         assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", *arguments) == 0
         facts = json.loads(report.read_text())
         assert [s["name"] for s in facts["stages"][:2]] == [f"harmonise, springs, η = {eta}" for eta in (0.5, 0.25)]

@@ -218,7 +218,7 @@ class TestSearch:
         fixed = np.append(boundary_of(F), [int(np.argmin(np.abs(V - (0, 0.7)).sum(axis=1)))])
         target = V[fixed] @ [[1, 0.4], [0, 1]]
         target[-1] += 0.02
-        strategy = [CoarseToFine(VectorAdam(parameterization="si-log", iterations=400))]
+        strategy = [CoarseToFine(VectorAdam(parameterisation="si-log", iterations=400))]
         result = solve(Problem(lift(V), F, fixed, target), strategy=strategy)
         assert result.injective
         assert result.stages[0].name.startswith("coarse-to-fine, vector-adam, si-log")

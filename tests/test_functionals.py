@@ -102,13 +102,13 @@ class TestValues:
 
 
 @pytest.mark.parametrize("functional", NAMES)
-@pytest.mark.parametrize("parameterization", ["tanh", "si-log"])
+@pytest.mark.parametrize("parameterisation", ["tanh", "si-log"])
 @pytest.mark.parametrize("reference", ["equilateral", "rest"])
 @pytest.mark.parametrize("pins", [0, 4])
 @pytest.mark.parametrize("mesh", [1, 2], ids=["bowl", "annulus"])
-def test_gradients_against_differences(functional, parameterization, reference, pins, mesh):
+def test_gradients_against_differences(functional, parameterisation, reference, pins, mesh):
     _, V, F = MESHES[mesh]
-    objective = Objective(posed(V, F, pins, noise=0.05), functional, parameterization, reference)
+    objective = Objective(posed(V, F, pins, noise=0.05), functional, parameterisation, reference)
     xi = random_xi(F)
     rng = np.random.default_rng(1)
     h = 1e-5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quasiharmonic.field.regularisers import Conformal
 
 from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
 from quasiharmonic.descent import LBFGS
@@ -13,7 +14,6 @@ from quasiharmonic.energy.derivatives import check_energy, derivative_error
 from quasiharmonic.energy.energies import MIPS, AreaPreserving, Combination, Energy
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.regularizers import Conformal
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.search.harmonised import Harmonised
 from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map
@@ -47,9 +47,9 @@ def objective_of(V, F, uv, fixed, energy, *, eta=0.3, conformal=0.2, weights=Non
     objective = Objective(problem, "dirichlet", sigmoid, reference)
     area = float(signed_areas(F, problem.frame.inward(uv)).sum())
     deformation = None if energy is None else DeformationEnergy(V, F, energy, area=area, weights=weights)
-    regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
+    regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
     return objective.descending(
-        Harmonised(problem, objective.mesh, area, deformation, regularizer, eta=eta, conformal=conformal)
+        Harmonised(problem, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
     )
 
 
@@ -93,8 +93,8 @@ class TestObjective:
         area = at.objective.functional.area
         assert area == pytest.approx(at.dw.area.sum())
         measured = distortion(V, F, at.objective.problem.positions(at.w))
-        regularizer = np.sum(measured.share * 4 * np.sinh(np.abs(xi)) ** 2)
-        expected = at.dirichlet / area + 0.3 * (measured.summary("mips").mean + 0.2 * regularizer)
+        regulariser = np.sum(measured.share * 4 * np.sinh(np.abs(xi)) ** 2)
+        expected = at.dirichlet / area + 0.3 * (measured.summary("mips").mean + 0.2 * regulariser)
         assert at.value == pytest.approx(expected, rel=1e-12)
 
     def test_does_not_depend_on_scales(self):
@@ -117,7 +117,7 @@ class TestObjective:
         assert at.value == pytest.approx(mips, rel=1e-10)
         assert objective.functional.distortion_of_map(at) == pytest.approx(mips, rel=1e-10)
 
-    def test_regularizer_of_an_inverted_map(self):
+    def test_regulariser_of_an_inverted_map(self):
         V, F, uv, fixed = bowl()
         objective = objective_of(V, F, uv, fixed, None)
         at = objective.evaluate(random_xi(F, 1.0))
@@ -184,7 +184,7 @@ class TestHarmonise:
 
     def test_areas_become_as_even_as_the_boundary_lets_them(self):
         V, F, uv, fixed = bowl(150)
-        found = harmonise(V, F, uv, fixed=fixed, energy="area", conformal=0, iterations=80)
+        found = harmonise(V, F, uv, fixed=fixed, energy="area", conformal=0, max_iterations=80)
         barrier = Combination((1.0, AreaPreserving()), (1e-5, MIPS()))
         least = polish(V, F, uv, fixed=fixed, energy=barrier, tolerance=1e-10)
         assert least.status is found.status is Status.POLISHED
@@ -204,7 +204,7 @@ class TestHarmonise:
     def test_as_the_paper_has_it(self):
         """One round of η = 1e-4, and nothing to keep triangles from collapsing."""
         problem, uv = folded()
-        result = harmonise_map(problem.domain, uv, energy="arap", eta=1e-4, conformal=0, iterations=100)
+        result = harmonise_map(problem.domain, uv, energy="arap", eta=1e-4, conformal=0, max_iterations=100)
         assert result.injective
         assert result.stages[0].name == "harmonise, arap, η = 0.0001"
 
@@ -212,7 +212,7 @@ class TestHarmonise:
         """R₁ alone ends near the map of least MIPS."""
         V, F, uv, fixed = bowl(150)
         found = harmonise(V, F, uv, fixed=fixed, energy=None, conformal=1.0)
-        least = harmonise(V, F, uv, fixed=fixed, energy="mips", iterations=80)
+        least = harmonise(V, F, uv, fixed=fixed, energy="mips", max_iterations=80)
         mips = [distortion(V, F, w).summary("mips").mean for w in (uv, found.uv, least.uv)]
         assert mips[2] < mips[1] < mips[2] + 0.1 * (mips[0] - mips[2])
 
@@ -263,7 +263,7 @@ class TestHarmonise:
         before = [x.copy() for x in (V, F, uv, fixed)]
         for x in (V, F, uv, fixed):
             x.flags.writeable = False
-        first, second = (harmonise(V, F, uv, fixed=fixed, energy="area", iterations=15) for _ in range(2))
+        first, second = (harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=15) for _ in range(2))
         np.testing.assert_array_equal(first.uv, second.uv)
         assert energies_of(first).tolist() == energies_of(second).tolist()
         for x, y in zip((V, F, uv, fixed), before, strict=True):
@@ -272,9 +272,9 @@ class TestHarmonise:
 
     def test_is_never_worse_than_what_it_was_given(self):
         V, F, uv, fixed = bowl()
-        best = harmonise(V, F, uv, fixed=fixed, energy="mips", iterations=100, eta=(1,) * 6, conformal=0)
+        best = harmonise(V, F, uv, fixed=fixed, energy="mips", max_iterations=100, eta=(1,) * 6, conformal=0)
         for eta in (1e-6, 1.0, 1e3):
-            again = harmonise(V, F, best.uv, fixed=fixed, energy="mips", iterations=3, eta=eta, conformal=0)
+            again = harmonise(V, F, best.uv, fixed=fixed, energy="mips", max_iterations=3, eta=eta, conformal=0)
             assert again.injective
             assert distortion(V, F, again.uv).summary("mips").mean <= (
                 distortion(V, F, best.uv).summary("mips").mean * (1 + 1e-12)
@@ -285,21 +285,21 @@ class TestHarmonise:
         V, F, uv, fixed = bowl()
         monkeypatch.setattr("quasiharmonic.search.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
         monkeypatch.setattr("quasiharmonic.search.harmonic_descent.RIGHTING", 1)
-        result = harmonise(V, F, uv, fixed=fixed, energy="arap", iterations=5)
+        result = harmonise(V, F, uv, fixed=fixed, energy="arap", max_iterations=5)
         assert result.injective
         assert result.status is not Status.POLISHED
 
     def test_a_perfect_map_stays(self):
         V, F = random_delaunay(60)
         for name in ENERGIES:
-            result = harmonise(V, F, 3 * V, fixed=boundary_of(F), energy=name, iterations=20)
+            result = harmonise(V, F, 3 * V, fixed=boundary_of(F), energy=name, max_iterations=20)
             assert result.injective
             np.testing.assert_allclose(result.uv, 3 * V, atol=1e-6)
 
     def test_steps_stages_and_interruption(self):
         V, F, uv, fixed = bowl()
         seen = []
-        result = harmonise(V, F, uv, fixed=fixed, energy="area", iterations=10, callback=seen.append)
+        result = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, callback=seen.append)
         assert seen == result.history
         assert [step.iteration for step in seen] == list(range(len(seen)))
         assert sum(stage.iterations for stage in result.stages) == len(seen) - 1
@@ -311,7 +311,7 @@ class TestHarmonise:
             if step.iteration == 12:
                 raise KeyboardInterrupt
 
-        stopped = harmonise(V, F, uv, fixed=fixed, energy="area", iterations=10, callback=interrupt)
+        stopped = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, callback=interrupt)
         assert stopped.status is Status.INTERRUPTED
         assert stopped.injective
         assert len(stopped.history) == 13
@@ -364,7 +364,7 @@ class TestHarmonise:
         with pytest.raises(ValueError, match="reference must be one of"):
             harmonise(V, F, uv, fixed=fixed, reference="round")
         with pytest.raises(ValueError, match="iterations must be a whole number"):
-            harmonise(V, F, uv, fixed=fixed, iterations=0)
+            harmonise(V, F, uv, fixed=fixed, max_iterations=0)
 
     def test_flat_rest_triangles(self):
         """An energy is undefined there; R₁ in triangles of another shape is not."""
@@ -383,7 +383,7 @@ class TestHarmonise:
     def test_what_leaves_the_numbers_range_is_not_at_rest(self):
         V, F, uv, fixed = bowl()
         for options in ({"eta": 1e300}, {"weights": np.full(len(F), 1e300)}):
-            result = harmonise(V, F, uv, fixed=fixed, energy="area", iterations=10, **options)
+            result = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, **options)
             assert result.injective
             assert result.status in (Status.STILL_FALLING, Status.UNIMPROVED)
 
@@ -395,7 +395,7 @@ class TestHarmonise:
         target = V[loop].copy()
         target[[1, 5]] = target[[5, 1]]
         problem = Problem(V, F, loop, target)
-        result = harmonise_map(problem.domain, quasi_harmonic_map(problem), energy="arap", iterations=5)
+        result = harmonise_map(problem.domain, quasi_harmonic_map(problem), energy="arap", max_iterations=5)
         assert not result.injective
         assert result.status is Status.IMPOSSIBLE
         assert result.diagnosis.forbids_injective

@@ -189,7 +189,7 @@ class TestPromises:
     def test_callback_sees_every_step_and_strategy_can_be_spelled_out(self):
         seen = []
         stages = [
-            LBFGS(parameterization="si-log", functional="neumann", reference="rest"),
+            LBFGS(parameterisation="si-log", functional="neumann", reference="rest"),
             Newton(resume=True),
         ]
         result = injective_map(*star_problem(), strategy=stages, callback=seen.append)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quasiharmonic.field.regularisers import Conformal
 
 from quasiharmonic import Problem
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import MIPS
 from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.regularizers import Conformal
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.search.harmonised import Harmonised
 from shared.meshes import bend, lift, random_annulus, random_xi
@@ -28,8 +28,8 @@ def harmonised(problem):
     """Q of the harmonised MIPS energy."""
     objective = Objective(problem, reference="rest")
     energy = DeformationEnergy(problem.V, problem.F, MIPS(), area=2.0)
-    regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
-    return objective.descending(Harmonised(problem, objective.mesh, 2.0, energy, regularizer, eta=0.3, conformal=0.2))
+    regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
+    return objective.descending(Harmonised(problem, objective.mesh, 2.0, energy, regulariser, eta=0.3, conformal=0.2))
 
 
 MAKERS = {name: lambda problem, name=name: Objective(problem, name) for name in FUNCTIONALS} | {

@@ -28,14 +28,14 @@ from quasiharmonic.energy.derivatives import check_energy, random_deformation
 from quasiharmonic.energy.energies import Deformation
 from quasiharmonic.field.functionals import beltrami_energy
 from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.tensor import PARAMETERIZATIONS, TANH, own_tensor
+from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, own_tensor
 from quasiharmonic.search.stages import CoarseToFine
 from quasiharmonic.search.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
 from shared.meshes import bend, boundary_of, lift, random_xi
 from shared.solvable import star_problem, turned_ring
 
-BOTH = list(PARAMETERIZATIONS)
+BOTH = list(PARAMETERISATIONS)
 
 
 def path(method, objective, start=None):
@@ -45,9 +45,9 @@ def path(method, objective, start=None):
 
 
 @pytest.mark.parametrize("name", BOTH)
-class TestParameterization:
+class TestParameterisation:
     def test_invert(self, name, rng):
-        p = PARAMETERIZATIONS[name]
+        p = PARAMETERISATIONS[name]
         xi = rng.standard_normal(50) + 1j * rng.standard_normal(50)
         np.testing.assert_allclose(p.invert(p.field(xi).mu), xi, rtol=1e-11)
         assert p.invert(np.zeros(1, dtype=complex))[0] == 0
@@ -56,7 +56,7 @@ class TestParameterization:
         assert np.all(np.abs(outside) <= p.bound * (1 + 1e-15))
 
     def test_bend_is_the_derivative_of_the_slope(self, name):
-        p = PARAMETERIZATIONS[name]
+        p = PARAMETERISATIONS[name]
         rho, h = np.linspace(0.1, 4, 20), 1e-5
         slope = (p.radial(rho + h)[2] - p.radial(rho - h)[2]) / (2 * h)
         np.testing.assert_allclose(p.bend(rho), slope, rtol=1e-6, atol=1e-9)
@@ -88,7 +88,7 @@ class TestAlternating:
 class TestNewton:
     def test_second_derivatives_against_differences(self, name, reference):
         """dᵀ(K − Bᵀ H⁻¹ B)d is the second derivative of V₃(ξ), the map following."""
-        objective = Objective(Problem(*star_problem(n=80)), parameterization=name, reference=reference)
+        objective = Objective(Problem(*star_problem(n=80)), parameterisation=name, reference=reference)
         xi = random_xi(objective.problem.F)
         h = 1e-4
         for seed in range(3):
@@ -109,13 +109,13 @@ class TestNewton:
             assert np.vdot(here.gradient, d).real == pytest.approx(slope, rel=1e-6)
 
     def test_descends(self, name, reference):
-        objective = Objective(Problem(*star_problem(depth=0.3)), parameterization=name, reference=reference)
+        objective = Objective(Problem(*star_problem(depth=0.3)), parameterisation=name, reference=reference)
         values = [i.dirichlet for i in path(Newton(iterations=15), objective)]
         assert np.all(np.diff(values) < 0)
         assert values[-1] < 0.05 * values[0]
 
     def test_starts_from_zero_where_polar_coordinates_do_not(self, name, reference):
-        objective = Objective(Problem(*star_problem(n=80)), parameterization=name, reference=reference)
+        objective = Objective(Problem(*star_problem(n=80)), parameterisation=name, reference=reference)
         model = SecondOrderModel(objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex)))
         for part in (*model.K, *model.g, *model.B[0], *model.B[1]):
             assert np.all(np.isfinite(part))
@@ -366,7 +366,7 @@ class TestStrategy:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ({"parameterization": "log"}, "parameterization must be one of tanh, si-log"),
+            ({"parameterisation": "log"}, "parameterisation must be one of tanh, si-log"),
             ({"functional": "v3"}, "functional must be one of dirichlet"),
             ({"reference": "square"}, "reference must be one of"),
             ({"iterations": 0}, "iterations must be a whole number of at least 1"),
@@ -395,8 +395,8 @@ class TestStrategy:
         V, F, fixed, target = star_problem(n=60)
         inner = int(np.setdiff1d(np.arange(len(V)), fixed)[0])
         pinned = Problem(V, F, np.append(fixed, inner), np.vstack([target, [[0, 0]]]))
-        assert stages_of("speed", pinned)[0].parameterization == "si-log"
-        assert stages_of("speed", Problem(V, F, fixed, target))[0].parameterization == "tanh"
+        assert stages_of("speed", pinned)[0].parameterisation == "si-log"
+        assert stages_of("speed", Problem(V, F, fixed, target))[0].parameterisation == "tanh"
 
     def test_quality_keeps_angles_better(self):
         """The si-log map's mean angle distortion is below tanh's, as in the paper's Figure 8."""

@@ -7,9 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.field.tensor import PARAMETERIZATIONS, SI_LOG, TANH
+from quasiharmonic.field.tensor import PARAMETERISATIONS, SI_LOG, TANH
 
-BOTH = list(PARAMETERIZATIONS.values())
+BOTH = list(PARAMETERISATIONS.values())
 
 
 def paper_tensor(mu):
@@ -18,49 +18,49 @@ def paper_tensor(mu):
     return np.array([np.abs(1 - mu) ** 2, -2 * mu.imag, np.abs(1 + mu) ** 2]) / one
 
 
-@pytest.mark.parametrize("parameterization", BOTH, ids=lambda p: p.name)
+@pytest.mark.parametrize("parameterisation", BOTH, ids=lambda p: p.name)
 class TestField:
-    def test_is_eq_33_of_the_sigmoid(self, parameterization, rng):
+    def test_is_eq_33_of_the_sigmoid(self, parameterisation, rng):
         xi = rng.standard_normal(50) + 1j * rng.standard_normal(50)
         rho = np.abs(xi)
-        r = np.tanh(rho) if parameterization is TANH else 1 - 1 / (1 + np.log(1 + rho))
-        field = parameterization.field(xi)
+        r = np.tanh(rho) if parameterisation is TANH else 1 - 1 / (1 + np.log(1 + rho))
+        field = parameterisation.field(xi)
         np.testing.assert_allclose(field.mu, r * xi / rho, rtol=1e-14)
         np.testing.assert_allclose(field.entries(), paper_tensor(field.mu), rtol=1e-11)
 
-    def test_has_unit_determinant_and_is_positive(self, parameterization, rng):
+    def test_has_unit_determinant_and_is_positive(self, parameterisation, rng):
         xi = 2 * (rng.standard_normal(500) + 1j * rng.standard_normal(500))
-        a11, a12, a22 = parameterization.field(xi).entries()
+        a11, a12, a22 = parameterisation.field(xi).entries()
         scale = (a11 + a22) ** 2
         assert np.all(np.abs(a11 * a22 - a12**2 - 1) <= 1e-14 * scale)
         assert np.all(a11 > 0)
         assert np.all(a22 > 0)
 
-    def test_is_the_identity_at_zero(self, parameterization):
-        field = parameterization.field(np.zeros(3, dtype=complex))
+    def test_is_the_identity_at_zero(self, parameterisation):
+        field = parameterisation.field(np.zeros(3, dtype=complex))
         np.testing.assert_array_equal(field.entries(), [[1] * 3, [0] * 3, [1] * 3])
         assert np.all(np.isfinite(field.pull(np.ones(3, dtype=complex))))
 
-    def test_stays_definite_up_to_its_bound(self, parameterization, rng):
-        xi = parameterization.bound * np.exp(2j * np.pi * rng.random(2000))
-        for a11, a12, a22 in parameterization.field(xi).entries().T:
+    def test_stays_definite_up_to_its_bound(self, parameterisation, rng):
+        xi = parameterisation.bound * np.exp(2j * np.pi * rng.random(2000))
+        for a11, a12, a22 in parameterisation.field(xi).entries().T:
             assert Fraction(a11) * Fraction(a22) > Fraction(a12) ** 2
             assert a11 > 0
 
     @pytest.mark.parametrize("scale", [1.0, 1e-9, 0.0])
-    def test_pull_is_the_transpose_of_the_differential(self, parameterization, rng, scale):
+    def test_pull_is_the_transpose_of_the_differential(self, parameterisation, rng, scale):
         xi = scale * (rng.standard_normal(40) + 1j * rng.standard_normal(40))
         weights = rng.standard_normal(40) + 1j * rng.standard_normal(40)
-        gradient = parameterization.field(xi).pull(weights)
+        gradient = parameterisation.field(xi).pull(weights)
         h = 1e-6
         for direction in (1, 1j):
-            ahead, behind = parameterization.field(xi + h * direction).mu, parameterization.field(xi - h * direction).mu
+            ahead, behind = parameterisation.field(xi + h * direction).mu, parameterisation.field(xi - h * direction).mu
             slope = (np.conj(weights) * (ahead - behind)).real / (2 * h)
             found = (np.conj(gradient) * direction).real
             # si-log is C¹ only at 0: a central difference is off by O(h) there.
             np.testing.assert_allclose(found, slope, rtol=1e-6, atol=1e-5 if scale < 1 else 1e-8)
 
-    def test_pull_twist_is_the_transpose_of_the_tensor(self, parameterization, rng):
+    def test_pull_twist_is_the_transpose_of_the_tensor(self, parameterisation, rng):
         xi = rng.standard_normal(40) + 1j * rng.standard_normal(40)
         by_c, by_w = rng.standard_normal(40), rng.standard_normal(40) + 1j * rng.standard_normal(40)
 
@@ -69,7 +69,7 @@ class TestField:
             c, w = (a11 + a22) / 2, (a22 - a11) / 2 - 1j * a12
             return by_c * c + (np.conj(by_w) * w).real
 
-        field = parameterization.field(xi)
+        field = parameterisation.field(xi)
         gradient = field.pull_twist(by_c, by_w)
         h = 1e-7
         for direction in (1, 1j):
@@ -80,10 +80,10 @@ class TestField:
 def test_rotating_xi_rotates_the_gradient_field(rng):
     """No direction is special: a frame turned by φ turns ξ by 2φ and leaves the tensor what it was."""
     xi = rng.standard_normal(30) + 1j * rng.standard_normal(30)
-    for parameterization in BOTH:
-        turned = parameterization.field(xi * np.exp(0.8j))
-        np.testing.assert_allclose(turned.mu, parameterization.field(xi).mu * np.exp(0.8j), rtol=1e-13)
-        np.testing.assert_allclose(turned.defect, parameterization.field(xi).defect, rtol=1e-12)
+    for parameterisation in BOTH:
+        turned = parameterisation.field(xi * np.exp(0.8j))
+        np.testing.assert_allclose(turned.mu, parameterisation.field(xi).mu * np.exp(0.8j), rtol=1e-13)
+        np.testing.assert_allclose(turned.defect, parameterisation.field(xi).defect, rtol=1e-12)
 
 
 def test_defect_keeps_its_digits_where_mu_rounds_to_one():

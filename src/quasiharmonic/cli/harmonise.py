@@ -43,7 +43,7 @@ def add_parser(commands: Commands) -> None:
         help="weight of the energy against injectivity, one for each round (default: four rounds, as suits the energy)",
     )
     parser.add_argument(
-        "--iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
+        "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
     )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
             uv,
             energy=options.energy,
             eta=options.eta,
-            iterations=options.iterations,
+            max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
         )

@@ -24,7 +24,7 @@ class Alternating(TensorDescent):
         """As of `Descent`."""
         here = start
         for _ in range(self.iterations):
-            best = objective.parameterization.invert(own_tensor(here.dw.p, here.dw.q))
+            best = objective.parameterisation.invert(own_tensor(here.dw.p, here.dw.q))
             here = objective.step(here, best - here.xi)
             yield here
         return False

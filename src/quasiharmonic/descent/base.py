@@ -144,7 +144,7 @@ class TensorDescent(Descent):
 
     Attributes
     ----------
-    parameterization : {"tanh", "si-log"}
+    parameterisation : {"tanh", "si-log"}
         How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
     reference : {"equilateral", "rest", "corrected"}
         Shape of the triangles, unless the problem itself names one.
@@ -155,7 +155,7 @@ class TensorDescent(Descent):
         inverted triangles, which may have been passed by early on, far from any solution.)
     """
 
-    parameterization: Literal["tanh", "si-log"] = "tanh"
+    parameterisation: Literal["tanh", "si-log"] = "tanh"
     reference: Reference = "equilateral"
     iterations: int = 1000
 
@@ -166,7 +166,7 @@ class TensorDescent(Descent):
     @property
     def name(self) -> str:
         """How reports call this stage."""
-        return f"{self.word}, {self.parameterization}"
+        return f"{self.word}, {self.parameterisation}"
 
     @property
     def patience(self) -> tuple[int, float] | None:
@@ -175,7 +175,7 @@ class TensorDescent(Descent):
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
         """What is descended: V₃."""
-        return Objective(problem, "dirichlet", self.parameterization, self.reference, linear_solver)
+        return Objective(problem, "dirichlet", self.parameterisation, self.reference, linear_solver)
 
     def start(self, objective: Objective, found: SoFar) -> Iterate:
         """At the caller's map if there is one, at the tensors of the lowest V₃ so far, or at ξ = 0."""
@@ -188,7 +188,7 @@ class TensorDescent(Descent):
             mu = best.field.mu
         else:
             mu = objective.own_tensor(best.w)
-        return objective.evaluate(objective.bounded(objective.parameterization.invert(mu)))
+        return objective.evaluate(objective.bounded(objective.parameterisation.invert(mu)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,11 +206,11 @@ class FunctionalDescent(TensorDescent):
     @property
     def name(self) -> str:
         """How reports call this stage."""
-        return f"{self.word}, {self.parameterization}, {self.functional}"
+        return f"{self.word}, {self.parameterisation}, {self.functional}"
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
         """What is descended."""
-        return Objective(problem, self.functional, self.parameterization, self.reference, linear_solver)
+        return Objective(problem, self.functional, self.parameterisation, self.reference, linear_solver)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -104,7 +104,7 @@ class SecondOrderModel:
         unit = np.divide(field.xi, field.rho, out=np.ones_like(field.xi), where=field.rho > 0)
         self.unit = unit
         r = field.ratio * field.rho
-        D, slope, bend = field.defect, field.slope, here.objective.parameterization.bend(field.rho)
+        D, slope, bend = field.defect, field.slope, here.objective.parameterisation.bend(field.rho)
         rho = np.where(field.rho > 0, field.rho, 1.0)
         # c and s by |ξ|, through r.
         c1 = 4 * r / D**2 * slope

@@ -55,7 +55,7 @@ class VectorAdam(FunctionalDescent):
 
     @property
     def _steps(self) -> Sequence[tuple[int, float]]:
-        return self.schedule or (TANH_STEPS if self.parameterization == "tanh" else SI_LOG_STEPS)
+        return self.schedule or (TANH_STEPS if self.parameterisation == "tanh" else SI_LOG_STEPS)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.field.functionals import FUNCTIONALS, Functional, beltrami_gradient
-from quasiharmonic.field.tensor import PARAMETERIZATIONS, TANH, TensorField, own_tensor
+from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, TensorField, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import FactoredLaplacian
 from quasiharmonic.mesh.reference import Derivatives, Reference, blocks
@@ -26,8 +26,8 @@ class Objective:
     problem : Problem
     functional : str
         A name of `quasiharmonic.field.functionals.FUNCTIONALS`.
-    parameterization : str
-        A name of `quasiharmonic.field.tensor.PARAMETERIZATIONS`.
+    parameterisation : str
+        A name of `quasiharmonic.field.tensor.PARAMETERISATIONS`.
     reference : {"equilateral", "rest", "corrected"}
         Shape of the triangles, unless the problem itself names one.
     linear_solver : str
@@ -35,7 +35,7 @@ class Objective:
 
     Attributes
     ----------
-    problem, mesh, laplacian, parameterization, functional
+    problem, mesh, laplacian, parameterisation, functional
         What it is made of; none of them changes.
     """
 
@@ -43,13 +43,13 @@ class Objective:
         self,
         problem: Problem,
         functional: str = "dirichlet",
-        parameterization: str = "tanh",
+        parameterisation: str = "tanh",
         reference: Reference = "equilateral",
         linear_solver: str = "auto",
     ) -> None:
         self.problem = problem
         self.mesh = problem.domain.mesh(problem.reference or reference)
-        self.parameterization = PARAMETERIZATIONS[parameterization]
+        self.parameterisation = PARAMETERISATIONS[parameterisation]
         self.laplacian = problem.domain.laplacian(linear_solver)
         self.functional: Functional = FUNCTIONALS[functional](problem, self.mesh)
         self._boundary = np.zeros(problem.n, dtype=np.complex128)
@@ -73,7 +73,7 @@ class Objective:
         quasiharmonic.linsolve.NotPositiveDefinite
             When rounding leaves no positive definite Laplacian.
         """
-        field = self.parameterization.field(xi)
+        field = self.parameterisation.field(xi)
         operator = self.operator(field)
         w = operator.extend(self._boundary)
         if not np.isfinite(w.view(np.float64)).all():
@@ -107,7 +107,7 @@ class Objective:
         quasiharmonic.linsolve.NotPositiveDefinite
             When rounding leaves no positive definite Laplacian.
         """
-        return self.evaluate(self.bounded(self.parameterization.invert(self.own_tensor(w))))
+        return self.evaluate(self.bounded(self.parameterisation.invert(self.own_tensor(w))))
 
     def step(self, start: Iterate, step: ComplexArray) -> Iterate:
         """Evaluate at ``ξ + step``, the tensors kept within the numbers' range and the step shortened when
@@ -127,7 +127,7 @@ class Objective:
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
         """``xi`` with moduli clipped to where the rounded tensor is still positive definite."""
-        bound = self.parameterization.bound
+        bound = self.parameterisation.bound
         inside = xi
         for part in blocks(xi.size):
             block = xi[part]

@@ -21,7 +21,7 @@ _TINY = 1e-300
 
 
 @dataclass(frozen=True)
-class Parameterization:
+class Parameterisation:
     """The sigmoid ``r`` that carries ξ to the Beltrami coefficient μ (§8.2).
 
     Attributes
@@ -88,11 +88,11 @@ class TensorField:
     """
 
     xi: ComplexArray
-    parameterization: Parameterization
+    parameterisation: Parameterisation
 
     def __getitem__(self, part: slice) -> TensorField:
         """The field on some of the triangles."""
-        return TensorField(self.xi[part], self.parameterization)
+        return TensorField(self.xi[part], self.parameterisation)
 
     @cached_property
     def _square(self) -> FloatArray:
@@ -104,7 +104,7 @@ class TensorField:
 
     @cached_property
     def _radial(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return self.parameterization.radial(self.rho)
+        return self.parameterisation.radial(self.rho)
 
     @property
     def ratio(self) -> FloatArray:
@@ -235,6 +235,6 @@ def _invert_si_log(r: FloatArray) -> FloatArray:
 # The eigenvalues of 𝒜 are e^{±2ρ} for tanh, and its entries are rounded at e^{2ρ} · 1e-16: beyond ρ = 9 the
 # smaller eigenvalue drowns. si-log comes nowhere near: its bound, which keeps |ξ|² finite, stands for
 # |μ| = 0.997, and what needs more distortion than that needs tanh.
-TANH = Parameterization("tanh", 8.8, _tanh, np.arctanh, _bend_tanh)
-SI_LOG = Parameterization("si-log", 1e150, _si_log, _invert_si_log, _bend_si_log)
-PARAMETERIZATIONS = {p.name: p for p in (TANH, SI_LOG)}
+TANH = Parameterisation("tanh", 8.8, _tanh, np.arctanh, _bend_tanh)
+SI_LOG = Parameterisation("si-log", 1e150, _si_log, _invert_si_log, _bend_si_log)
+PARAMETERISATIONS = {p.name: p for p in (TANH, SI_LOG)}

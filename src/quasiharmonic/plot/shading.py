@@ -65,9 +65,9 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     seen = V @ frame.T
     facing = (normals / np.maximum(sizes, np.finfo(float).tiny)[:, None]) @ frame.T
 
-    center = seen[F, :2].mean(axis=1)
+    middle = seen[F, :2].mean(axis=1)
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
-    across, up = ((center - low) / np.maximum(high - low, np.finfo(float).tiny)).T[:, :, None]
+    across, up = ((middle - low) / np.maximum(high - low, np.finfo(float).tiny)).T[:, :, None]
     hue = (1 - up) * ((1 - across) * _CORNERS[0, 0] + across * _CORNERS[0, 1]) + up * (
         (1 - across) * _CORNERS[1, 0] + across * _CORNERS[1, 1]
     )

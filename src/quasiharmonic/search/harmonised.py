@@ -14,7 +14,7 @@ from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import Deformation
 from quasiharmonic.field.functionals import Functional, QuasiHarmonicMap, twist
-from quasiharmonic.field.regularizers import Conformal
+from quasiharmonic.field.regularisers import Conformal
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
 
@@ -34,7 +34,7 @@ class Harmonised(Functional):
         |Ω|, the area that the target encloses, in the problem's frame; positive.
     energy : DeformationEnergy or None
         E, for maps in the frame; None for zero.
-    regularizer : Conformal
+    regulariser : Conformal
         R₁.
     eta, conformal : float
         η and κ.
@@ -48,7 +48,7 @@ class Harmonised(Functional):
         mesh: ReferenceMesh,
         area: float,
         energy: DeformationEnergy | None,
-        regularizer: Conformal,
+        regulariser: Conformal,
         *,
         eta: float,
         conformal: float,
@@ -56,7 +56,7 @@ class Harmonised(Functional):
         super().__init__(problem, mesh)
         self.area = area
         self.energy = energy
-        self.regularizer = regularizer
+        self.regulariser = regulariser
         self.eta = eta
         self.conformal = conformal
         self._known: tuple[ComplexArray, Deformation] | None = None
@@ -71,15 +71,15 @@ class Harmonised(Functional):
             adjoint = self.mesh.derivatives(at.operator.respond(pull))
             by_mu = at.field.pull_twist(*twist(self.mesh, adjoint, at.dw))
             gradient = gradient - self.eta * at.field.pull(by_mu)
-        return gradient + self.eta * self.conformal * self.regularizer.gradient(at.field)
+        return gradient + self.eta * self.conformal * self.regulariser.gradient(at.field)
 
     def distortion(self, at: QuasiHarmonicMap) -> float:
         """``E + κ R₁``; ``inf`` where E is a barrier and a triangle inverted."""
-        return self._energy(at) + self.conformal * self.regularizer.value(at.field)
+        return self._energy(at) + self.conformal * self.regulariser.value(at.field)
 
     def distortion_of_map(self, at: QuasiHarmonicMap) -> float:
         """The same with R₁ taken at the map's own tensors: a property of the map alone, ``inf`` if it is inverted."""
-        return self._energy(at) + self.conformal * self.regularizer.of_map(at.dw)
+        return self._energy(at) + self.conformal * self.regulariser.of_map(at.dw)
 
     def _energy(self, at: QuasiHarmonicMap) -> float:
         return 0.0 if self.energy is None else self.energy.value_of(self._deformation(self.energy, at))

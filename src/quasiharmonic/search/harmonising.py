@@ -17,7 +17,7 @@ from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.exact.diagnosis import diagnose
 from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.regularizers import Conformal
+from quasiharmonic.field.regularisers import Conformal
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Status, Step
@@ -47,7 +47,7 @@ def harmonise(
     eta: float | Sequence[float] | None = None,
     conformal: float = 1e-3,
     weights: ArrayLike | None = None,
-    iterations: int = 40,
+    max_iterations: int = 40,
     tolerance: float = 1e-3,
     reference: Reference = "rest",
     linear_solver: str = "auto",
@@ -88,7 +88,7 @@ def harmonise(
     weights : (f,) array, optional
         How much each triangle's distortion counts in E; not negative, 1 by default. R₁ counts all alike: it keeps the
         others from collapsing.
-    iterations : int
+    max_iterations : int
         Linear solves of each round at most.
     tolerance : float
         A round is at rest when ten steps have lowered its objective by less than this fraction. Not negative.
@@ -139,7 +139,7 @@ def harmonise(
         eta=eta,
         conformal=conformal,
         weights=weights,
-        iterations=iterations,
+        max_iterations=max_iterations,
         tolerance=tolerance,
         reference=reference,
         linear_solver=linear_solver,
@@ -156,7 +156,7 @@ def harmonise_map(
     eta: float | Sequence[float] | None = None,
     conformal: float = 1e-3,
     weights: ArrayLike | None = None,
-    iterations: int = 40,
+    max_iterations: int = 40,
     tolerance: float = 1e-3,
     reference: Reference = "rest",
     linear_solver: str = "auto",
@@ -177,7 +177,7 @@ def harmonise_map(
         raise ValueError("weights are the energy's, and there is none")
     if reference not in get_args(Reference):
         raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
-    whole_number("iterations", iterations, least=1)
+    whole_number("max_iterations", max_iterations, least=1)
     not_negative("tolerance", tolerance)
     start = map_array("uv", uv, domain.n)
     flipped = flipped_triangles(domain.F, start)
@@ -194,17 +194,17 @@ def harmonise_map(
             raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
         deformation = None if chosen is None else DeformationEnergy(own.V, own.F, chosen, area=area, weights=weights)
         objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
-        regularizer = Conformal(objective.mesh.m / objective.mesh.m.sum())
+        regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
 
         def descended(eta: float) -> Harmonised:
-            return Harmonised(own, objective.mesh, area, deformation, regularizer, eta=eta, conformal=conformal)
+            return Harmonised(own, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
 
         descent = HarmonicDescent(objective, descended, start, callback)
         first, status = descent.best, Status.STILL_FALLING
         try:
             for values in (schedule, len(schedule) * schedule[-1:]):
                 for value in values:
-                    rest = descent.run(f"harmonise, {name}, η = {value:g}", value, iterations, tolerance)
+                    rest = descent.run(f"harmonise, {name}, η = {value:g}", value, max_iterations, tolerance)
                     status = Status.POLISHED if rest else Status.STILL_FALLING
                 if descent.right() or values == len(schedule) * schedule[-1:]:
                     break

@@ -31,8 +31,8 @@ def speed(problem: Problem) -> Stages:
         In the order in which they are run.
     """
     if problem.domain.pins.size:
-        first: Descent = VectorAdam(parameterization="si-log", iterations=400)
-        newton = Newton(parameterization="si-log", iterations=60, resume=True)
+        first: Descent = VectorAdam(parameterisation="si-log", iterations=400)
+        newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
         first, newton = VectorAdam(iterations=100), Newton(iterations=300, resume=True)
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
@@ -61,8 +61,8 @@ def quality(problem: Problem) -> Stages:
     list of Descent or CoarseToFine
     """
     return [
-        VectorAdam(parameterization="si-log", reference="corrected", iterations=1000),
-        Newton(parameterization="si-log", reference="corrected", iterations=60, resume=True),
+        VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
+        Newton(parameterisation="si-log", reference="corrected", iterations=60, resume=True),
         *speed(problem),
     ]
 
