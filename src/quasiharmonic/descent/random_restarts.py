@@ -66,6 +66,11 @@ class RandomRestarts(VertexDescent):
         super().__post_init__()
         whole_number("in_vain", self.in_vain, least=1)
 
+    @property
+    def patience(self) -> tuple[int, float] | None:
+        """Untangling all of the mesh is cut short where it gets nowhere."""
+        return self.in_vain, 0.0
+
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a map after every patch that left fewer inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
