@@ -25,6 +25,8 @@ from quasiharmonic.polishing import energy_named, polished
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search import Search
+from quasiharmonic.sliding.descent import moved_onto
+from quasiharmonic.sliding.rails import Rails
 from quasiharmonic.strategy import Descent, stages_of, whole_number
 from quasiharmonic.tensor import TANH
 
@@ -46,6 +48,7 @@ def injective_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     record: int = 0,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Map a triangle mesh into the plane with no triangle inverted.
 
@@ -78,6 +81,9 @@ def injective_map(
         which ends the search as Ctrl-C does.
     record : int
         Keep the map of every ``record``-th iteration in the result's ``path``; none of them by default.
+    slide : bool or Rails
+        While polishing let boundary vertices glide along their outline, its corners held; see `quasiharmonic.polish`.
+        The boundary of ``target`` is put onto the curves first, if it is off them by a chord.
 
     Returns
     -------
@@ -118,6 +124,7 @@ def injective_map(
         linear_solver=linear_solver,
         callback=callback,
         record=record,
+        slide=slide,
     )
     return replace(result, seconds=time.perf_counter() - began)
 
@@ -132,6 +139,7 @@ def solve(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     record: int = 0,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Solve a problem at hand.
 
@@ -139,7 +147,7 @@ def solve(
     ----------
     problem : Problem
         It has the kind of reference triangles too, and is not changed but for what it keeps to be solved again sooner.
-    strategy, polish, start, max_iterations, linear_solver, callback, record
+    strategy, polish, start, max_iterations, linear_solver, callback, record, slide
         As of `injective_map`.
 
     Returns
@@ -159,6 +167,10 @@ def solve(
     whole_number("record", record, least=0)
     lower = None if polish is None else energy_named(polish)
     first = None if start is None else _first_map(problem, start)
+    if slide is not False:
+        if lower is None:
+            raise ValueError("the boundary slides while distortion is lowered: name an energy too (polish=)")
+        problem = moved_onto(slide, problem)
     with problem.exclusive() as own:
         search = Search(own, linear_solver, callback, max_iterations, record, first)
         status = search.run(stages_of(strategy, own))
@@ -178,7 +190,7 @@ def solve(
         reference=search.best_reference,
     )
     if lower is not None and status is Status.INJECTIVE:
-        result = polished(problem, result, energy=lower, callback=callback)
+        result = polished(problem, result, energy=lower, callback=callback, slide=slide)
     return replace(result, seconds=time.perf_counter() - began)
 
 

@@ -77,7 +77,7 @@ class NewtonDescent:
         self._fixed, self._pinned = fixed, uv[fixed]
         self._exponent = exponent
         self.w: ComplexArray = in_units(uv, exponent)
-        self.system = NewtonSystem(energy.F, energy.g, len(uv), fixed, linear_solver)
+        self.system = self._system(len(uv), linear_solver)
         self._deformation = self.energy.deform(self.w)
         self.value = self.first = self.energy.value_of(self._deformation)
         self._cut = True
@@ -91,7 +91,7 @@ class NewtonDescent:
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step; a status where there is no other to take."""
-        gradient = self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
+        gradient = self._gradient()
         # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
             direction, promise, newton = self._direction(gradient, negative)
@@ -106,6 +106,14 @@ class NewtonDescent:
                 self._idle = 0 if before - self.value > _IDLE * tolerance * before else self._idle + 1
                 return Status.EXHAUSTED if self._idle >= _PATIENCE else None
         return Status.EXHAUSTED
+
+    def _system(self, n: int, linear_solver: str) -> NewtonSystem:
+        """The matrix of Newton's steps for ``n`` vertices."""
+        return NewtonSystem(self.energy.F, self.energy.g, n, self._fixed, linear_solver)
+
+    def _gradient(self) -> ComplexArray:
+        """The energy's derivative by the unknowns."""
+        return self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
 
     def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
         """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;

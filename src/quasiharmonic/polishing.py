@@ -27,6 +27,8 @@ from quasiharmonic.mesh.topology import named
 from quasiharmonic.newton_descent import NewtonDescent, in_units
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
+from quasiharmonic.sliding.descent import SlidingDescent, lay_boundary
+from quasiharmonic.sliding.rails import Rails
 from quasiharmonic.strategy import whole_number
 
 FloatArray = NDArray[np.float64]
@@ -52,6 +54,7 @@ def polish(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Lower the distortion of an injective map; every step on the way is injective, certified exactly.
 
@@ -87,6 +90,11 @@ def polish(
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at the start and after every step; its ``energy`` is the mean energy.
+    slide : bool or Rails
+        Let boundary vertices glide along the outline, in their order, its corners held: along the curves of
+        `quasiharmonic.sliding.Rails`, or with True along the polygon that the boundary is in ``uv``, whose corners are
+        where it turns by 20° or more. Vertices that slide are on their curve up to one rounding; a map that is
+        bijective stays so.
 
     Returns
     -------
@@ -99,7 +107,8 @@ def polish(
     ------
     ValueError
         When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
-        the message names the triangles. When the energy is not known, not a barrier or without second derivatives,
+        the message names the triangles. When the boundary is not on the curves that it is to slide along (see `Rails`),
+        or triangles are inverted once it is on them. When the energy is not known, not a barrier or without second derivatives,
         or another option has no such value.
 
     Examples
@@ -127,6 +136,7 @@ def polish(
         tolerance=tolerance,
         linear_solver=linear_solver,
         callback=callback,
+        slide=slide,
     )
     return replace(result, seconds=time.perf_counter() - began)
 
@@ -141,16 +151,20 @@ def polish_map(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Polish a map of a `Problem` at hand; the rest as `polish` has it.
 
-    The problem's ``fixed`` vertices stay where they are in ``uv``; its ``target`` is not looked at.
+    The problem's ``fixed`` vertices stay where they are in ``uv``, or slide; its ``target`` is not looked at.
     """
     began = time.perf_counter()
     chosen = energy_named(energy)
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)
     start = _start(problem, uv)
+    track = lay_boundary(slide, problem, start) if slide is not False else None
+    if track is not None:
+        start = track.uv
     if weights is not None:
         weights = real_array("weights", weights)
         bad = np.flatnonzero(~(weights > 0))
@@ -162,7 +176,10 @@ def polish_map(
         exponent = int(np.frexp(np.abs(start).max())[1])
         area = float(signed_areas(problem.F, in_units(start, exponent)).sum())
         deformation = DeformationEnergy(problem.V, problem.F, chosen, area=area, weights=weights)
-        descent = NewtonDescent(deformation, start, problem.fixed, exponent, linear_solver)
+        if track is None:
+            descent = NewtonDescent(deformation, start, problem.fixed, exponent, linear_solver)
+        else:
+            descent = SlidingDescent(deformation, track, problem.fixed, problem.loops, exponent, linear_solver)
     history: list[Step] = []
 
     def report() -> None:
@@ -212,6 +229,7 @@ def polished(
     energy: str | Energy,
     max_iterations: int = 200,
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Polish the injective map of a result, by the linear solver that found it; stages and history are continued."""
     further = polish_map(
@@ -221,6 +239,7 @@ def polished(
         max_iterations=max_iterations,
         linear_solver=result.linear_solver,
         callback=callback,
+        slide=slide,
     )
     return replace(
         further,

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
+    from quasiharmonic.sliding import Rails
 
 # What is done unasked. On some 10,000 triangles these steps take a few times as long as the first map, and go nearly as
 # far as convergence: a fifth of the MIPS energy, a hundredth of the worst stretch. On larger meshes they are felt.
@@ -57,6 +58,11 @@ def add_parser(commands: Commands) -> None:
         "100,000 triangles)",
     )
     distortion.add_argument("--no-polish", action="store_true", help="leave the first injective map as it is found")
+    parser.add_argument(
+        "--slide",
+        action="store_true",
+        help="let boundary vertices glide along the outline while distortion is lowered, its corners held",
+    )
     solver = parser.add_argument_group("how it is solved")
     solver.add_argument(
         "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
@@ -75,6 +81,8 @@ def run(options: argparse.Namespace) -> int:
     from . import report, targets
 
     began = time.perf_counter()
+    if options.slide and options.no_polish:
+        raise ValueError("--slide moves the boundary while distortion is lowered, which --no-polish forbids")
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     if options.to is not None:
         # The handles of a folder say which vertices its own vt hold.
@@ -85,12 +93,13 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     posed = targets.pose(options, mesh, fixed)
-    problem = posed.problem
-    result = search(problem, options.strategy, options.polish, options.max_iterations, options.linear_solver)
+    problem, slide = posed.problem, posed.slide
+    found = options.strategy, options.polish, options.max_iterations, options.linear_solver
+    result = search(problem, *found, slide=slide if options.polish else False)
     if result.status is Status.INTERRUPTED and not result.history:
         raise KeyboardInterrupt
     if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-        result = smoothed(problem, result)
+        result = smoothed(problem, result, slide)
     certificate = write(options.output, posed.mesh, result)
     with report.after_writing(options.output):
         if options.plot is not None:
@@ -108,7 +117,14 @@ def run(options: argparse.Namespace) -> int:
     return 0 if certificate.injective else 1
 
 
-def search(problem: Problem, strategy: str, polish: str | None, max_iterations: int, linear_solver: str) -> MapResult:
+def search(
+    problem: Problem,
+    strategy: str,
+    polish: str | None,
+    max_iterations: int,
+    linear_solver: str,
+    slide: bool | Rails = False,
+) -> MapResult:
     """Solve with progress on the terminal."""
     from quasiharmonic.inject import solve
 
@@ -122,10 +138,11 @@ def search(problem: Problem, strategy: str, polish: str | None, max_iterations: 
             max_iterations=max_iterations,
             linear_solver=linear_solver,
             callback=show,
+            slide=slide,
         )
 
 
-def smoothed(problem: Problem, result: MapResult) -> MapResult:
+def smoothed(problem: Problem, result: MapResult, slide: bool | Rails = False) -> MapResult:
     """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
     from quasiharmonic.mesh.shapes import rest_shapes
     from quasiharmonic.polishing import polished
@@ -133,10 +150,10 @@ def smoothed(problem: Problem, result: MapResult) -> MapResult:
 
     from . import progress
 
-    if len(problem.F) > _LARGEST or rest_shapes(problem.V, problem.F).flat.size:
+    if (len(problem.F) > _LARGEST and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
         return result
     with progress.line() as show:
-        smoother = polished(problem, result, energy="blend", max_iterations=_STEPS, callback=show)
+        smoother = polished(problem, result, energy="blend", max_iterations=_STEPS, callback=show, slide=slide)
     # Nobody asked for convergence, so it is not missed.
     interrupted = smoother.status is Status.INTERRUPTED
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)

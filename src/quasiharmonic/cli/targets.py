@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from quasiharmonic.mesh.reference import Reference
     from quasiharmonic.problem import Problem
     from quasiharmonic.refinement import Refined
+    from quasiharmonic.sliding import Rails
 
 # That of quasiharmonic.targets.specification, which is not imported to say it.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
@@ -29,6 +30,9 @@ class Posed:
     ----------
     mesh : MeshData
     problem : Problem
+        Its boundary on the curves it is to slide along, if it is to.
+    slide : bool or Rails
+        Whether, and along what.
     facts : dict
         What was done, for the report.
     notes : list of str
@@ -37,6 +41,7 @@ class Posed:
 
     mesh: MeshData
     problem: Problem
+    slide: bool | Rails = False
     facts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -119,6 +124,9 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
                 _check_room(posed.problem, options.to)
     if options.refine:
         _refine(posed, options.reference)
+    if options.slide:
+        with report.about(mesh.source):
+            _slide(options, posed)
     return posed
 
 
@@ -160,6 +168,23 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[ND
         places = boundary_to(mesh.V, mesh.F, contours, corners=corners, corner_angle=angle)
     with report.about(mesh.source):
         return Posed(mesh, Problem(mesh.V, mesh.F, *places, reference=options.reference), facts, notes)
+
+
+def _slide(options: argparse.Namespace, posed: Posed) -> None:
+    """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
+    from quasiharmonic.sliding import Rails
+    from quasiharmonic.sliding.descent import moved_onto
+    from quasiharmonic.targets import outline_curves
+
+    posed.slide = True
+    if options.to is not None:
+        posed.slide = Rails(
+            outline_curves(options.to, font=options.font),
+            held=[] if options.corners is None else list(read_corners(options.corners)),
+            corner_angle=20.0 if options.corner_angle is None else options.corner_angle,
+        )
+    posed.problem = moved_onto(posed.slide, posed.problem)
+    posed.facts["slide"] = True
 
 
 def _check_room(problem: Problem, to: str) -> None:

@@ -1,0 +1,232 @@
+"""Newton steps in the places of free vertices and the arc lengths of sliding ones.
+
+A vertex that slides has one unknown, a length δ along its curve: to first order it moves by ``δ τ``, with τ the unit
+tangent, and to second order by ``½ κ δ² iτ`` to the side. With P the matrix that takes unknowns to displacements, g the
+energy's gradient by positions and H its second derivative::
+
+    gradient  Pᵀ g        Hessian  Pᵀ H P + diag(κ g · iτ)
+
+The unknown across the curve keeps its row and column, emptied, so that the pattern is that of the mesh. A step is laid
+back onto the curve by going the length δ along it.
+
+At a kink the energy has two slopes. If it falls to neither side the vertex rests there for this step; if it falls to
+one, that is where it may go. Where a step over kinks leads nowhere, one that stops at them does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.boundary_curves import judge_loops
+from quasiharmonic.certificate import flipped_triangles, is_injective
+from quasiharmonic.deformation_energy import DeformationEnergy
+from quasiharmonic.energies import QuadraticForm, damped
+from quasiharmonic.mesh.topology import named
+from quasiharmonic.newton_descent import _FRACTION, _HALVINGS, _SUFFICIENT, NewtonDescent, in_units
+from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.problem import Problem
+from quasiharmonic.sliding.rails import Rails, Track, rails_of
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+
+
+def lay_boundary(slide: bool | Rails, problem: Problem, uv: FloatArray) -> Track:
+    """Put the boundary of an injective map onto the curves it is to slide along.
+
+    Raises
+    ------
+    ValueError
+        As `Rails.lay`; when triangles are inverted by the way onto the curves.
+    """
+    track = rails_of(slide, problem.loops, uv).lay(problem.loops, uv)
+    flipped = flipped_triangles(problem.F, track.uv)
+    if flipped.size:
+        raise ValueError(
+            f"with the boundary on the curves to slide along, {named('triangle', 'triangles', flipped)} inverted or "
+            "without area: let it be there from the start (injective_map with slide, or qhm map --slide)"
+        )
+    return track
+
+
+def moved_onto(slide: bool | Rails, problem: Problem) -> Problem:
+    """The problem with its boundary's target on the curves that it is to slide along."""
+    places = np.zeros((problem.n, 2))
+    places[problem.fixed] = problem.target
+    track = rails_of(slide, problem.loops, places).lay(problem.loops, places)
+    return problem.moved(track.uv[problem.fixed])
+
+
+class SlidingSystem(NewtonSystem):
+    """The matrix of Newton's steps in which some vertices have one unknown, the length along their curve.
+
+    Parameters
+    ----------
+    F, g, n, fixed, linear_solver
+        As of `NewtonSystem`; ``fixed`` without those that slide.
+    sliding : (k,) int64
+        Vertices that do.
+    """
+
+    def __init__(
+        self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str, sliding: IntArray
+    ) -> None:
+        super().__init__(F, g, n, fixed, linear_solver)
+        size = self.free.size
+        self.at: IntArray = np.searchsorted(self.free, sliding)
+        place = np.full(size, -1)
+        place[self.at] = np.arange(sliding.size)
+        row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
+        ends = place[row // 2], place[self._indices[self._side_slots[0]] // 2]
+        # Blocks of which a row, or a column, belongs to a sliding vertex, and to which.
+        self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
+        self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
+        self.tangent: ComplexArray = np.zeros(sliding.size, dtype=np.complex128)
+        self.bend: FloatArray = np.zeros(sliding.size)
+
+    def assemble(self, form: QuadraticForm) -> None:
+        """Add up the triangles' forms and pass to the unknowns along ``tangent``; ``bend`` is added on the diagonal."""
+        super().assemble(form)
+        values, slots = self._values, self._side_slots
+        x, y = self.tangent.real, self.tangent.imag
+        xx, xy, yx, yy = slots[:, self._by_row]
+        a, b = x[self._of_row], y[self._of_row]
+        values[xx], values[xy] = a * values[xx] + b * values[yx], a * values[xy] + b * values[yy]
+        values[yx] = values[yy] = 0
+        xx, xy, yx, yy = slots[:, self._by_column]
+        a, b = x[self._of_column], y[self._of_column]
+        values[xx], values[yx] = a * values[xx] + b * values[xy], a * values[yx] + b * values[yy]
+        values[xy] = values[yy] = 0
+        xx, xy, yy = self._corner_slots[:, self.at]
+        along = x * x * values[xx] + 2 * x * y * values[xy] + y * y * values[yy]
+        values[xx] = np.where(self.tangent == 0, 0, along + self.bend)
+        values[xy] = values[yy] = 0
+        self._diagonal = values[self._first]
+
+
+class SlidingDescent(NewtonDescent):
+    """As `NewtonDescent`, with boundary vertices on curves.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+    track : Track
+        The map, and what slides where.
+    fixed : (k,) int64
+        Vertices that stay where they are, but for those that slide.
+    loops : sequence of (l,) int64
+        The boundary, which may not come to meet itself.
+    exponent : int
+    linear_solver : str
+        As of `NewtonDescent`.
+    """
+
+    def __init__(
+        self,
+        energy: DeformationEnergy,
+        track: Track,
+        fixed: IntArray,
+        loops: Sequence[IntArray],
+        exponent: int,
+        linear_solver: str,
+    ) -> None:
+        self._track, self._s, self._loops = track, track.s, list(loops)
+        super().__init__(energy, track.uv, np.setdiff1d(fixed, track.vertices), exponent, linear_solver)
+        # A map that is injective and no more may overlap itself further.
+        self._simple = not judge_loops(self._loops, track.uv)[1]
+
+    def _system(self, n: int, linear_solver: str) -> SlidingSystem:
+        return SlidingSystem(
+            self.energy.F, self.energy.g, n, self._fixed, linear_solver, sliding=self._track.vertices
+        )
+
+    def _gradient(self) -> ComplexArray:
+        """By the unknowns: of a sliding vertex the real part counts, and the imaginary one is zero."""
+        pull = self.energy.gradient_of(self._deformation, self.w.size)
+        at, system = pull[self._track.vertices], self.system
+        (ahead, curvature), (back, curvature_back) = (
+            self._track.frame(self._s, np.full(at.size, forward)) for forward in (True, False)
+        )
+        kink = self._track.at_kink(self._s)
+        slope, slope_back = _along(ahead, at), _along(back, at)
+        # Of the sides to which the energy falls, the steeper one.
+        turned = kink & (slope_back > np.maximum(-slope, 0))
+        rests = kink & (slope >= 0) & (slope_back <= 0)
+        tangent = np.where(rests, 0, np.where(turned, back, ahead))
+        system.tangent = tangent
+        self._forces = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * 2.0**self._exponent
+        # A vertex leaves a kink by the side it was given only.
+        self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
+        gradient = pull[system.free]
+        gradient[system.at] = _along(tangent, at)
+        return gradient
+
+    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
+        system = self.system
+        system.bend = damped(self._forces, negative)
+        direction, promise, newton = super()._direction(gradient, negative)
+        wrong = direction[system.at].real * self._side < 0
+        if wrong.any():
+            promise += float(np.sum((gradient[system.at] * direction[system.at]).real[wrong]))
+            direction[system.at[wrong]] = 0
+        return direction, promise, newton
+
+    def _search(self, direction: ComplexArray, promise: float) -> bool:
+        """Move along a direction, as far as is good; False where no step lowers the energy enough."""
+        if not promise > 0:
+            return False
+        at, vertices = self.system.at, self._track.vertices
+        full = np.zeros_like(self.w)
+        full[self.system.free] = direction
+        full[vertices] = self.system.tangent * direction[at].real
+        along = np.ldexp(direction[at].real, self._exponent)
+        limit = _FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
+        start, s, before = self.w, self._s, self.value
+        longest = min(1.0, limit)
+        for t in longest * 0.5 ** np.arange(_HALVINGS):
+            bound = before - _SUFFICIENT * t * promise
+            if self._try(start + t * full, s, t * along, bound, stop=False):
+                break
+            if self._try(start + t * full, s, t * along, bound, stop=True):
+                break
+        else:
+            return False
+        self._cut = t < 1
+        while t >= 1 and 2 * t <= limit and self._try(start + 2 * t * full, s, 2 * t * along, self.value, stop=False):
+            t *= 2
+        return True
+
+    def _try(self, w: ComplexArray, s: FloatArray, step: FloatArray, bound: float, *, stop: bool) -> bool:
+        """Lay a step back onto the curves and go there if that is good."""
+        there = self._track.moved(s, step, stop=stop)
+        if stop and np.array_equal(there, self._track.moved(s, step)):
+            return False  # no kink in the way, and this has been tried
+        if not self._track.in_order(there):
+            return False
+        w[self._track.vertices] = in_units(self._track.position(there), self._exponent)
+        if not self._accept(w, bound):
+            return False
+        self._s = there
+        return True
+
+    def _accept(self, w: ComplexArray, bound: float) -> bool:
+        """Go there if the energy is below a bound, every triangle positive, and the boundary apart from itself."""
+        deformation = self.energy.deform(w)
+        value = self.energy.value_of(deformation)
+        if not value < bound:
+            return False
+        uv = self.positions(w)
+        if not is_injective(self.energy.F, uv) or (self._simple and judge_loops(self._loops, uv)[1]):
+            return False
+        self.w, self._deformation, self.value = w, deformation, value
+        return True
+
+
+def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
+    """Components of vectors along unit tangents."""
+    return tangent.real * vector.real + tangent.imag * vector.imag
