@@ -83,6 +83,11 @@ class NewtonDescent:
         self._cut = True
         self._idle = 0
 
+    @property
+    def energies(self) -> tuple[float, float]:
+        """The mean energy at the start and now."""
+        return self.first, self.value
+
     def positions(self, w: ComplexArray) -> FloatArray:
         """A map as the caller gets it, the fixed vertices to the last bit."""
         uv = np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent)

@@ -183,7 +183,7 @@ def polish_map(
     history: list[Step] = []
 
     def report() -> None:
-        history.append(Step(len(history), 0, descent.value))
+        history.append(Step(len(history), 0, descent.energies[1]))
         if callback is not None:
             callback(history[-1])
 
@@ -208,7 +208,7 @@ def polish_map(
         iterations=max(len(history) - 1, 0),
         seconds=seconds,
         flipped=(0, 0),
-        energy=(descent.first, descent.value),
+        energy=descent.energies,
         kept=descent.value < descent.first,
     )
     return MapResult(

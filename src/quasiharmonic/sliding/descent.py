@@ -9,6 +9,9 @@ energy's gradient by positions and H its second derivative::
 The unknown across the curve keeps its row and column, emptied, so that the pattern is that of the mesh. A step is laid
 back onto the curve by going the length δ along it.
 
+What is descended is the energy and a little of a barrier that keeps the boundary's edges near the curves
+(`quasiharmonic.sliding.straying`).
+
 At a kink the energy has two slopes. If it falls to neither side the vertex rests there for this step; if it falls to
 one, that is where it may go. Where a step over kinks leads nowhere, one that stops at them does.
 """
@@ -28,12 +31,17 @@ from quasiharmonic.mesh.topology import named
 from quasiharmonic.newton_descent import _FRACTION, _HALVINGS, _SUFFICIENT, NewtonDescent, in_units
 from quasiharmonic.newton_system import NewtonSystem
 from quasiharmonic.problem import Problem
+from quasiharmonic.result import Status
 from quasiharmonic.sliding.rails import Rails, Track, rails_of
+from quasiharmonic.sliding.straying import Straying
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
+
+# Of the energy at hand: the weight of the barrier.
+_WEIGHT = 1e-3
 
 
 def lay_boundary(slide: bool | Rails, problem: Problem, uv: FloatArray) -> Track:
@@ -86,8 +94,20 @@ class SlidingSystem(NewtonSystem):
         # Blocks of which a row, or a column, belongs to a sliding vertex, and to which.
         self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
         self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
+        self._place, self._row = place, row // 2
         self.tangent: ComplexArray = np.zeros(sliding.size, dtype=np.complex128)
         self.bend: FloatArray = np.zeros(sliding.size)
+        self._coupled: IntArray = np.empty(0, dtype=np.int64)
+        self.coupling: FloatArray = np.zeros(0)
+
+    def couple(self, pairs: IntArray) -> None:
+        """Name pairs (e, 2) of sliding vertices, each an edge of the mesh, between whose unknowns ``coupling`` is."""
+        low, high = np.sort(self.at[pairs], axis=1).T
+        column = self._indices[self._side_slots[0]] // 2
+        size = self.free.size
+        keys = self._row * size + column
+        self._coupled = self._side_slots[0, np.searchsorted(keys, low * size + high)]
+        self.coupling = np.zeros(len(pairs))
 
     def assemble(self, form: QuadraticForm) -> None:
         """Add up the triangles' forms and pass to the unknowns along ``tangent``; ``bend`` is added on the diagonal."""
@@ -106,6 +126,7 @@ class SlidingSystem(NewtonSystem):
         along = x * x * values[xx] + 2 * x * y * values[xy] + y * y * values[yy]
         values[xx] = np.where(self.tangent == 0, 0, along + self.bend)
         values[xy] = values[yy] = 0
+        values[self._coupled] += self.coupling
         self._diagonal = values[self._first]
 
 
@@ -136,7 +157,14 @@ class SlidingDescent(NewtonDescent):
         linear_solver: str,
     ) -> None:
         self._track, self._s, self._loops = track, track.s, list(loops)
+        self._straying = Straying(track, self._loops)
         super().__init__(energy, track.uv, np.setdiff1d(fixed, track.vertices), exponent, linear_solver)
+        self._energies = self.value, self.value
+        self._weigh()
+        self.first = self.value
+        both = (self._straying.pairs >= 0).all(axis=1)
+        self._both = np.flatnonzero(both)
+        self.system.couple(self._straying.pairs[both])
         # A map that is injective and no more may overlap itself further.
         self._simple = not judge_loops(self._loops, track.uv)[1]
 
@@ -145,15 +173,31 @@ class SlidingDescent(NewtonDescent):
             self.energy.F, self.energy.g, n, self._fixed, linear_solver, sliding=self._track.vertices
         )
 
+    @property
+    def energies(self) -> tuple[float, float]:
+        """The mean energy at the start and now, without the barrier."""
+        return self._energies
+
+    def _weigh(self) -> None:
+        """Give the barrier its part of the energy at hand, which only falls."""
+        self._weight = _WEIGHT * self._energies[1]
+        self.value = self._energies[1] + self._weight * self._straying.value(self._s)
+
+    def step(self, tolerance: float) -> Status | None:
+        """Take one step; a status where there is no other to take."""
+        self._weigh()
+        return super().step(tolerance)
+
     def _gradient(self) -> ComplexArray:
         """By the unknowns: of a sliding vertex the real part counts, and the imaginary one is zero."""
         pull = self.energy.gradient_of(self._deformation, self.w.size)
         at, system = pull[self._track.vertices], self.system
+        slopes, self._bends = self._barrier()
         (ahead, curvature), (back, curvature_back) = (
             self._track.frame(self._s, np.full(at.size, forward)) for forward in (True, False)
         )
         kink = self._track.at_kink(self._s)
-        slope, slope_back = _along(ahead, at), _along(back, at)
+        slope, slope_back = _along(ahead, at) + slopes, _along(back, at) + slopes
         # Of the sides to which the energy falls, the steeper one.
         turned = kink & (slope_back > np.maximum(-slope, 0))
         rests = kink & (slope >= 0) & (slope_back <= 0)
@@ -163,12 +207,27 @@ class SlidingDescent(NewtonDescent):
         # A vertex leaves a kink by the side it was given only.
         self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
         gradient = pull[system.free]
-        gradient[system.at] = _along(tangent, at)
+        gradient[system.at] = np.where(tangent == 0, 0, _along(tangent, at) + slopes)
         return gradient
+
+    def _barrier(self) -> tuple[FloatArray, FloatArray]:
+        """The barrier's derivatives: by the sliding vertices' lengths, in units, and edge by edge (e, 2, 2)."""
+        by_ends, by_both = self._straying.derivatives(self._s)
+        unit = self._weight * 2.0**self._exponent
+        slopes = np.zeros(self._s.size)
+        for end in (0, 1):
+            number = self._straying.pairs[:, end]
+            np.add.at(slopes, number[number >= 0], unit * by_ends[number >= 0, end])
+        return slopes, unit * 2.0**self._exponent * by_both
 
     def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
         system = self.system
         system.bend = damped(self._forces, negative)
+        for end in (0, 1):
+            number = self._straying.pairs[:, end]
+            np.add.at(system.bend, number[number >= 0], self._bends[number >= 0, end, end])
+        moves = (system.tangent[self._straying.pairs[self._both]] != 0).all(axis=1)
+        system.coupling = np.where(moves, self._bends[self._both, 0, 1], 0)
         direction, promise, newton = super()._direction(gradient, negative)
         wrong = direction[system.at].real * self._side < 0
         if wrong.any():
@@ -209,21 +268,16 @@ class SlidingDescent(NewtonDescent):
         if not self._track.in_order(there):
             return False
         w[self._track.vertices] = in_units(self._track.position(there), self._exponent)
-        if not self._accept(w, bound):
-            return False
-        self._s = there
-        return True
-
-    def _accept(self, w: ComplexArray, bound: float) -> bool:
-        """Go there if the energy is below a bound, every triangle positive, and the boundary apart from itself."""
         deformation = self.energy.deform(w)
-        value = self.energy.value_of(deformation)
+        energy = self.energy.value_of(deformation)
+        value = energy + self._weight * self._straying.value(there)
         if not value < bound:
             return False
         uv = self.positions(w)
         if not is_injective(self.energy.F, uv) or (self._simple and judge_loops(self._loops, uv)[1]):
             return False
-        self.w, self._deformation, self.value = w, deformation, value
+        self.w, self._s, self._deformation, self.value = w, there, deformation, value
+        self._energies = self._energies[0], energy
         return True
 
 

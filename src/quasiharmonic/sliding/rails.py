@@ -207,10 +207,15 @@ class Chain:
     s: FloatArray
     sliding: BoolArray
 
-    def in_order(self, s: FloatArray) -> bool:
-        """Whether the vertices are in their order still with the sliding ones at ``s``."""
+    def every(self, s: FloatArray) -> FloatArray:
+        """Where all vertices are with the sliding ones at ``s``."""
         every = self.s.copy()
         every[self.sliding] = s
+        return every
+
+    def in_order(self, s: FloatArray) -> bool:
+        """Whether the vertices are in their order still with the sliding ones at ``s``."""
+        every = self.every(s)
         backwards = np.diff(every) <= 0
         if not self.curve.closed:
             return not backwards.any()
@@ -229,6 +234,8 @@ class Track:
 
     Attributes
     ----------
+    chains : list of Chain
+    uv : (n, 2) float64
     vertices : (k,) int64
         Those that slide, curve by curve.
     s : (k,) float64
@@ -237,10 +244,14 @@ class Track:
 
     def __init__(self, chains: Sequence[Chain], uv: FloatArray) -> None:
         self.uv = uv
-        self._chains = list(chains)
+        self.chains = list(chains)
         self._ends = np.cumsum([0, *(int(chain.sliding.sum()) for chain in chains)])
         self.vertices = np.concatenate([chain.vertices[chain.sliding] for chain in chains])
         self.s = np.concatenate([chain.s[chain.sliding] for chain in chains])
+
+    def every(self, s: FloatArray) -> list[tuple[Chain, FloatArray]]:
+        """Where all vertices of each chain are with the sliding ones at ``s``."""
+        return [(chain, chain.every(s[part])) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
 
     def position(self, s: FloatArray) -> FloatArray:
         """Places of the sliding vertices; (k, 2) float64."""
@@ -265,13 +276,13 @@ class Track:
     def in_order(self, s: FloatArray) -> bool:
         """Whether on every curve the vertices are in their order, and none in one place."""
         return all(
-            chain.in_order(s[part]) for chain, (_, part) in zip(self._chains, self._parts(), strict=True)
+            chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)
         )
 
     def _parts(self) -> list[tuple[Curve, slice]]:
         ends = self._ends.tolist()
         return [
-            (chain.curve, slice(first, last)) for chain, first, last in zip(self._chains, ends, ends[1:], strict=False)
+            (chain.curve, slice(first, last)) for chain, first, last in zip(self.chains, ends, ends[1:], strict=False)
         ]
 
 
