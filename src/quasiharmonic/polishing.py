@@ -94,7 +94,7 @@ def polish(
         Let boundary vertices glide along the outline, in their order, its corners held: along the curves of
         `quasiharmonic.sliding.Rails`, or with True along the polygon that the boundary is in ``uv``, whose corners are
         where it turns by 20° or more. Vertices that slide are on their curve up to one rounding; a map that is
-        bijective stays so.
+        bijective stays so. The scale is that of the start, whatever little the polygon's area changes.
 
     Returns
     -------

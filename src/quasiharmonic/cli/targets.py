@@ -31,19 +31,19 @@ class Posed:
     mesh : MeshData
     problem : Problem
         Its boundary on the curves it is to slide along, if it is to.
-    slide : bool or Rails
-        Whether, and along what.
     facts : dict
         What was done, for the report.
     notes : list of str
         The same in sentences.
+    slide : bool or Rails
+        Whether the boundary slides, and along what.
     """
 
     mesh: MeshData
     problem: Problem
-    slide: bool | Rails = False
     facts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    slide: bool | Rails = False
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

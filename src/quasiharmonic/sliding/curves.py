@@ -502,7 +502,8 @@ def _on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
     # A cosine and a sine as rounded lie off the unit circle; put back onto it they belong to an angle beside the one
     # that was meant, which nobody minds.
     (cc, cc_low), (ss, ss_low) = two_product(cos, cos), two_product(sin, sin)
-    off = ((cc - 1) + ss + (cc_low + ss_low)) / 2
+    square, square_low = two_sum(cc, ss)
+    off = ((square - 1) + (square_low + cc_low + ss_low)) / 2
     centre, a, b = control[:, 0], control[:, 1], control[:, 2]
     (along_a, a_low), (along_b, b_low) = two_product(cos, a), two_product(sin, b)
     one, one_low = two_sum(along_a, along_b)

@@ -17,8 +17,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
 
-# Vertices this near to a corner, as a share of the curve's size, are there and keep every bit of their place.
-_THERE = 1e-12
+# Of the largest coordinate: a vertex this near to its place is there, and keeps every bit.
+_THERE = 2.0**-51
 
 
 class Rails:
@@ -119,20 +119,40 @@ class Rails:
         """
         boundary = np.concatenate(loops)
         curve, s = self._found(boundary, uv)
+        corners = [self._corners(one, uv[boundary]) for one in self.curves]
+        slides = ~np.isin(boundary, self.held)
+        slides[[member for taken in corners for member in taken]] = False
         places, chains = uv.copy(), []
-        for k, one in enumerate(self.curves):
-            members = np.flatnonzero(curve == k)
+        for k, (one, taken) in enumerate(zip(self.curves, corners, strict=True)):
+            at_corners = np.array(list(taken), dtype=np.int64)
+            members = np.union1d(np.flatnonzero(curve == k), at_corners)
             if not members.size:
                 continue
-            vertices, along = boundary[members], s[members]
-            slides = ~np.isin(vertices, self.held)
-            self._take_corners(one, vertices, along, slides, places)
-            order = np.argsort(along, kind="stable")
-            chain = Chain(one, vertices[order], along[order], slides[order])
+            along = s.copy()
+            along[at_corners] = list(taken.values())
+            members = members[np.argsort(along[members], kind="stable")]
+            chain = Chain(one, boundary[members], along[members], slides[members])
             _check_order(chain, k, loops, len(uv))
-            places[chain.vertices[chain.sliding]] = one.position(chain.s[chain.sliding])
+            moves = (slides[members] | np.isin(members, at_corners)) & ~np.isin(chain.vertices, self.held)
+            _move(places, chain.vertices[moves], one.position(chain.s[moves]))
             chains.append(chain)
         return Track(chains, places)
+
+    def _corners(self, one: Curve, places: FloatArray) -> dict[int, float]:
+        """The rows of the boundary's places (b, 2) that are at corners of a curve, and where these are along it.
+
+        A corner has the vertex nearest to it, be it on this curve or another, and a vertex one corner.
+        """
+        marks = one.corners(self.corner_angle)
+        found = []
+        for mark, corner in zip(marks, one.position(marks), strict=True):
+            away = np.abs(as_complex(places - corner))
+            found.append((float(away.min()), int(np.argmin(away)), float(mark)))
+        taken: dict[int, float] = {}
+        for away, member, mark in sorted(found):
+            if away <= self.tolerance * one.size:
+                taken.setdefault(member, mark)
+        return taken
 
     def _found(self, boundary: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """The curve of each boundary vertex, -1 for none, and where along it."""
@@ -163,20 +183,6 @@ class Rails:
                 "scale, or elsewhere?"
             )
         return curve, s
-
-    def _take_corners(
-        self, one: Curve, vertices: IntArray, along: FloatArray, slides: BoolArray, places: FloatArray
-    ) -> None:
-        """Hold the vertex nearest to each corner there, if it is near."""
-        marks = one.corners(self.corner_angle)
-        for mark, corner in zip(marks, one.position(marks), strict=True):
-            away = np.abs(as_complex(places[vertices] - corner))
-            nearest = int(np.argmin(away))
-            if away[nearest] > self.tolerance * one.size:
-                continue
-            if slides[nearest] and away[nearest] > _THERE * one.size:
-                places[vertices[nearest]] = corner
-            along[nearest], slides[nearest] = mark, False
 
 
 def rails_of(slide: bool | Rails, loops: Sequence[IntArray], uv: FloatArray) -> Rails:
@@ -284,6 +290,13 @@ class Track:
         return [
             (chain.curve, slice(first, last)) for chain, first, last in zip(self.chains, ends, ends[1:], strict=False)
         ]
+
+
+def _move(places: FloatArray, vertices: IntArray, there: FloatArray) -> None:
+    """Put vertices into their places, but for those that are there up to rounding."""
+    off = np.abs(places[vertices] - there) > _THERE * np.abs(there).max(initial=0)
+    moves = off.any(axis=1)
+    places[vertices[moves]] = there[moves]
 
 
 def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> None:

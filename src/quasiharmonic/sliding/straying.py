@@ -2,7 +2,7 @@
 
 Vertices that slide would leave a bend that costs energy, and the edge between the last two would cut it off: the polygon
 of the boundary would no longer be the outline. So an edge may stray from its stretch of the curve no further than the
-worst one does at the start, or once every vertex has gone halfway to the next, and half as far again. On K points of the
+worst one does at the start, or once every vertex has gone halfway to the next, and a fifth as far again. On K points of the
 stretch, at distances dₖ from the edge's line,
 
     m = Σₖ dₖ² / K        barrier = −log(1 − m/M) − m/M        with M the bound,
@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 # Where along the stretch, as shares of it.
 _SHARES = np.arange(1, 8) / 8
 # How far an edge may stray, in units of the worst at the start.
-_ALLOWED = 1.5
+_ALLOWED = 1.2
 # Squares of distances below this share of the curve's size squared are rounding: the curve is straight there.
 _STRAIGHT = 1e-18
 
