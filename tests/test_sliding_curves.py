@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from fractions import Fraction
 
 import numpy as np
@@ -29,10 +30,7 @@ def bezier(control, t):
     points = [tuple(map(Fraction, row)) for row in control]
     t = Fraction(t)
     while len(points) > 1:
-        points = [
-            tuple((1 - t) * a + t * b for a, b in zip(p, q, strict=True))
-            for p, q in zip(points[:-1], points[1:], strict=True)
-        ]
+        points = [tuple((1 - t) * a + t * b for a, b in zip(p, q, strict=True)) for p, q in itertools.pairwise(points)]
     return points[0]
 
 

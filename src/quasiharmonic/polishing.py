@@ -108,8 +108,8 @@ def polish(
     ValueError
         When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
         the message names the triangles. When the boundary is not on the curves that it is to slide along (see `Rails`),
-        or triangles are inverted once it is on them. When the energy is not known, not a barrier or without second derivatives,
-        or another option has no such value.
+        or triangles are inverted once it is on them. When the energy is not known, not a barrier or without second
+        derivatives, or another option has no such value.
 
     Examples
     --------

@@ -1,10 +1,8 @@
 """Boundary vertices that glide along the outline they are on, its corners held.
 
-    curves ── positions, tangents and corners by arc length
-      ▼
-    rails ─── which vertex is on which curve, and where; their order along it
-      ▼
-    descent ─ Newton's steps in the free vertices' places and the sliding ones' arc lengths
+`curves` has positions, directions and corners by arc length; `rails` which vertex is on which curve, and their order;
+`straying` how far the boundary's edges may come to be from the curves; `descent` Newton's steps in the free vertices'
+places and the sliding ones' lengths.
 """
 
 from quasiharmonic.sliding.curves import Arc, Curve

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -241,7 +242,8 @@ class Curve:
             begin = np.where(candidate == here, at, 0.0 if other > 0 else 1.0)
             found, away = self._refined(candidate, begin, z)
             better = away < best
-            piece, t, best = np.where(better, candidate, piece), np.where(better, found, t), np.where(better, away, best)
+            piece, t = np.where(better, candidate, piece), np.where(better, found, t)
+            best = np.minimum(best, away)
         s = self._starts[piece] + self._way(piece, t)
         # A joint is a joint to the last bit.
         joint = np.concatenate([piece, (piece + 1) % self._degree.size if self.closed else piece + 1])
@@ -263,7 +265,7 @@ class Curve:
         self._chord_head = self._point(self._chord_piece, (nth + 1) * self._chord_width)
         every = np.concatenate([self._chord_tail, self._chord_head])
         self.size = float(max(np.ptp(every.real), np.ptp(every.imag)))
-        if not (_SMALLEST < self.size and np.abs(every).max() < _LARGEST):
+        if not (self.size > _SMALLEST and np.abs(every).max() < _LARGEST):
             raise ValueError(
                 f"a curve of size {self.size:.3g} around {every[0]:.3g} leaves the range that can be computed in "
                 f"({_SMALLEST:.0e} to {_LARGEST:.0e}): scale the drawing"
@@ -429,22 +431,20 @@ def _parts(i: int, piece: ArrayLike | Arc) -> list[tuple[int, ComplexArray, tupl
         rows = [np.asarray(x, dtype=np.float64) for x in (piece.centre, piece.a, piece.b)]
         if any(row.shape != (2,) for row in rows):
             raise ValueError(f"piece {i} of the curve: an arc has a centre and two axes of shape (2,)")
-        every = np.concatenate([*rows, (piece.first, piece.last)])
-        degree, control = 0, np.stack(rows)
+        control, ends = np.stack(rows), (float(piece.first), float(piece.last))
     else:
-        control = np.array(piece, dtype=np.float64)
+        control, ends = np.array(piece, dtype=np.float64), (0.0, 0.0)
         if control.ndim != 2 or control.shape[1] != 2 or not 2 <= len(control) <= 4:
             raise ValueError(f"piece {i} of the curve must have shape (2, 2), (3, 2) or (4, 2), not {control.shape}")
-        degree, every = len(control) - 1, control.ravel()
-    if not np.isfinite(every).all():
+    if not (np.isfinite(control).all() and np.isfinite(ends).all()):
         raise ValueError(f"piece {i} of the curve is not finite")
     four = np.zeros(4, dtype=np.complex128)
     four[: len(control)] = as_complex(control)
-    if degree:
-        return [(degree, four, (0.0, 0.0))]
-    steps = max(1, int(np.ceil(abs(piece.last - piece.first) / _LONGEST_ARC)))
-    angles = np.linspace(piece.first, piece.last, steps + 1)
-    return [(0, four, (angles[k], angles[k + 1])) for k in range(steps)]
+    if not isinstance(piece, Arc):
+        return [(len(control) - 1, four, ends)]
+    steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
+    angles = np.linspace(*ends, steps + 1).tolist()
+    return [(0, four, pair) for pair in pairwise(angles)]
 
 
 def _chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:

@@ -147,6 +147,8 @@ class SlidingDescent(NewtonDescent):
         As of `NewtonDescent`.
     """
 
+    system: SlidingSystem
+
     def __init__(
         self,
         energy: DeformationEnergy,
@@ -169,9 +171,7 @@ class SlidingDescent(NewtonDescent):
         self._simple = not judge_loops(self._loops, track.uv)[1]
 
     def _system(self, n: int, linear_solver: str) -> SlidingSystem:
-        return SlidingSystem(
-            self.energy.F, self.energy.g, n, self._fixed, linear_solver, sliding=self._track.vertices
-        )
+        return SlidingSystem(self.energy.F, self.energy.g, n, self._fixed, linear_solver, sliding=self._track.vertices)
 
     @property
     def energies(self) -> tuple[float, float]:

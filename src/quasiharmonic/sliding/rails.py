@@ -149,8 +149,8 @@ class Rails:
             away = np.abs(as_complex(places - corner))
             found.append((float(away.min()), int(np.argmin(away)), float(mark)))
         taken: dict[int, float] = {}
-        for away, member, mark in sorted(found):
-            if away <= self.tolerance * one.size:
+        for distance, member, mark in sorted(found):
+            if distance <= self.tolerance * one.size:
                 taken.setdefault(member, mark)
         return taken
 
@@ -281,9 +281,7 @@ class Track:
 
     def in_order(self, s: FloatArray) -> bool:
         """Whether on every curve the vertices are in their order, and none in one place."""
-        return all(
-            chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)
-        )
+        return all(chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True))
 
     def _parts(self) -> list[tuple[Curve, slice]]:
         ends = self._ends.tolist()

@@ -1,9 +1,9 @@
 """How far the boundary's edges stray from the curves that their ends slide along, kept in bounds.
 
-Vertices that slide would leave a bend that costs energy, and the edge between the last two would cut it off: the polygon
-of the boundary would no longer be the outline. So an edge may stray from its stretch of the curve no further than the
-worst one does at the start, or once every vertex has gone halfway to the next, and a fifth as far again. On K points of the
-stretch, at distances dₖ from the edge's line,
+Vertices that slide would leave a bend that costs energy, and the edge between the last two would cut it off: the
+polygon of the boundary would no longer be the outline. So an edge may stray from its stretch of the curve no further
+than the worst one does at the start, or once every vertex has gone halfway to the next, and a fifth as far again. On K
+points of the stretch, at distances dₖ from the edge's line,
 
     m = Σₖ dₖ² / K        barrier = −log(1 − m/M) − m/M        with M the bound,
 
@@ -102,10 +102,9 @@ class Straying:
     def _shares(self, s: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """``m/M`` of the edges on each curve, and its first and second derivatives by the ends' lengths."""
         return [
-            tuple(part / bound for part in _strayed(chain, every[tail], every[head]))
-            for (chain, tail, head), every, bound in zip(
-                self._edges, self._every(s), self._bounds, strict=True
-            )
+            (share / bound, by_ends / bound, by_both / bound)
+            for (chain, tail, head), every, bound in zip(self._edges, self._every(s), self._bounds, strict=True)
+            for share, by_ends, by_both in [_strayed(chain, every[tail], every[head])]
         ]
 
     def _every(self, s: FloatArray) -> list[FloatArray]:
@@ -125,8 +124,8 @@ def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
     order = {int(i): k for k, i in enumerate(tail)}
     links = [(order[int(i)], k) for k, i in enumerate(tail) for i in [head[k]] if int(i) in order and chain.sliding[i]]
     if links:
-        after, before = np.array(links).T
-        found = max(found, _strayed(chain, middle[before] % chain.curve.length, middle[after] % chain.curve.length)[0].max())
+        before, after = (middle[k] % chain.curve.length for k in np.array(links).T[::-1])
+        found = max(found, _strayed(chain, before, after)[0].max())
     return float(found)
 
 

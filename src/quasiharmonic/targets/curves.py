@@ -69,4 +69,3 @@ def _contours(paths: list[Pieces]) -> list[Curve]:
         for pieces in paths
         if any(isinstance(piece, Arc) or np.ptp(piece, axis=0).any() for piece in pieces)
     ]
-

@@ -11,6 +11,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -120,7 +121,7 @@ class _Drawing:
 
     def __init__(self, path: str | os.PathLike[str], arcs: bool) -> None:
         self.path, self.arcs = path, arcs
-        self.subpaths: list[Pieces] = []
+        self.subpaths: list[list[Any]] = []
         self.count = 0
         # A transform of homogeneous points for every open container.
         self.transforms = [np.diag([1.0, -1.0, 1.0])]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import cmath
 import math
 import re
+from typing import Any
 
 import numpy as np
 
@@ -110,7 +111,8 @@ class _Pen:
     """Follows the commands of a path; points are complex numbers x + iy."""
 
     def __init__(self, arcs: bool) -> None:
-        self.subpaths: list[Pieces] = []
+        # Control points, and arcs if they are left what they are.
+        self.subpaths: list[list[Any]] = []
         self.count = 0
         self.arcs = arcs
         self.here = self.start = 0j
@@ -189,7 +191,7 @@ class _Pen:
 
         if self.arcs:
             rows = np.array([centre, axis * rx, 1j * axis * ry]).view(np.float64).reshape(-1, 2)
-            self.subpaths[-1].append(Arc(*rows, first, first + angle))
+            self.subpaths[-1].append(Arc(rows[0], rows[1], rows[2], first, first + angle))
             self.here = end
             self.count += 1
             return
