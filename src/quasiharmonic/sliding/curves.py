@@ -7,7 +7,7 @@ may turn: by an angle that makes it a corner, or by less, which is a kink; there
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -255,7 +255,11 @@ class Curve:
         return np.where(s < self.length, s, 0.0) if self.closed else s, best
 
     def _measure(self) -> None:
-        """Chords to find nearest points on, the curve's size, and where its pieces begin."""
+        """The pieces as powers of the parameter, chords to find nearest points on, and where the pieces begin."""
+        a, b, c, d = self._control.T
+        by_degree = [(a, 0 * a, 0 * a, 0 * a), (a, b - a, 0 * a, 0 * a), (a, 2 * (b - a), a - 2 * b + c, 0 * a)]
+        by_degree.append((a, 3 * (b - a), 3 * (a - 2 * b + c), d - a + 3 * (b - c)))
+        self._powers = np.stack([np.choose(self._degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
         count = np.array([_chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
         self._chord_piece = np.repeat(np.arange(count.size), count)
         nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -308,7 +312,9 @@ class Curve:
         piece = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, self._degree.size - 1)
         whole = self._starts[piece + 1] - self._starts[piece]
         way = np.clip(s - self._starts[piece], 0.0, whole)
-        t = way / whole
+        # The table is a good guess, but its last bits may lie beyond the piece.
+        guess = np.clip(np.interp(s, *self._table) - piece, 1e-3, 1 - 1e-3)
+        t = np.where((self._degree[piece] == 1) | (way <= 0) | (way >= whole), way / whole, guess)
         open_ = np.flatnonzero((self._degree[piece] != 1) & (t > 0) & (t < 1))
         low, high = np.zeros(open_.size), np.ones(open_.size)
         # Newton's steps, or halves where these leave what is known to hold the parameter.
@@ -340,46 +346,31 @@ class Curve:
 
     def _point(self, piece: IntArray, t: FloatArray) -> ComplexArray:
         """Points in plain doubles."""
-        u = 1 - t
-        a, b, c, d = self._control[piece].T
-        angle = _angle(self._angles[piece], t)
-        return np.choose(
-            self._degree[piece],
-            [
-                a + b * np.cos(angle) + c * np.sin(angle),
-                u * a + t * b,
-                u * u * a + 2 * u * t * b + t * t * c,
-                u**3 * a + 3 * u * u * t * b + 3 * u * t * t * c + t**3 * d,
-            ],
-        )
+        a, b, c, d = self._powers[piece].T
+        found: ComplexArray = a + t * (b + t * (c + t * d))
+        for arc, cos, sin in self._on_arcs(piece, t):
+            centre, along, across, _ = self._control[piece[arc]].T
+            found[arc] = centre + along * cos + across * sin
+        return found
 
     def _derivatives(self, piece: IntArray, t: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """First and second derivatives by the parameter."""
-        u = 1 - t
-        degree = self._degree[piece]
-        a, b, c, d = self._control[piece].T
-        span = self._angles[piece, 1] - self._angles[piece, 0]
-        angle = _angle(self._angles[piece], t)
-        cos, sin = np.cos(angle), np.sin(angle)
-        first = np.choose(
-            degree,
-            [
-                span * (c * cos - b * sin),
-                b - a,
-                2 * (u * (b - a) + t * (c - b)),
-                3 * (u * u * (b - a) + 2 * u * t * (c - b) + t * t * (d - c)),
-            ],
-        )
-        second = np.choose(
-            degree,
-            [
-                -(span**2) * (b * cos + c * sin),
-                np.zeros_like(a),
-                2 * (a - 2 * b + c),
-                6 * (u * (a - 2 * b + c) + t * (b - 2 * c + d)),
-            ],
-        )
+        _, b, c, d = self._powers[piece].T
+        first: ComplexArray = b + t * (2 * c + 3 * t * d)
+        second: ComplexArray = 2 * c + 6 * t * d
+        for arc, cos, sin in self._on_arcs(piece, t):
+            _, along, across, _ = self._control[piece[arc]].T
+            span = self._angles[piece[arc], 1] - self._angles[piece[arc], 0]
+            first[arc] = span * (across * cos - along * sin)
+            second[arc] = -(span**2) * (along * cos + across * sin)
         return first, second
+
+    def _on_arcs(self, piece: IntArray, t: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Which of some places are on arcs, if any is, and the cosines and sines there."""
+        arc = np.flatnonzero(self._degree[piece] == 0)
+        if arc.size:
+            angle = _angle(self._angles[piece[arc]], t[arc])
+            yield arc, np.cos(angle), np.sin(angle)
 
     def _direction(self, piece: IntArray, t: FloatArray) -> tuple[ComplexArray, FloatArray]:
         """Unit tangents and curvatures."""

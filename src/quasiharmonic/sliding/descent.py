@@ -41,7 +41,7 @@ BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
 
 # Of the energy at hand: the weight of the barrier.
-_WEIGHT = 1e-3
+_WEIGHT = 1e-2
 
 
 def lay_boundary(slide: bool | Rails, problem: Problem, uv: FloatArray) -> Track:
@@ -193,10 +193,9 @@ class SlidingDescent(NewtonDescent):
         pull = self.energy.gradient_of(self._deformation, self.w.size)
         at, system = pull[self._track.vertices], self.system
         slopes, self._bends = self._barrier()
-        (ahead, curvature), (back, curvature_back) = (
-            self._track.frame(self._s, np.full(at.size, forward)) for forward in (True, False)
-        )
         kink = self._track.at_kink(self._s)
+        ahead, curvature = self._track.frame(self._s, np.ones(at.size, dtype=bool))
+        back, curvature_back = self._track.frame(self._s, ~kink)
         slope, slope_back = _along(ahead, at) + slopes, _along(back, at) + slopes
         # Of the sides to which the energy falls, the steeper one.
         turned = kink & (slope_back > np.maximum(-slope, 0))
@@ -265,12 +264,13 @@ class SlidingDescent(NewtonDescent):
         there = self._track.moved(s, step, stop=stop)
         if stop and np.array_equal(there, self._track.moved(s, step)):
             return False  # no kink in the way, and this has been tried
-        if not self._track.in_order(there):
+        barrier = self._weight * self._straying.value(there)
+        if barrier == np.inf or not self._track.in_order(there):
             return False
         w[self._track.vertices] = in_units(self._track.position(there), self._exponent)
         deformation = self.energy.deform(w)
         energy = self.energy.value_of(deformation)
-        value = energy + self._weight * self._straying.value(there)
+        value = energy + barrier
         if not value < bound:
             return False
         uv = self.positions(w)
