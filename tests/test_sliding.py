@@ -15,6 +15,7 @@ from quasiharmonic import Status, certify, injective_map, io, morph, polish, sur
 from quasiharmonic.cli import main
 from quasiharmonic.deformation_energy import DeformationEnergy
 from quasiharmonic.energies import SymmetricDirichlet
+from quasiharmonic.io.fem import read_fem
 from quasiharmonic.measures import distortion
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.sliding import Curve, Rails
@@ -526,3 +527,23 @@ def test_what_the_command_line_refuses(tmp_path, capsys):
     assert main(["map", str(tmp_path / "in.obj"), "--to", "disk", "--slide", *out]) == 0
     assert main(["polish", str(tmp_path / "out.obj"), "--to", "disk", "-o", str(tmp_path / "b.obj")]) == 2
     assert "add --slide" in capsys.readouterr().err
+
+
+def test_morph_slides(tmp_path):
+    V, F, walls, body, turn = channel(10)
+    shift = np.zeros((len(V), 3))
+    shift[body, :2] = turn - V[body]
+    lines = ["# vtk DataFile Version 3.0", "a channel", "ASCII", "DATASET UNSTRUCTURED_GRID", f"POINTS {len(V)} double"]
+    lines += [f"{x!r} {y!r} 0" for x, y in V.tolist()]
+    lines += [f"CELLS {len(F)} {4 * len(F)}", *(f"3 {a} {b} {c}" for a, b, c in F.tolist())]
+    lines += [f"CELL_TYPES {len(F)}", *["5"] * len(F), f"POINT_DATA {len(V)}", "VECTORS displacement double"]
+    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in shift.tolist()]
+    (tmp_path / "in.vtk").write_text("\n".join(lines) + "\n")
+    call = ["morph", str(tmp_path / "in.vtk"), "--field", "displacement", "--slide", "-o", str(tmp_path / "out.vtk")]
+    assert main(call) == 0
+    after = read_fem(tmp_path / "out.vtk").points
+    # The field moves the walls by nothing, so they slide.
+    np.testing.assert_array_equal(after, morph(V, F, body, V[body] + shift[body, :2], slide=True).points)
+    assert np.abs(after[walls] - V[walls]).max() > 0.03
+    assert (np.abs(after[walls]).max(axis=1) == 1).all()
+    assert main([*call, "--energy", "none"]) == 2

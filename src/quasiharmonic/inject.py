@@ -169,7 +169,7 @@ def solve(
     first = None if start is None else _first_map(problem, start)
     if slide is not False:
         if lower is None:
-            raise ValueError("the boundary slides while distortion is lowered: name an energy too (polish=)")
+            raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
         problem = moved_onto(slide, problem)
     with problem.exclusive() as own:
         search = Search(own, linear_solver, callback, max_iterations, record, first)
