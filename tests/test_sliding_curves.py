@@ -50,6 +50,8 @@ def test_positions_are_rounded_once(control, rng):
 def test_a_circle_is_met_to_one_rounding(radius, centre, rng):
     curve = Curve.circle(radius, centre)
     assert curve.closed
+    assert curve.corners(0.0).tolist() == [0]
+    assert curve.corners(1e-6).size == 0
     assert curve.length == pytest.approx(2 * np.pi * radius)
     x, y, r = (Fraction(c) for c in (*centre, radius))
     for place in curve.position(rng.random(500) * curve.length).tolist():

@@ -106,9 +106,11 @@ class Curve:
         parts = [part for i, piece in enumerate(pieces) for part in _parts(i, piece)]
         if not parts:
             raise ValueError("a curve has at least one piece")
-        self._degree = np.array([degree for degree, _, _ in parts])
-        self._control = np.stack([control for _, control, _ in parts])
-        self._angles = np.array([angles for _, _, angles in parts])
+        self._degree = np.array([degree for degree, _, _, _ in parts])
+        self._control = np.stack([control for _, control, _, _ in parts])
+        self._angles = np.array([angles for _, _, angles, _ in parts])
+        # An arc is taken apart for the sake of its length; where it is, is no joint.
+        self._within = np.array([within for _, _, _, within in parts])
         self._measure()
         self._join()
 
@@ -222,7 +224,7 @@ class Curve:
 
     def corners(self, angle: float) -> FloatArray:
         """Where the curve turns by at least so many degrees, and its ends if it has any; ascending."""
-        marks = self._starts[:-1][np.abs(self._turn) >= np.radians(angle)]
+        marks = self._starts[:-1][(np.abs(self._turn) >= np.radians(angle)) & ~self._within]
         return marks if self.closed else np.unique(np.append(marks, (0.0, self.length)))
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -277,7 +279,8 @@ class Curve:
         lengths = self._way(np.arange(count.size), np.ones(count.size))
         kept = lengths > _SNAP * self.size
         if not kept.all():
-            self._degree, self._control, self._angles = self._degree[kept], self._control[kept], self._angles[kept]
+            self._degree, self._control = self._degree[kept], self._control[kept]
+            self._angles, self._within = self._angles[kept], self._within[kept]
             self._measure()
             return
         self._starts = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -416,8 +419,11 @@ class Curve:
         return best, least
 
 
-def _parts(i: int, piece: ArrayLike | Arc) -> list[tuple[int, ComplexArray, tuple[float, float]]]:
-    """A piece as its degree (0 for an arc), four complex numbers and two angles; long arcs in several."""
+def _parts(i: int, piece: ArrayLike | Arc) -> list[tuple[int, ComplexArray, tuple[float, float], bool]]:
+    """A piece as its degree (0 for an arc), four complex numbers and two angles; long arcs in several.
+
+    The last of each says whether it begins within the piece.
+    """
     if isinstance(piece, Arc):
         rows = [np.asarray(x, dtype=np.float64) for x in (piece.centre, piece.a, piece.b)]
         if any(row.shape != (2,) for row in rows):
@@ -432,10 +438,10 @@ def _parts(i: int, piece: ArrayLike | Arc) -> list[tuple[int, ComplexArray, tupl
     four = np.zeros(4, dtype=np.complex128)
     four[: len(control)] = as_complex(control)
     if not isinstance(piece, Arc):
-        return [(len(control) - 1, four, ends)]
+        return [(len(control) - 1, four, ends, False)]
     steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
     angles = np.linspace(*ends, steps + 1).tolist()
-    return [(0, four, pair) for pair in pairwise(angles)]
+    return [(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
 
 
 def _chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:

@@ -29,7 +29,7 @@ class Rails:
 
     Parameters
     ----------
-    curves : sequence of Curve or (k, 2) float
+    curves : sequence of Curve or (k, 2) float, or one of these
         Contours, or single sides; arrays are closed polygons.
     on : mapping from int to int, optional
         Boundary vertices that are told their curve, by its number. All others are on the curve nearest to them, or, if
@@ -57,17 +57,21 @@ class Rails:
 
     def __init__(
         self,
-        curves: Iterable[Curve | ArrayLike],
+        curves: Iterable[Curve | ArrayLike] | Curve,
         *,
         on: Mapping[int, int] | None = None,
         held: ArrayLike = (),
         corner_angle: float = 20.0,
         tolerance: float = 1e-3,
     ) -> None:
+        if isinstance(curves, Curve) or (isinstance(curves, np.ndarray) and curves.ndim == 2):
+            curves = [curves]
         self.curves = [curve if isinstance(curve, Curve) else Curve.polygon(curve) for curve in curves]
         if not self.curves:
             raise ValueError("there is no curve to slide along")
-        self.on = dict(on or {})
+        on = on or {}
+        told = zip(index_array("on", list(on)).tolist(), index_array("on", list(on.values())).tolist(), strict=True)
+        self.on: dict[int, int] = dict(told)
         self.held = index_array("held", held).ravel()
         wrong = [v for v, k in self.on.items() if not 0 <= k < len(self.curves)]
         if wrong:
