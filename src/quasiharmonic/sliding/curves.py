@@ -8,16 +8,12 @@ may turn: by an angle that makes it a corner, or by less, which is a kink; there
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.mesh.topology import named
-from quasiharmonic.predicates import _two_product as two_product
-from quasiharmonic.predicates import _two_sum as two_sum
+from quasiharmonic.sliding.pieces import Arc, angle_at, as_complex, chords, gauss, on_bezier, on_ellipse, parts
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -30,44 +26,16 @@ _LARGEST, _SMALLEST = 1e75, 1e-75
 _MEET = 1e-9
 # Bends of fewer radians than this are passed like none at all: what they change in a descent is beyond its tolerance.
 _KINK = 1e-3
-# The longest arc, so that few nodes integrate its length to rounding.
-_LONGEST_ARC = np.pi / 4
 # Of the mean speed; where a piece is slower its direction is taken from a chord.
 _SLOW, _CHORD = 1e-9, 1e-5
-# Bends of a chord polygon that nearest points are looked for on.
-_FLAT = 0.1
 # Distances between points and chords computed at a time.
 _PAIRS = 1 << 20
 # Lengths below this share of the curve's size are rounding.
 _SNAP = 1e-13
 # Parameters of each piece in the table of lengths.
 _TABLE = 32
-# Nodes of Gauss' formula for a length; steps of the searches for a parameter by length, and by distance.
-_NODES, _MOST_STEPS, _REFINEMENTS = 16, 60, 6
-
-
-@dataclass(frozen=True, eq=False)
-class Arc:
-    """An elliptic arc ``centre + a cos θ + b sin θ`` from one angle to another.
-
-    Attributes
-    ----------
-    centre, a, b : (2,) float
-        ``a`` and ``b`` of equal length and at right angles make a circle; any others an ellipse.
-    first, last : float
-        Radians; the arc runs clockwise where ``last`` is the smaller.
-    """
-
-    centre: ArrayLike
-    a: ArrayLike
-    b: ArrayLike
-    first: float
-    last: float
-
-    def transformed(self, matrix: FloatArray, shift: FloatArray) -> Arc:
-        """The arc after ``x → matrix @ x + shift``, an elliptic arc again."""
-        centre, a, b = (matrix @ np.asarray(x, dtype=np.float64) for x in (self.centre, self.a, self.b))
-        return Arc(centre + shift, a, b, self.first, self.last)
+# Steps of the searches for a parameter by length, and by distance.
+_MOST_STEPS, _REFINEMENTS = 60, 6
 
 
 class Curve:
@@ -103,14 +71,14 @@ class Curve:
     """
 
     def __init__(self, pieces: Sequence[ArrayLike | Arc]) -> None:
-        parts = [part for i, piece in enumerate(pieces) for part in _parts(i, piece)]
-        if not parts:
+        found = [part for i, piece in enumerate(pieces) for part in parts(i, piece)]
+        if not found:
             raise ValueError("a curve has at least one piece")
-        self._degree = np.array([degree for degree, _, _, _ in parts])
-        self._control = np.stack([control for _, control, _, _ in parts])
-        self._angles = np.array([angles for _, _, angles, _ in parts])
+        self._degree = np.array([part.degree for part in found])
+        self._control = np.stack([part.control for part in found])
+        self._angles = np.array([part.angles for part in found])
         # An arc is taken apart for the sake of its length; where it is, is no joint.
-        self._within = np.array([within for _, _, _, within in parts])
+        self._within = np.array([part.within for part in found])
         self._measure()
         self._join()
 
@@ -159,9 +127,9 @@ class Curve:
             which = self._degree[piece] == degree
             control = self._control[piece[which]].view(np.float64).reshape(-1, 4, 2)
             if degree:
-                found[which] = _on_bezier(control[:, : degree + 1], t[which])
+                found[which] = on_bezier(control[:, : degree + 1], t[which])
             else:
-                found[which] = _on_ellipse(control, _angle(self._angles[piece[which]], t[which]))
+                found[which] = on_ellipse(control, angle_at(self._angles[piece[which]], t[which]))
         return found
 
     def sampled(self, s: FloatArray) -> tuple[ComplexArray, ComplexArray]:
@@ -262,7 +230,7 @@ class Curve:
         by_degree = [(a, 0 * a, 0 * a, 0 * a), (a, b - a, 0 * a, 0 * a), (a, 2 * (b - a), a - 2 * b + c, 0 * a)]
         by_degree.append((a, 3 * (b - a), 3 * (a - 2 * b + c), d - a + 3 * (b - c)))
         self._powers = np.stack([np.choose(self._degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
-        count = np.array([_chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
+        count = np.array([chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
         self._chord_piece = np.repeat(np.arange(count.size), count)
         nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         self._chord_width = 1.0 / count[self._chord_piece]
@@ -341,7 +309,7 @@ class Curve:
         found = np.abs(self._control[piece, 1] - self._control[piece, 0]) * t
         curved = np.flatnonzero(self._degree[piece] != 1)
         if curved.size:
-            nodes, weights = _gauss()
+            nodes, weights = gauss()
             which, until = np.repeat(piece[curved], nodes.size), t[curved]
             speed = np.abs(self._derivatives(which, (until[:, None] * nodes).ravel())[0])
             found[curved] = until * (speed.reshape(-1, nodes.size) @ weights)
@@ -372,7 +340,7 @@ class Curve:
         """Which of some places are on arcs, if any is, and the cosines and sines there."""
         arc = np.flatnonzero(self._degree[piece] == 0)
         if arc.size:
-            angle = _angle(self._angles[piece[arc]], t[arc])
+            angle = angle_at(self._angles[piece[arc]], t[arc])
             yield arc, np.cos(angle), np.sin(angle)
 
     def _direction(self, piece: IntArray, t: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -419,44 +387,6 @@ class Curve:
         return best, least
 
 
-def _parts(i: int, piece: ArrayLike | Arc) -> list[tuple[int, ComplexArray, tuple[float, float], bool]]:
-    """A piece as its degree (0 for an arc), four complex numbers and two angles; long arcs in several.
-
-    The last of each says whether it begins within the piece.
-    """
-    if isinstance(piece, Arc):
-        rows = [np.asarray(x, dtype=np.float64) for x in (piece.centre, piece.a, piece.b)]
-        if any(row.shape != (2,) for row in rows):
-            raise ValueError(f"piece {i} of the curve: an arc has a centre and two axes of shape (2,)")
-        control, ends = np.stack(rows), (float(piece.first), float(piece.last))
-    else:
-        control, ends = np.array(piece, dtype=np.float64), (0.0, 0.0)
-        if control.ndim != 2 or control.shape[1] != 2 or not 2 <= len(control) <= 4:
-            raise ValueError(f"piece {i} of the curve must have shape (2, 2), (3, 2) or (4, 2), not {control.shape}")
-    if not (np.isfinite(control).all() and np.isfinite(ends).all()):
-        raise ValueError(f"piece {i} of the curve is not finite")
-    four = np.zeros(4, dtype=np.complex128)
-    four[: len(control)] = as_complex(control)
-    if not isinstance(piece, Arc):
-        return [(len(control) - 1, four, ends, False)]
-    steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
-    angles = np.linspace(*ends, steps + 1).tolist()
-    return [(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
-
-
-def _chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
-    """Chords into which a piece is taken apart so that each bends little."""
-    if degree == 1:
-        return 1
-    if degree == 0:
-        return int(max(1, np.ceil(abs(angles[1] - angles[0]) / _FLAT)))
-    sides = np.diff(control[: degree + 1])
-    sides = sides[sides != 0]
-    bends = np.abs(np.angle(sides[1:] / sides[:-1])).sum()
-    # The handles' bends are spread unevenly over the parameter.
-    return int(max(4, 2 * np.ceil(bends / _FLAT)))
-
-
 def _sides(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
     """The straight lines between points."""
     array = np.array(points, dtype=np.float64)
@@ -468,48 +398,3 @@ def _sides(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
         raise ValueError(f"points is not finite at {named('row', 'rows', bad)}")
     ends = np.concatenate([array, array[:1]]) if closed else array
     return list(np.stack([ends[:-1], ends[1:]], axis=1))
-
-
-def as_complex(points: ArrayLike) -> ComplexArray:
-    """Points (k, 2) as complex numbers (k,)."""
-    return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
-
-
-def _angle(angles: FloatArray, t: FloatArray) -> FloatArray:
-    return angles[:, 0] + t * (angles[:, 1] - angles[:, 0])
-
-
-def _on_bezier(control: FloatArray, t: FloatArray) -> FloatArray:
-    """De Casteljau's construction in twice the digits, rounded; control (k, degree + 1, 2), t (k,)."""
-    t = t[:, None]
-    high, low = np.moveaxis(control, 1, 0), np.zeros((control.shape[1], len(t), 2))
-    u, u_low = two_sum(np.ones_like(t), -t)
-    while len(high) > 1:
-        left, left_low = two_product(u, high[:-1])
-        right, right_low = two_product(t, high[1:])
-        total, lost = two_sum(left, right)
-        low = lost + left_low + right_low + (u_low * high[:-1] + u * low[:-1] + t * low[1:])
-        high, low = two_sum(total, low)
-    return np.asarray(high[0])
-
-
-def _on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
-    """``centre + a cos θ + b sin θ`` in twice the digits, rounded; control (k, 4, 2), angle (k,)."""
-    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    # A cosine and a sine as rounded lie off the unit circle; put back onto it they belong to an angle beside the one
-    # that was meant, which nobody minds.
-    (cc, cc_low), (ss, ss_low) = two_product(cos, cos), two_product(sin, sin)
-    square, square_low = two_sum(cc, ss)
-    off = ((square - 1) + (square_low + cc_low + ss_low)) / 2
-    centre, a, b = control[:, 0], control[:, 1], control[:, 2]
-    (along_a, a_low), (along_b, b_low) = two_product(cos, a), two_product(sin, b)
-    one, one_low = two_sum(along_a, along_b)
-    two, two_low = two_sum(one, centre)
-    return np.asarray(two + (two_low + one_low + a_low + b_low - off * one))
-
-
-@cache
-def _gauss() -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights of Gauss' formula on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return (nodes + 1) / 2, weights / 2

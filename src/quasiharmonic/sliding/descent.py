@@ -37,7 +37,6 @@ from quasiharmonic.sliding.straying import Straying
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
 
 # Of the energy at hand: the weight of the barrier.
@@ -94,7 +93,7 @@ class SlidingSystem(NewtonSystem):
         # Blocks of which a row, or a column, belongs to a sliding vertex, and to which.
         self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
         self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
-        self._place, self._row = place, row // 2
+        self._row = row // 2
         self.tangent: ComplexArray = np.zeros(sliding.size, dtype=np.complex128)
         self.bend: FloatArray = np.zeros(sliding.size)
         self._coupled: IntArray = np.empty(0, dtype=np.int64)

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import check_range, index_array
 from quasiharmonic.mesh.topology import named
-from quasiharmonic.sliding.curves import Curve, as_complex
+from quasiharmonic.sliding.curves import Curve
+from quasiharmonic.sliding.pieces import as_complex
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -259,9 +260,9 @@ class Track:
         self.vertices = np.concatenate([chain.vertices[chain.sliding] for chain in chains])
         self.s = np.concatenate([chain.s[chain.sliding] for chain in chains])
 
-    def every(self, s: FloatArray) -> list[tuple[Chain, FloatArray]]:
+    def every(self, s: FloatArray) -> list[FloatArray]:
         """Where all vertices of each chain are with the sliding ones at ``s``."""
-        return [(chain, chain.every(s[part])) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
+        return [chain.every(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
 
     def position(self, s: FloatArray) -> FloatArray:
         """Places of the sliding vertices; (k, 2) float64."""

@@ -49,10 +49,10 @@ class Straying:
         following = {int(i): int(j) for loop in loops for i, j in zip(loop, np.roll(loop, -1), strict=True)}
         number = {int(v): k for k, v in enumerate(track.vertices)}
         self._track = track
-        self._edges: list[tuple[Chain, IntArray, IntArray]] = []
+        self._edges: list[tuple[int, IntArray, IntArray]] = []
         self._bounds: list[float] = []
         pairs = []
-        for chain in track.chains:
+        for k, chain in enumerate(track.chains):
             ahead = np.roll(np.arange(chain.s.size), -1)
             tail = np.flatnonzero(
                 [
@@ -67,7 +67,7 @@ class Straying:
             kept = chain.sliding[tail] | chain.sliding[head]
             if bound <= _STRAIGHT * chain.curve.size**2 or not kept.any():
                 continue
-            self._edges.append((chain, tail[kept], head[kept]))
+            self._edges.append((k, tail[kept], head[kept]))
             self._bounds.append(bound)
             ends = np.stack([chain.vertices[tail[kept]], chain.vertices[head[kept]]], axis=1)
             pairs += [[number.get(i, -1), number.get(j, -1)] for i, j in ends.tolist()]
@@ -75,7 +75,8 @@ class Straying:
 
     def value(self, s: FloatArray) -> float:
         """The barrier's mean over the edges; ``inf`` where one strays too far."""
-        return self._mean([_barrier(share)[0] for share, _, _ in self._shares(s)])
+        total = sum(float(_barrier(share)[0].sum()) for share, _, _ in self._shares(s))
+        return total / max(len(self.pairs), 1)
 
     def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """First and second derivatives of the mean by the lengths at each edge's ends.
@@ -96,21 +97,13 @@ class Straying:
         count = max(len(self.pairs), 1)
         return np.concatenate(slopes) / count, np.concatenate(bends) / count
 
-    def _mean(self, values: list[FloatArray]) -> float:
-        return float(sum(one.sum() for one in values)) / max(len(self.pairs), 1)
-
     def _shares(self, s: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """``m/M`` of the edges on each curve, and its first and second derivatives by the ends' lengths."""
-        return [
-            (share / bound, by_ends / bound, by_both / bound)
-            for (chain, tail, head), every, bound in zip(self._edges, self._every(s), self._bounds, strict=True)
-            for share, by_ends, by_both in [_strayed(chain, every[tail], every[head])]
-        ]
-
-    def _every(self, s: FloatArray) -> list[FloatArray]:
-        """Lengths of all vertices on each curve that has edges to look at."""
-        asked = {id(chain) for chain, _, _ in self._edges}
-        return [every for chain, every in self._track.every(s) if id(chain) in asked]
+        found, every = [], self._track.every(s)
+        for (k, tail, head), bound in zip(self._edges, self._bounds, strict=True):
+            share, by_ends, by_both = _strayed(self._track.chains[k], every[k][tail], every[k][head])
+            found.append((share / bound, by_ends / bound, by_both / bound))
+        return found
 
 
 def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:

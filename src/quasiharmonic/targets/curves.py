@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.sliding.curves import Arc, Curve
+from quasiharmonic.sliding.curves import Curve
+from quasiharmonic.sliding.pieces import Arc
 from quasiharmonic.targets.contours import Pieces
 from quasiharmonic.targets.glyphs import Font, glyph_paths
 from quasiharmonic.targets.specification import outline

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import read_text
-from quasiharmonic.sliding.curves import Arc
+from quasiharmonic.sliding.pieces import Arc
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces, as_complex, flatten
 from quasiharmonic.targets.nesting import arranged
 from quasiharmonic.targets.svgpath import parse_path

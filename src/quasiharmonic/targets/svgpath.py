@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.sliding.curves import Arc
+from quasiharmonic.sliding.pieces import Arc
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces
 
 _BLANKS = " \t\r\n\f"
