@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.predicates import _two_product as two_product
-from quasiharmonic.predicates import _two_sum as two_sum
+from quasiharmonic.predicates import two_product, two_sum
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
