@@ -314,6 +314,17 @@ def test_morph(example):
     assert [row["worst mean ratio"] for row in rows] == pytest.approx([0.19, 0.114, 0.08], rel=0.05)
 
 
+def test_channel(example):
+    numbers = example("channel", size=12)
+    for degrees in (30, 60, 90):
+        held, sliding = (numbers[f"{degrees}°"][name] for name in ("held", "sliding"))
+        assert sliding["symmetric Dirichlet"] < 0.75 * held["symmetric Dirichlet"]
+        assert sliding["worst mean ratio"] > held["worst mean ratio"]
+        assert sliding["valid"]
+        assert sliding["bijective"]
+        assert sliding["corners off by"] == sliding["walls off by"] == 0
+
+
 def test_cut(example):
     pytest.importorskip("igl")
     numbers = example("cut")

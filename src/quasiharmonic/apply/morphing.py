@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.mesh.topology import boundary_edges
@@ -66,6 +67,7 @@ def morph(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> Morphed:
     """Move some vertices of a planar mesh and place the others such that no triangle is inverted.
 
@@ -88,6 +90,10 @@ def morph(
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at every iteration.
+    slide : bool or Rails
+        Let the boundary vertices that are not moved glide along their outline, its corners held, as nodes on the walls
+        of a channel do: along the curves of `quasiharmonic.curves.Rails`, or with True along the polygon that the
+        boundary is. Moved ones slide only where ``Rails`` tell them a curve of their own.
 
     Returns
     -------
@@ -131,6 +137,7 @@ def morph(
     fixed, target = _placed(points, F, moved, positions)
     used = np.unique(F)
     problem = Problem(points[used], np.searchsorted(used, F), np.searchsorted(used, fixed), target)
+    rails = _rails(slide, problem, used, np.asarray(moved))
     result = solve(
         problem,
         # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
@@ -139,6 +146,7 @@ def morph(
         max_iterations=max_iterations,
         linear_solver=linear_solver,
         callback=callback,
+        slide=rails,
     )
     after = points.copy()
     after[used] = result.uv
@@ -161,3 +169,15 @@ def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayL
         raise ValueError(f"{named('vertex', 'vertices', idle)} to be moved in no triangle")
     rest = np.setdiff1d(boundary_edges(F, len(points)), given)
     return np.concatenate([given, rest]), np.concatenate([target, points[rest]])
+
+
+def _rails(slide: bool | Rails, problem: Problem, used: IntArray, moved: IntArray) -> bool | Rails:
+    """What the boundary slides along, in the numbers of the vertices that triangles use; those moved are held."""
+    held = np.searchsorted(used, moved)
+    if isinstance(slide, Rails):
+        return slide.among(used).holding(held)
+    if slide is not True:
+        return slide
+    places = np.zeros((problem.n, 2))
+    places[problem.fixed] = problem.target
+    return Rails.around(problem.domain.loops, places, held=held)

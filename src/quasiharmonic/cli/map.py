@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.curves import Rails
     from quasiharmonic.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
@@ -57,6 +58,11 @@ def add_parser(commands: Commands) -> None:
         "100,000 triangles)",
     )
     distortion.add_argument("--no-polish", action="store_true", help="leave the first injective map as it is found")
+    parser.add_argument(
+        "--slide",
+        action="store_true",
+        help="let boundary vertices glide along the outline while distortion is lowered, its corners held",
+    )
     solver = parser.add_argument_group("how it is solved")
     solver.add_argument(
         "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
@@ -74,6 +80,8 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
+    if options.slide and options.no_polish:
+        raise ValueError("--slide moves the boundary while distortion is lowered, which --no-polish forbids")
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     if options.to is not None:
         # The handles of a folder say which vertices its own vt hold.
@@ -84,12 +92,13 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     posed = targets.pose(options, mesh, fixed)
-    problem = posed.problem
-    result = search(problem, options.strategy, options.polish, options.max_iterations, options.linear_solver)
+    problem, slide = posed.problem, posed.slide
+    found = options.strategy, options.polish, options.max_iterations, options.linear_solver
+    result = search(problem, *found, slide=slide if options.polish else False)
     if result.status is Status.INTERRUPTED and not result.history:
         raise KeyboardInterrupt
     if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-        result = smoothed(problem, result)
+        result = smoothed(problem, result, slide)
     certificate = write(options.output, posed.mesh, result)
     with report.after_writing(options.output):
         if options.plot is not None:
@@ -107,7 +116,14 @@ def run(options: argparse.Namespace) -> int:
     return 0 if certificate.injective else 1
 
 
-def search(problem: Problem, strategy: str, polish: str | None, max_iterations: int, linear_solver: str) -> MapResult:
+def search(
+    problem: Problem,
+    strategy: str,
+    polish: str | None,
+    max_iterations: int,
+    linear_solver: str,
+    slide: bool | Rails = False,
+) -> MapResult:
     """Solve with progress on the terminal."""
     from quasiharmonic.cli import progress
     from quasiharmonic.search.inject import solve
@@ -120,20 +136,21 @@ def search(problem: Problem, strategy: str, polish: str | None, max_iterations: 
             max_iterations=max_iterations,
             linear_solver=linear_solver,
             callback=show,
+            slide=slide,
         )
 
 
-def smoothed(problem: Problem, result: MapResult) -> MapResult:
+def smoothed(problem: Problem, result: MapResult, slide: bool | Rails = False) -> MapResult:
     """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
     from quasiharmonic.cli import progress
     from quasiharmonic.energy.polishing import polished
     from quasiharmonic.mesh.shapes import rest_shapes
     from quasiharmonic.result import Status
 
-    if len(problem.F) > LARGEST or rest_shapes(problem.V, problem.F).flat.size:
+    if (len(problem.F) > LARGEST and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
         return result
     with progress.line() as show:
-        smoother = polished(problem, result, energy="blend", max_iterations=STEPS, callback=show)
+        smoother = polished(problem, result, energy="blend", max_iterations=STEPS, callback=show, slide=slide)
     # Nobody asked for convergence, so it is not missed.
     interrupted = smoother.status is Status.INTERRUPTED
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)

@@ -49,6 +49,12 @@ def add_parser(commands: Commands) -> None:
         help="what the placement minimises; none: the first valid mesh (default: symmetric-dirichlet)",
     )
     parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    parser.add_argument(
+        "--slide",
+        action="store_true",
+        help="let boundary vertices that are not moved, or by nothing, glide along the boundary as it is, its corners "
+        "held",
+    )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
@@ -73,6 +79,9 @@ def run(options: argparse.Namespace) -> int:
         with report.about(options.input):
             moved = np.unique(boundary_edges(F, len(mesh.points)))
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
+        if options.slide:
+            goes = (positions != mesh.points[moved]).any(axis=1)
+            moved, positions = moved[goes], positions[goes]
     else:
         moved, positions = _positions(options.positions, len(mesh.points))
     with report.about(options.input), progress.line() as show:
@@ -85,6 +94,7 @@ def run(options: argparse.Namespace) -> int:
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
+            slide=options.slide,
         )
     write_fem(options.output, mesh, morphed.points)
     with report.after_writing(options.output):

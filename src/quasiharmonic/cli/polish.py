@@ -41,6 +41,14 @@ def add_parser(commands: Commands) -> None:
         "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"
     )
     parser.add_argument("--max-iterations", type=arguments.count, default=200, metavar="N", help="(default: 200)")
+    parser.add_argument(
+        "--slide", action="store_true", help="let boundary vertices glide along the outline, its corners held"
+    )
+    parser.add_argument(
+        "--to",
+        metavar="OUTLINE",
+        help="the outline that the boundary is on, as qhm map names it (default: the polygon that the boundary is)",
+    )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
@@ -48,9 +56,13 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, polish, write, judge, report."""
+    if options.to is not None and not options.slide:
+        raise ValueError("--to names the outline to slide along: add --slide")
 
     def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
+        from quasiharmonic.curves import Rails
         from quasiharmonic.energy.polishing import polish_map
+        from quasiharmonic.targets import outline_curves
 
         return polish_map(
             domain,
@@ -59,6 +71,7 @@ def run(options: argparse.Namespace) -> int:
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
+            slide=options.slide if options.to is None else Rails(outline_curves(options.to)),
         )
 
     return improve(options, lower)

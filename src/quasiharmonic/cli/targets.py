@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.curves import Rails
     from quasiharmonic.io import MeshData
     from quasiharmonic.mesh.reference import Reference
     from quasiharmonic.mesh.refinement import Refined
@@ -29,16 +30,20 @@ class Posed:
     ----------
     mesh : MeshData
     problem : Problem
+        Its boundary on the curves it is to slide along, if it is to.
     facts : dict
         What was done, for the report.
     notes : list of str
         The same in sentences.
+    slide : bool or Rails
+        Whether the boundary slides, and along what.
     """
 
     mesh: MeshData
     problem: Problem
     facts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    slide: bool | Rails = False
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -118,6 +123,9 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
                 _check_room(posed.problem, options.to)
     if options.refine:
         _refine(posed, options.reference)
+    if options.slide:
+        with report.about(mesh.source):
+            _slide(options, posed)
     return posed
 
 
@@ -159,6 +167,23 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[ND
         places = boundary_to(mesh.V, mesh.F, contours, corners=corners, corner_angle=angle)
     with report.about(mesh.source):
         return Posed(mesh, Problem(mesh.V, mesh.F, *places, reference=options.reference), facts, notes)
+
+
+def _slide(options: argparse.Namespace, posed: Posed) -> None:
+    """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
+    from quasiharmonic.curves import Rails
+    from quasiharmonic.energy.sliding import moved_onto
+    from quasiharmonic.targets import outline_curves
+
+    posed.slide = True
+    if options.to is not None:
+        posed.slide = Rails(
+            outline_curves(options.to, font=options.font),
+            held=[] if options.corners is None else list(read_corners(options.corners)),
+            corner_angle=20.0 if options.corner_angle is None else options.corner_angle,
+        )
+    posed.problem = moved_onto(posed.slide, posed.problem)
+    posed.facts["slide"] = True
 
 
 def _check_room(problem: Problem, to: str) -> None:

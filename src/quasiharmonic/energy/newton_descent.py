@@ -24,9 +24,9 @@ from quasiharmonic.exact.certificate import is_injective
 from quasiharmonic.result import Status
 
 # Of the step at which the first triangle would collapse.
-_FRACTION = 0.9
+FRACTION = 0.9
 # The step is halved, and then doubled, this often before the direction is given up.
-_HALVINGS = 30
+HALVINGS = 30
 # Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
 # by the first, and where triangles span many orders of magnitude they are as small as that.
 _SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
@@ -62,31 +62,40 @@ class NewtonDescent:
     w : (n,) complex128
         The map, in units.
     first, value : float
-        The energy at the start and now.
+        What is descended, at the start and now.
+    fixed : (k,) int64
+        The vertices that stay.
+    exponent : int
+        Of the unit of computation.
     """
 
     def __init__(
         self, energy: DeformationEnergy, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
     ) -> None:
         self.energy = energy
-        self._fixed, self._pinned = fixed, uv[fixed]
-        self._exponent = exponent
+        self.fixed, self._pinned = fixed, uv[fixed]
+        self.exponent = exponent
         self.w: ComplexArray = in_units(uv, exponent)
-        self.system = NewtonSystem(energy.F, energy.g, len(uv), fixed, linear_solver)
+        self.system = self._system(len(uv), linear_solver)
         self._deformation = self.energy.deform(self.w)
         self.value = self.first = self.energy.value_of(self._deformation)
         self._cut = True
         self._idle = 0
 
+    @property
+    def energies(self) -> tuple[float, float]:
+        """The mean energy at the start and now."""
+        return self.first, self.value
+
     def positions(self, w: ComplexArray) -> FloatArray:
         """A map as the caller gets it, the fixed vertices to the last bit."""
-        uv = np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent)
-        uv[self._fixed] = self._pinned
+        uv = np.ldexp(w.view(np.float64).reshape(-1, 2), self.exponent)
+        uv[self.fixed] = self._pinned
         return uv
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step; a status where there is no other to take."""
-        gradient = self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
+        gradient = self.gradient()
         # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
             direction, promise, newton = self._direction(gradient, negative)
@@ -101,6 +110,14 @@ class NewtonDescent:
                 self._idle = 0 if before - self.value > _IDLE * tolerance * before else self._idle + 1
                 return Status.EXHAUSTED if self._idle >= _PATIENCE else None
         return Status.EXHAUSTED
+
+    def _system(self, n: int, linear_solver: str) -> NewtonSystem:
+        """The matrix of Newton's steps for ``n`` vertices."""
+        return NewtonSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver)
+
+    def gradient(self) -> ComplexArray:
+        """The energy's derivative by the unknowns."""
+        return self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
 
     def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
         """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
@@ -119,7 +136,7 @@ class NewtonDescent:
             return False
         full = np.zeros_like(self.w)
         full[self.system.free] = direction
-        limit = _FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
+        limit = FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
         start, before = self.w, self.value
 
         def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
@@ -130,10 +147,10 @@ class NewtonDescent:
             accepted = value < bound and is_injective(self.energy.F, self.positions(w))
             return value, (w, deformation) if accepted else None
 
-        taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=_HALVINGS)
+        taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=HALVINGS)
         if taken is None:
             # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
-            doublings = int(np.count_nonzero(2.0 ** np.arange(1, _HALVINGS) <= limit))
+            doublings = int(np.count_nonzero(2.0 ** np.arange(1, HALVINGS) <= limit))
             taken = backtrack(trial, before, promise, longest=2.0, tries=doublings, factor=lambda t, value: 2.0)
         if taken is None:
             return False

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, map_array, named, not_negative, real_array, whole_number
+from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.energies import (
     ARAP,
@@ -21,6 +22,7 @@ from quasiharmonic.energy.energies import (
     conformal_area_blend,
 )
 from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
+from quasiharmonic.energy.sliding import SlidingDescent, lay_boundary
 from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
@@ -46,6 +48,7 @@ def polish(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Lower the distortion of an injective map; every step on the way is injective, certified exactly.
 
@@ -81,6 +84,11 @@ def polish(
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at the start and after every step; its ``energy`` is the mean energy.
+    slide : bool or Rails
+        Let boundary vertices glide along the outline, in their order, its corners held: along the curves of
+        `quasiharmonic.curves.Rails`, or with True along the polygon that the boundary is in ``uv``, whose corners are
+        where it turns by 20° or more. Vertices that slide are on their curve up to one rounding; a map that is
+        bijective stays so. The scale is that of the start, whatever little the polygon's area changes.
 
     Returns
     -------
@@ -93,8 +101,9 @@ def polish(
     ------
     ValueError
         When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
-        the message names the triangles. When the energy is not known, not a barrier or without second derivatives,
-        or another option has no such value.
+        the message names the triangles. When the boundary is not on the curves that it is to slide along (see `Rails`),
+        or triangles are inverted once it is on them. When the energy is not known, not a barrier or without second
+        derivatives, or another option has no such value.
 
     Examples
     --------
@@ -121,6 +130,7 @@ def polish(
         tolerance=tolerance,
         linear_solver=linear_solver,
         callback=callback,
+        slide=slide,
     )
     return replace(result, seconds=time.perf_counter() - began)
 
@@ -135,16 +145,20 @@ def polish_map(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Polish a map of a `Domain` at hand; the rest as `polish` has it.
 
-    The domain's ``fixed`` vertices stay where they are in ``uv``.
+    The domain's ``fixed`` vertices stay where they are in ``uv``, or slide.
     """
     began = time.perf_counter()
     chosen = energy_named(energy)
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)
     start = _start(domain, uv)
+    track = lay_boundary(slide, domain, start) if slide is not False else None
+    if track is not None:
+        start = track.uv
     if weights is not None:
         weights = real_array("weights", weights)
         bad = np.flatnonzero(~(weights > 0))
@@ -156,11 +170,14 @@ def polish_map(
         exponent = int(np.frexp(np.abs(start).max())[1])
         area = float(signed_areas(domain.F, in_units(start, exponent)).sum())
         deformation = DeformationEnergy(domain.V, domain.F, chosen, area=area, weights=weights)
-        descent = NewtonDescent(deformation, start, domain.fixed, exponent, linear_solver)
+        if track is None:
+            descent = NewtonDescent(deformation, start, domain.fixed, exponent, linear_solver)
+        else:
+            descent = SlidingDescent(deformation, track, domain.fixed, domain.loops, exponent, linear_solver)
     history: list[Step] = []
 
     def report() -> None:
-        history.append(Step(len(history), 0, descent.value))
+        history.append(Step(len(history), 0, descent.energies[1]))
         if callback is not None:
             callback(history[-1])
 
@@ -185,7 +202,7 @@ def polish_map(
         iterations=max(len(history) - 1, 0),
         seconds=seconds,
         flipped=(0, 0),
-        energy=(descent.first, descent.value),
+        energy=descent.energies,
         kept=descent.value < descent.first,
     )
     return MapResult(
@@ -206,6 +223,7 @@ def polished(
     energy: str | Energy,
     max_iterations: int = 200,
     callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Polish the injective map of a result, by the linear solver that found it; stages and history are continued."""
     further = polish_map(
@@ -215,6 +233,7 @@ def polished(
         max_iterations=max_iterations,
         linear_solver=result.linear_solver,
         callback=callback,
+        slide=slide,
     )
     return replace(
         further,

@@ -156,10 +156,10 @@ def _expanded(x: FloatArray) -> SignArray:
 
 def _components(x: FloatArray) -> FloatArray:
     """Sixteen doubles, as a rule small ones first, whose sum is the determinant exactly; (16, k)."""
-    (ax, bx), (ax_tail, bx_tail) = _two_sum(x[0:4:2], -x[4])
-    (ay, by), (ay_tail, by_tail) = _two_sum(x[1:4:2], -x[5])
+    (ax, bx), (ax_tail, bx_tail) = two_sum(x[0:4:2], -x[4])
+    (ay, by), (ay_tail, by_tail) = two_sum(x[1:4:2], -x[5])
     # (ax + ax_tail)(by + by_tail) − (ay + ay_tail)(bx + bx_tail), product by product, small ones first.
-    product, error = _two_product(
+    product, error = two_product(
         np.stack([ax_tail, -ay_tail, ax_tail, ax, -ay_tail, -ay, ax, -ay]),
         np.stack([by_tail, bx_tail, by, by_tail, bx, bx_tail, by, bx]),
     )
@@ -177,7 +177,7 @@ def _sum(terms: FloatArray) -> FloatArray:
     left = np.arange(terms.shape[1])
     while left.size:
         for i in range(1, len(terms)):
-            terms[i], terms[i - 1] = _two_sum(terms[i], terms[i - 1])
+            terms[i], terms[i - 1] = two_sum(terms[i], terms[i - 1])
         # Doubled, the computed weight of the rest is surely above the true one.
         rest = 2.0 * np.abs(terms[:-1]).sum(axis=0)
         decided = (np.abs(terms[-1]) > rest) | (rest == 0.0)
@@ -186,14 +186,14 @@ def _sum(terms: FloatArray) -> FloatArray:
     return total
 
 
-def _two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+def two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rounded sum and its error: ``a + b`` exactly (Knuth)."""
     total = a + b
     b_part = total - a
     return total, (a - (total - b_part)) + (b - b_part)
 
 
-def _two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+def two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rounded product and its error: ``a * b`` exactly (Dekker, Veltkamp)."""
     product = a * b
     a_high, a_low = _split(a)

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, map_array, named, whole_number
+from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
+from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH
@@ -42,6 +44,7 @@ def injective_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     record: int = 0,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Map a triangle mesh into the plane with no triangle inverted.
 
@@ -74,6 +77,9 @@ def injective_map(
         which ends the search as Ctrl-C does.
     record : int
         Keep the map of every ``record``-th iteration in the result's ``path``; none of them by default.
+    slide : bool or Rails
+        While polishing let boundary vertices glide along their outline, its corners held; see `quasiharmonic.polish`.
+        The boundary of ``target`` is put onto the curves first, if it is off them by a chord.
 
     Returns
     -------
@@ -114,6 +120,7 @@ def injective_map(
         linear_solver=linear_solver,
         callback=callback,
         record=record,
+        slide=slide,
     )
     return replace(result, seconds=time.perf_counter() - began)
 
@@ -128,6 +135,7 @@ def solve(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     record: int = 0,
+    slide: bool | Rails = False,
 ) -> MapResult:
     """Solve a problem at hand.
 
@@ -135,7 +143,7 @@ def solve(
     ----------
     problem : Problem
         It has the kind of reference triangles too, and is not changed but for what it keeps to be solved again sooner.
-    strategy, polish, start, max_iterations, linear_solver, callback, record
+    strategy, polish, start, max_iterations, linear_solver, callback, record, slide
         As of `injective_map`.
 
     Returns
@@ -155,6 +163,10 @@ def solve(
     whole_number("record", record, least=0)
     lower = None if polish is None else energy_named(polish)
     first = None if start is None else _first_map(problem, start)
+    if slide is not False:
+        if lower is None:
+            raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+        problem = moved_onto(slide, problem)
     with problem.exclusive() as own:
         search = Search(own, linear_solver, callback, max_iterations, record, first)
         status = search.run(stages_of(strategy, own))
@@ -174,7 +186,7 @@ def solve(
         reference=search.best_reference,
     )
     if lower is not None and status is Status.INJECTIVE:
-        result = polished(problem, result, energy=lower, callback=callback)
+        result = polished(problem, result, energy=lower, callback=callback, slide=slide)
     return replace(result, seconds=time.perf_counter() - began)
 
 

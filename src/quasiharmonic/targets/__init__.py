@@ -4,6 +4,7 @@ from quasiharmonic.targets.boundary import boundary_to
 from quasiharmonic.targets.chords import flattened_edges
 from quasiharmonic.targets.contours import signed_area
 from quasiharmonic.targets.correspondence import arc_length
+from quasiharmonic.targets.curves import outline_curves
 from quasiharmonic.targets.glyphs import letter, word
 from quasiharmonic.targets.nesting import filled, nested
 from quasiharmonic.targets.outlines import disk, ellipse, rectangle, regular_polygon, ring, star
@@ -21,6 +22,7 @@ __all__ = [
     "letter",
     "nested",
     "outline",
+    "outline_curves",
     "read_polylines",
     "read_svg",
     "rectangle",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.targets.contours import distinct, flatten, signed_area
+from quasiharmonic.targets.contours import Pieces, distinct, flatten, signed_area
 from quasiharmonic.targets.nesting import filled, nested
 
 Font = str | PathLike[str]
@@ -131,6 +131,12 @@ def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
 
 def _contours(text: str, font: Font | None, tolerance: float) -> list[FloatArray]:
     """Contours of a line of text as the font winds them, counterclockwise or not."""
+    contours = [flatten(pieces, tolerance) for pieces in glyph_paths(text, font)]
+    return [contour for contour in contours if len(contour) > 2 and signed_area(contour) != 0]
+
+
+def glyph_paths(text: str, font: Font | None = None) -> list[Pieces]:
+    """The closed paths of lines and Bézier curves that a line of text is drawn by; raises as `letter`."""
     from matplotlib.font_manager import FontProperties, get_font
     from matplotlib.path import Path
     from matplotlib.textpath import text_to_path
@@ -146,14 +152,12 @@ def _contours(text: str, font: Font | None, tolerance: float) -> list[FloatArray
     points, codes = text_to_path.get_text_path(FontProperties(fname=file), text)
     if len(codes) == 0:
         return []
-    path = Path(np.asarray(points) / text_to_path.FONT_SCALE, codes)
-    contours = [flatten(pieces, tolerance) for pieces in _pieces(path)]
-    return [contour for contour in contours if len(contour) > 2 and signed_area(contour) != 0]
+    return _pieces(Path(np.asarray(points) / text_to_path.FONT_SCALE, codes))
 
 
-def _pieces(path: Any) -> list[list[FloatArray]]:
+def _pieces(path: Any) -> list[Pieces]:
     """Take a matplotlib path of lines and Bézier curves apart into its closed parts."""
-    parts: list[list[FloatArray]] = []
+    parts: list[Pieces] = []
     here = np.zeros((0, 2))
     for flat, code in path.iter_segments(simplify=False):
         control = flat.reshape(-1, 2)

@@ -11,11 +11,13 @@ import math
 import os
 import re
 from collections.abc import Callable
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray
+from quasiharmonic.curves.pieces import Arc
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import read_text
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces, as_complex, flatten
@@ -74,10 +76,7 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     """
     if not 1e-7 <= tolerance < 1:
         raise ValueError(f"the tolerance is a share of the drawing's size, from 1e-7 to below 1, not {tolerance}")
-    if os.path.isfile(path) and os.path.getsize(path) > MOST_BYTES:
-        raise MeshFileError(path, f"is larger than {MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
-    with np.errstate(over="ignore", invalid="ignore"):
-        subpaths = _Drawing(path).read(read_text(path))
+    subpaths = svg_paths(path)
     controls = [control for pieces in subpaths for control in pieces]
     if not controls:
         raise MeshFileError(path, "draws no path or shape")
@@ -101,6 +100,14 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
         raise MeshFileError(path, f"{error} (in units of the drawing, the y-axis upwards)") from None
 
 
+def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Pieces]:
+    """The paths that an SVG file draws, as `read_svg` reads it; with ``arcs`` as `parse_path` has them."""
+    if os.path.isfile(path) and os.path.getsize(path) > MOST_BYTES:
+        raise MeshFileError(path, f"is larger than {MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _Drawing(path, arcs).read(read_text(path))
+
+
 def _breadth(contour: FloatArray) -> float:
     """Area of the triangles that a contour's sides span with its first point: 0 only if all lies on one line."""
     w = as_complex(contour - contour[0])
@@ -110,9 +117,9 @@ def _breadth(contour: FloatArray) -> float:
 class _Drawing:
     """Walks through the elements of a drawing and collects its paths, transformed."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = path
-        self.subpaths: list[Pieces] = []
+    def __init__(self, path: str | os.PathLike[str], arcs: bool) -> None:
+        self.path, self.arcs = path, arcs
+        self.subpaths: list[list[Any]] = []
         self.count = 0
         # A transform of homogeneous points for every open container.
         self.transforms = [np.diag([1.0, -1.0, 1.0])]
@@ -197,11 +204,14 @@ class _Drawing:
         self.depth -= 1
 
     def _add(self, d: str, transform: FloatArray) -> None:
-        for pieces in parse_path(d):
+        matrix, shift = transform[:2, :2], transform[:2, 2]
+        for pieces in parse_path(d, arcs=self.arcs):
             self.count += len(pieces)
             if self.count > MOST_POINTS:
                 raise ValueError(f"more than {MOST_POINTS:,} pieces in all")
-            self.subpaths.append([control @ transform[:2, :2].T + transform[:2, 2] for control in pieces])
+            self.subpaths.append(
+                [p.transformed(matrix, shift) if isinstance(p, Arc) else p @ matrix.T + shift for p in pieces]
+            )
 
 
 def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> FloatArray:

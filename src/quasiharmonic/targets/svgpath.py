@@ -8,9 +8,11 @@ from __future__ import annotations
 import cmath
 import math
 import re
+from typing import Any
 
 import numpy as np
 
+from quasiharmonic.curves.pieces import Arc
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces
 
 _BLANKS = " \t\r\n\f"
@@ -20,13 +22,15 @@ _ARGUMENTS = {"M": "xx", "L": "xx", "H": "x", "V": "x", "C": "x" * 6, "S": "x" *
 _ARGUMENTS |= {"A": "xxxFFxx", "Z": ""}
 
 
-def parse_path(d: str) -> list[Pieces]:
+def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
     """Read path data.
 
     Parameters
     ----------
     d : str
         Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as [1]_ has them.
+    arcs : bool
+        Leave arcs what they are, as `quasiharmonic.curves.Arc`.
 
     Returns
     -------
@@ -39,7 +43,7 @@ def parse_path(d: str) -> list[Pieces]:
     ValueError
         With the place, where the data break the rules.
     """
-    pen = _Pen()
+    pen = _Pen(arcs)
     scan = _Scanner(d)
     command = ""
     while (token := scan.command(command)) is not None:
@@ -106,9 +110,11 @@ class _Scanner:
 class _Pen:
     """Follows the commands of a path; points are complex numbers x + iy."""
 
-    def __init__(self) -> None:
-        self.subpaths: list[Pieces] = []
+    def __init__(self, arcs: bool) -> None:
+        # Control points, and arcs if they are left what they are.
+        self.subpaths: list[list[Any]] = []
         self.count = 0
+        self.arcs = arcs
         self.here = self.start = 0j
         # The last control point of the curve before, and of which kind it was.
         self.control = 0j
@@ -183,6 +189,12 @@ class _Pen:
         def outward(z: complex) -> complex:
             return centre + axis * complex(z.real * rx, z.imag * ry)
 
+        if self.arcs:
+            rows = np.array([centre, axis * rx, 1j * axis * ry]).view(np.float64).reshape(-1, 2)
+            self.subpaths[-1].append(Arc(rows[0], rows[1], rows[2], first, first + angle))
+            self.here = end
+            self.count += 1
+            return
         # A cubic curve strays from a circle by 6.6e-8 of the radius on a sixteenth of it.
         steps = max(1, math.ceil(abs(angle) / (math.pi / 8)))
         lever = 1j * 4 / 3 * math.tan(angle / steps / 4)

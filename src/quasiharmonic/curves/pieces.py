@@ -1,0 +1,147 @@
+"""What curves are made of: lines, Bézier curves and elliptic arcs; their points in twice the digits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.exact.predicates import two_product, two_sum
+
+# The longest arc, so that few nodes integrate its length to rounding.
+_LONGEST_ARC = np.pi / 4
+# Radians by which a chord's piece bends.
+_FLAT = 0.1
+# Nodes of Gauss' formula for a length.
+_NODES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """An elliptic arc ``centre + a cos θ + b sin θ`` from one angle to another.
+
+    Attributes
+    ----------
+    centre, a, b : (2,) float
+        ``a`` and ``b`` of equal length and at right angles make a circle; any others an ellipse.
+    first, last : float
+        Radians; the arc runs clockwise where ``last`` is the smaller.
+    """
+
+    centre: ArrayLike
+    a: ArrayLike
+    b: ArrayLike
+    first: float
+    last: float
+
+    def transformed(self, matrix: FloatArray, shift: FloatArray) -> Arc:
+        """The arc after ``x → matrix @ x + shift``, an elliptic arc again."""
+        centre, a, b = (matrix @ np.asarray(x, dtype=np.float64) for x in (self.centre, self.a, self.b))
+        return Arc(centre + shift, a, b, self.first, self.last)
+
+
+class Piece(NamedTuple):
+    """A piece as curves keep it.
+
+    Attributes
+    ----------
+    degree : int
+        Of a Bézier curve; 0 for an arc.
+    control : (4,) complex128
+        Control points, or centre and axes; zeros behind.
+    angles : (float, float)
+        Of an arc.
+    within : bool
+        Whether it is a later part of an arc.
+    """
+
+    degree: int
+    control: ComplexArray
+    angles: tuple[float, float]
+    within: bool
+
+
+def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
+    """Piece ``i`` of a curve, checked; long arcs in several."""
+    if isinstance(piece, Arc):
+        rows = [np.asarray(x, dtype=np.float64) for x in (piece.centre, piece.a, piece.b)]
+        if any(row.shape != (2,) for row in rows):
+            raise ValueError(f"piece {i} of the curve: an arc has a centre and two axes of shape (2,)")
+        control, ends = np.stack(rows), (float(piece.first), float(piece.last))
+    else:
+        control, ends = np.array(piece, dtype=np.float64), (0.0, 0.0)
+        if control.ndim != 2 or control.shape[1] != 2 or not 2 <= len(control) <= 4:
+            raise ValueError(f"piece {i} of the curve must have shape (2, 2), (3, 2) or (4, 2), not {control.shape}")
+    if not (np.isfinite(control).all() and np.isfinite(ends).all()):
+        raise ValueError(f"piece {i} of the curve is not finite")
+    four = np.zeros(4, dtype=np.complex128)
+    four[: len(control)] = as_complex(control)
+    if not isinstance(piece, Arc):
+        return [Piece(len(control) - 1, four, ends, False)]
+    steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
+    angles = np.linspace(*ends, steps + 1).tolist()
+    return [Piece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
+
+
+def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
+    """Chords into which a piece is taken apart so that each bends little."""
+    if degree == 1:
+        return 1
+    if degree == 0:
+        return int(max(1, np.ceil(abs(angles[1] - angles[0]) / _FLAT)))
+    sides = np.diff(control[: degree + 1])
+    sides = sides[sides != 0]
+    bends = np.abs(np.angle(sides[1:] / sides[:-1])).sum()
+    # The handles' bends are spread unevenly over the parameter.
+    return int(max(4, 2 * np.ceil(bends / _FLAT)))
+
+
+def as_complex(points: ArrayLike) -> ComplexArray:
+    """Points (k, 2) as complex numbers (k,)."""
+    return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
+
+
+def angle_at(angles: FloatArray, t: FloatArray) -> FloatArray:
+    """Angles on arcs (k, 2) at parameters from 0 to 1."""
+    return angles[:, 0] + t * (angles[:, 1] - angles[:, 0])
+
+
+def on_bezier(control: FloatArray, t: FloatArray) -> FloatArray:
+    """De Casteljau's construction in twice the digits, rounded; control (k, degree + 1, 2), t (k,)."""
+    t = t[:, None]
+    high, low = np.moveaxis(control, 1, 0), np.zeros((control.shape[1], len(t), 2))
+    u, u_low = two_sum(np.ones_like(t), -t)
+    while len(high) > 1:
+        left, left_low = two_product(u, high[:-1])
+        right, right_low = two_product(t, high[1:])
+        total, lost = two_sum(left, right)
+        low = lost + left_low + right_low + (u_low * high[:-1] + u * low[:-1] + t * low[1:])
+        high, low = two_sum(total, low)
+    return np.asarray(high[0])
+
+
+def on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
+    """``centre + a cos θ + b sin θ`` in twice the digits, rounded; control (k, 4, 2), angle (k,)."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    # A cosine and a sine as rounded lie off the unit circle; put back onto it they belong to an angle beside the one
+    # that was meant, which nobody minds.
+    (cc, cc_low), (ss, ss_low) = two_product(cos, cos), two_product(sin, sin)
+    square, square_low = two_sum(cc, ss)
+    off = ((square - 1) + (square_low + cc_low + ss_low)) / 2
+    centre, a, b = control[:, 0], control[:, 1], control[:, 2]
+    (along_a, a_low), (along_b, b_low) = two_product(cos, a), two_product(sin, b)
+    one, one_low = two_sum(along_a, along_b)
+    two, two_low = two_sum(one, centre)
+    return np.asarray(two + (two_low + one_low + a_low + b_low - off * one))
+
+
+@cache
+def gauss() -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights of Gauss' formula on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    return (nodes + 1) / 2, weights / 2
