@@ -47,13 +47,13 @@ def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> Complex
     w = w.copy()
     for number in reversed(range(len(coarsening.rounds))):
         for vertices, rings in coarsening.rounds[number]:
-            w[vertices] = _places(w[rings])
+            w[vertices] = places(w[rings])
         if number in coarsening.levels:
             _smooth(w, coarsening.levels[number], held)
     return w
 
 
-def _places(ring: ComplexArray) -> ComplexArray:
+def places(ring: ComplexArray) -> ComplexArray:
     """Where to put a vertex into each ring; (r,) from (r, d), the apex first."""
     place = ring.mean(axis=1)
     poor = np.flatnonzero(~(_shape(place, ring) < _GOOD * ring.shape[1]))

@@ -1,0 +1,2 @@
+"""stub"""
+def coarse_start(*a): return None

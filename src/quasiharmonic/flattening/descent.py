@@ -1,0 +1,225 @@
+"""Newton's steps down the energy of a map whose boundary is free; where asked, without overlap on the way.
+
+One vertex is held, or the map could drift. It may turn: the raised diagonal of the Newton system takes care of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.deformation_energy import DeformationEnergy
+from quasiharmonic.energies import Deformation, Energy, QuadraticForm
+from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.flattening.reweighted import ReweightedDirichlet
+from quasiharmonic.newton_descent import NewtonDescent
+from quasiharmonic.newton_system import NewtonSystem
+from quasiharmonic.result import Status
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
+
+# Contacts weigh this much of the surface's mean energy, each against one triangle of mean size, and then less and less:
+# what is left of them when they no longer matter is far below a map's usual distance from its minimum.
+_WEIGHTS = 1e-2, 1e-3, 1e-4
+# ... where the energy is next to nothing as if it were this.
+_LEAST_ENERGY = 1e-4
+# A step may take the narrowest gap down to this share of what it was, or of its reach.
+_NARROWER = 0.3
+
+
+class _Moment(NamedTuple):
+    """A map as a `GuardedEnergy` reads it."""
+
+    surface: Deformation
+    w: ComplexArray
+
+
+class GuardedEnergy:
+    """The energy of a surface and of the contacts of its boundary with itself, as `NewtonDescent` asks for it.
+
+    Parameters
+    ----------
+    surface : DeformationEnergy
+
+    Attributes
+    ----------
+    contacts : Contacts
+    stiffness : float
+        The factor on each contact's barrier.
+    """
+
+    def __init__(self, surface: DeformationEnergy) -> None:
+        self.surface = surface
+        self.F, self.g = surface.F, surface.g
+        self.contacts, self.stiffness = Contacts.none(), 0.0
+
+    def deform(self, w: ComplexArray) -> _Moment:
+        """What the other methods read of a map."""
+        return _Moment(self.surface.deform(w), w)
+
+    def value_of(self, moment: _Moment) -> float:
+        """The mean energy of the surface, and the barriers."""
+        return self.surface.value_of(moment.surface) + self.stiffness * self.contacts.value(moment.w)
+
+    def gradient_of(self, moment: _Moment, n: int) -> ComplexArray:
+        """The derivative by ``n`` positions; (n,) complex128."""
+        return self.surface.gradient_of(moment.surface, n) + self.stiffness * self.contacts.gradient(moment.w)
+
+    def curvature_of(self, moment: _Moment, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivatives on the surface's triangles, and then on the contacts'."""
+        surface = self.surface.curvature_of(moment.surface, negative=negative)
+        between = self.contacts.curvature(moment.w).scaled(np.full(self.contacts.reach.shape, self.stiffness))
+        fields = zip(vars(surface).values(), vars(between).values(), strict=True)
+        return QuadraticForm(*(np.concatenate(both) for both in fields))
+
+    def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
+        """How far along a direction each of the surface's triangles first vanishes."""
+        return self.surface.steps_to_collapse(w, direction)
+
+
+class FreeDescent(NewtonDescent):
+    """Steps of a map of which nothing but one vertex is held.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+    uv : (n, 2) float64
+        An injective map, of about unit size.
+    linear_solver : str
+    """
+
+    def __init__(self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str) -> None:
+        super().__init__(energy, uv, np.zeros(1, dtype=np.int64), 0, linear_solver)
+
+    @property
+    def uv(self) -> FloatArray:
+        """The map at hand; (n, 2) float64."""
+        return self.positions(self.w)
+
+    @property
+    def surface(self) -> DeformationEnergy:
+        """The energy of the surface alone."""
+        return self.energy
+
+    @property
+    def distortion(self) -> float:
+        """The value of the surface's energy alone."""
+        return self.value
+
+    def turn_to(self, density: Energy) -> None:
+        """Go on with another density on the same triangles."""
+        self.surface.energy = density
+        self.value = self.energy.value_of(self._deformation)
+        self._cut, self._idle = True, 0
+
+    def ease(self) -> bool:
+        """Make what only guards the map count for less; False if it cannot."""
+        return False
+
+
+class GuardedDescent(FreeDescent):
+    """Steps of a map that stays bijective.
+
+    Parameters
+    ----------
+    energy, uv, linear_solver
+        As `FreeDescent` has them; the map is bijective.
+    rim : Rim
+        The surface's boundary.
+    """
+
+    energy: GuardedEnergy  # type: ignore[assignment]
+
+    def __init__(self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str, rim: Rim) -> None:
+        self._rim, self._linear_solver = rim, linear_solver
+        self._weights = iter(_WEIGHTS)
+        self._weight = next(self._weights)
+        self._distortion = np.inf
+        super().__init__(GuardedEnergy(energy), uv, linear_solver)  # type: ignore[arg-type]
+        self._distortion = self.value
+        self._near = rim.contacts(self.w)
+        self._known = Contacts.none().corners
+
+    @property
+    def surface(self) -> DeformationEnergy:
+        """The energy of the surface alone."""
+        return self.energy.surface
+
+    @property
+    def distortion(self) -> float:
+        """The value of the surface's energy alone."""
+        return self.energy.surface.value_of(self._deformation.surface)  # type: ignore[attr-defined]
+
+    def ease(self) -> bool:
+        """Lower the weight of the contacts; False at the last."""
+        weight = next(self._weights, None)
+        if weight is None:
+            return False
+        self._weight, self._idle = weight, 0
+        return True
+
+    def step(self, tolerance: float) -> Status | None:
+        """Take one step, with the contacts there are now."""
+        repelling = self._near.within(self.w, 1.0).among(self._known, self.w.size)
+        if repelling is None:
+            # The pattern of the system gets those that may come as well, so that it lasts for some steps.
+            self._known = self._near.corners
+            F = np.concatenate([self.energy.F, self._known.T])
+            g = np.concatenate([self.energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
+            self.system = NewtonSystem(F, g, self.w.size, self._fixed, self._linear_solver)
+        known = self._near.among(self._known, self.w.size)
+        self.energy.contacts = known if known is not None else repelling
+        self.energy.stiffness = self._weight * max(self.distortion, _LEAST_ENERGY) / len(self.energy.F)
+        self.value = self.energy.value_of(self._deformation)
+        return super().step(tolerance)
+
+    def _accept(self, w: ComplexArray, bound: float) -> bool:
+        """Go there if, besides, the boundary does not meet itself, exactly, and no gap becomes much narrower."""
+        before = self.w, self._deformation, self.value
+        if super()._accept(w, bound):
+            if not self._rim.meets_itself(self.positions(w)):
+                near = self._rim.contacts(w)
+                if near.room(w) >= _NARROWER * min(self._near.room(before[0]), _NARROWER):
+                    self._near = near
+                    return True
+            self.w, self._deformation, self.value = before
+        return False
+
+
+def descend(descent: FreeDescent, density: Energy, tolerance: float) -> Iterator[Status | None]:
+    """Take steps until there is no other to take.
+
+    Parameters
+    ----------
+    descent : FreeDescent
+        At its start. If its energy's density is `ReweightedDirichlet`, it is held to that as long as two steps
+        together at least halve it.
+    density : Energy
+        What is lowered.
+    tolerance : float
+        As `quasiharmonic.polish` has it.
+
+    Yields
+    ------
+    Status or None
+        After every step; a status after the last.
+    """
+    values = [np.inf, descent.distortion]
+    far = isinstance(descent.surface.energy, ReweightedDirichlet)
+    while True:
+        with np.errstate(all="ignore"):
+            outcome = descent.step(tolerance)
+        values.append(descent.distortion)
+        if far and (outcome is not None or not values[-1] < 0.5 * values[-3]):
+            far, outcome = False, None
+            descent.turn_to(density)
+        elif outcome is not None and descent.ease():
+            outcome = None
+        yield outcome
+        if outcome is not None:
+            return

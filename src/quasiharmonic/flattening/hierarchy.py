@@ -1,0 +1,218 @@
+"""Coarse meshes of a surface whose boundary is coarsened too, and the way back.
+
+Each boundary loop is filled by a fan around a vertex of its own, its *hub*, which makes the boundary's vertices interior
+ones and lets `quasiharmonic.mesh.coarsening` take them out as any other; hubs stay, and no new edge ends at
+them. So what is left without the hubs is a coarse mesh with coarse loops.
+
+On the way back a vertex goes to where the surface says that it is. Its ring is laid out flat around it, by the angles
+and lengths at rest; the affine map that takes the ring nearest to where it is now takes the vertex along. That
+is exact where the map is affine. Where it inverts a triangle the vertex goes where its triangles are
+best shaped, as in `quasiharmonic.prolongation`: inside of its ring, and of the coarse surface's image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.mesh.coarsening import coarsen
+from quasiharmonic.mesh.topology import trace_loops
+from quasiharmonic.prolongation import places
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+
+# The affine map is held to a similarity where the ring does not say otherwise, with this weight.
+_RIGID = 1e-2
+# A vertex keeps its place if none of its triangles has less than this share of the area that it has laid out flat.
+_LEAST = 0.05
+# Angles around a vertex of the boundary add up to this at most when its ring is laid out.
+_WIDEST = 1.9 * np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One mesh of a hierarchy, with vertices numbered for itself.
+
+    Attributes
+    ----------
+    vertices : (m,) int64
+        Its vertices as the finest mesh numbers them, ascending.
+    F : (f, 3) int64
+    loops : list of (l,) int64
+    """
+
+    vertices: IntArray
+    F: IntArray
+    loops: list[IntArray]
+
+
+class Hierarchy:
+    """Coarser and coarser meshes of a surface.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+        Rest positions, of about unit size.
+    F : (f, 3) int64
+        Triangles of a connected surface.
+    loops : list of (l,) int64
+        Its boundary loops.
+    goal : int
+        How many vertices the coarsest mesh is to have; it has more where no other can be taken out.
+    """
+
+    def __init__(self, V: FloatArray, F: IntArray, loops: list[IntArray], goal: int) -> None:
+        self._V = V
+        self._n = n = len(V)
+        hubs = [
+            np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)
+        ]
+        held = np.zeros(n + len(loops), dtype=bool)
+        held[n:] = True
+        self._coarsening = coarsen(np.concatenate([F, *hubs]), held.size, held, goal + len(loops))
+        self._rounds = len(self._coarsening.rounds)
+        # Where there are meshes: before some of the rounds, and after the last.
+        self.stops = [*sorted(self._coarsening.levels), self._rounds]
+
+    def level(self, stop: int) -> Level:
+        """The mesh after so many rounds, one of `stops`."""
+        T = self._coarsening.F if stop == self._rounds else self._coarsening.levels[stop]
+        T = T[(T < self._n).all(axis=1)]
+        used = np.zeros(self._n, dtype=bool)
+        used[T] = True
+        vertices = np.flatnonzero(used)
+        number = np.full(self._n, -1)
+        number[vertices] = np.arange(vertices.size)
+        F = number[T]
+        return Level(vertices, F, _loops(F, vertices.size))
+
+    def prolong(self, w: ComplexArray, start: int, stop: int, *, inside: float | None = None) -> ComplexArray:
+        """Carry a map from the mesh at one stop to a finer one.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+            By the numbers of the finest mesh; those of the mesh at ``start`` are read.
+        start, stop : int
+            Stops, ``stop < start``.
+        inside : float, optional
+            Put vertices of the boundary within the coarse image, ears so high above the edge they stand on, as a
+            share of its length: small enough, and the map is bijective if it was. By default they go where the
+            surface says.
+
+        Returns
+        -------
+        (n,) complex128
+        """
+        w = w.copy()
+        for number in reversed(range(stop, start)):
+            for vertices, rings in self._coarsening.rounds[number]:
+                at_rim = (rings >= self._n).any(axis=1)
+                for some, rim in ((~at_rim, False), (at_rim, True)):
+                    if some.any():
+                        ring = self._opened(rings[some]) if rim else rings[some]
+                        w[vertices[some]] = self._placed(w, vertices[some], ring, rim, inside)
+        return w
+
+    def _opened(self, rings: IntArray) -> IntArray:
+        """Rings of vertices of the boundary without their hubs, from one end to the other."""
+        hub = (rings >= self._n).argmax(axis=1)
+        turn = (hub[:, None] + 1 + np.arange(rings.shape[1] - 1)) % rings.shape[1]
+        return np.take_along_axis(rings, turn, axis=1)
+
+    def _placed(
+        self, w: ComplexArray, vertices: IntArray, ring: IntArray, rim: bool, inside: float | None
+    ) -> ComplexArray:
+        flat = self._laid_out(vertices, ring, rim)
+        around = w[ring]
+        place = _carried(flat, around)
+        if rim and ring.shape[1] == 2:
+            if inside is not None:
+                # The ear lies to the left of x₁ → x₂, and all else to the right.
+                side = around[:, 1] - around[:, 0]
+                place = around[:, 0] + (0.5 + 1j * inside) * side
+            return place
+        good = _keeps_shape(flat, place, around, rim)
+        if rim and inside is not None:
+            good[:] = False
+        poor = np.flatnonzero(~good)
+        if poor.size:
+            # Of an open ring either end may be the apex of the fan that fills it.
+            apex_last = around[poor] if not rim else np.where(
+                _fan_positive(around[poor])[:, None], around[poor], np.roll(around[poor], 1, axis=1)
+            )
+            place[poor] = places(apex_last)
+        return place
+
+    def _laid_out(self, vertices: IntArray, ring: IntArray, rim: bool) -> ComplexArray:
+        """Rings at rest, laid out flat around their vertices; (r, d) complex128, of about unit size."""
+        arm = self._V[ring] - self._V[vertices][:, None]
+        length = np.linalg.norm(arm, axis=2)
+        following = np.roll(arm, -1, axis=1)
+        cross = np.linalg.norm(np.cross(arm, following), axis=2)
+        angle = np.arctan2(cross, (arm * following).sum(axis=2))
+        if rim:
+            angle = angle[:, :-1]
+        total = angle.sum(axis=1)
+        wanted = np.minimum(total, _WIDEST) if rim else np.full(total.shape, 2 * np.pi)
+        angle = angle * (wanted / np.where(total > 0, total, 1))[:, None]
+        turned = np.zeros(ring.shape)
+        turned[:, 1:] = np.cumsum(angle if rim else angle[:, :-1], axis=1)
+        size = length.mean(axis=1)
+        return length / np.where(size > 0, size, 1)[:, None] * np.exp(1j * turned)
+
+
+def _loops(F: IntArray, n: int) -> list[IntArray]:
+    from quasiharmonic.mesh.topology import edges
+
+    return trace_loops(edges(F, n).boundary)
+
+
+def _carried(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
+    """Where the affine maps that take flat rings nearest to given ones take their centres; (r,) complex128."""
+    weight = 1 / (flat.real**2 + flat.imag**2 + 1e-12)
+    columns = np.stack([np.ones(flat.shape, dtype=np.complex128), flat, flat.conj()], axis=2)
+    weighted = columns.conj() * weight[:, :, None]
+    normal = np.swapaxes(weighted, 1, 2) @ columns
+    scale = weight.sum(axis=1)
+    normal[:, 2, 2] += _RIGID * scale
+    normal[:, (0, 1), (0, 1)] += 1e-12 * scale[:, None]
+    middle = around.mean(axis=1)
+    load = np.einsum("rdk,rd->rk", weighted, around - middle[:, None])
+    return middle + np.linalg.solve(normal, load[:, :, None])[:, 0, 0]
+
+
+def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, rim: bool) -> BoolArray:
+    """Whether no triangle around a vertex has lost most of the area that it should have."""
+    now, then = around - place[:, None], flat
+    last = -1 if rim else None
+    area = (now.conj() * np.roll(now, -1, axis=1)).imag[:, :last]
+    rest = (then.conj() * np.roll(then, -1, axis=1)).imag[:, :last]
+    scale = area.sum(axis=1) / rest.sum(axis=1)
+    good: BoolArray = (area > _LEAST * scale[:, None] * np.maximum(rest, 0)).all(axis=1) & (area > 0).all(axis=1)
+    return good
+
+
+def _fan_positive(ring: ComplexArray) -> BoolArray:
+    """Whether the fan from the first vertex of each ring has only positive triangles."""
+    arm = ring[:, 1:] - ring[:, :1]
+    positive: BoolArray = ((arm[:, :-1].conj() * arm[:, 1:]).imag > 0).all(axis=1)
+    return positive
+
+
+def spread(level: Level, w: ComplexArray, n: int) -> ComplexArray:
+    """A map of a level by the numbers of the finest mesh; (n,) complex128, zero elsewhere."""
+    out = np.zeros(n, dtype=np.complex128)
+    out[level.vertices] = w
+    return out
+
+
+def stations(hierarchy: Hierarchy, ratio: float) -> Iterator[int]:
+    """Stops from the coarsest to the finest, each with so many times the vertices of the one before."""
+    raise NotImplementedError

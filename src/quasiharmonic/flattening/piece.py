@@ -1,0 +1,240 @@
+"""One connected surface on its way into the plane."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.certificate import certify, is_injective
+from quasiharmonic.deformation_energy import DeformationEnergy, signed_areas
+from quasiharmonic.energies import Energy
+from quasiharmonic.flattening.cascade import coarse_start
+from quasiharmonic.flattening.contacts import Rim
+from quasiharmonic.flattening.descent import FreeDescent, GuardedDescent, descend
+from quasiharmonic.flattening.reweighted import ReweightedDirichlet
+from quasiharmonic.flattening.start import disk_start
+from quasiharmonic.mesh.topology import counted
+from quasiharmonic.newton_descent import in_units
+from quasiharmonic.problem import Problem
+from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# From so many triangles on the start is flattened by way of coarse meshes.
+_COARSE_FROM = 50_000
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a caller of `flatten` has chosen, checked.
+
+    Attributes
+    ----------
+    density : Energy
+    name : str
+        Of the energy.
+    tolerance : float
+    max_iterations : int
+    linear_solver : str
+    callback : callable or None
+    record : int
+    """
+
+    density: Energy
+    name: str
+    tolerance: float
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    record: int
+
+
+class Piece:
+    """A connected surface that can be flattened, in a unit near its size.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+    F : (f, 3) array of int
+
+    Raises
+    ------
+    ValueError
+        As `Problem`; where the surface has handles, or a triangle no area.
+
+    Attributes
+    ----------
+    V : (n, 3) float64
+        Positions in units of ``2 ** exponent``.
+    F : (f, 3) int64
+    loops : list of (l,) int64
+        Boundary loops.
+    exponent : int
+    area : float
+        The surface's, in square units.
+    """
+
+    def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
+        everywhere = np.arange(len(np.asarray(V)))
+        problem = Problem(V, F, everywhere, np.zeros((everywhere.size, 2)), reference="equilateral")
+        self.F, self.loops = problem.F, problem.loops
+        handles, odd = divmod(self._missing(problem), 2)
+        if handles or odd:
+            raise ValueError(
+                f"the surface has {counted('handle', 'handles', handles)} and cannot lie in the plane: "
+                "cut it open first (cut_open; qhm flatten --cut)"
+            )
+        self.exponent = int(np.frexp(np.abs(problem.V).max())[1])
+        self.V = np.zeros((problem.n, 3))
+        self.V[:, : problem.V.shape[1]] = np.ldexp(problem.V, -self.exponent)
+
+        corners = self.V[self.F]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+
+    @staticmethod
+    def _missing(problem: Problem) -> int:
+        """What the Euler characteristic is short of a disk's with as many holes: two for each handle."""
+        found = problem.edges
+        euler = problem.n - len(found.interior) - len(found.boundary) + len(problem.F)
+        return 2 - len(problem.loops) - euler
+
+    def energy(self, density: Energy, weights: FloatArray | None) -> DeformationEnergy:
+        """The energy of its maps."""
+        return DeformationEnergy(self.V, self.F, density, weights=weights)
+
+
+class Flattening:
+    """The descent of one surface's map, and what is to be told of it.
+
+    Parameters
+    ----------
+    piece : Piece
+    settings : Settings
+    weights : (f,) float64 or None
+    """
+
+    def __init__(self, piece: Piece, settings: Settings, weights: FloatArray | None) -> None:
+        self._piece, self._settings, self._weights = piece, settings, weights
+        self._rim = Rim(piece.loops)
+        self._measure = piece.energy(settings.density, weights)
+        self._bijective: FloatArray | None = None
+        self._solver = ""
+        self._stages: list[Stage] = []
+        self._history: list[Step] = []
+        self._path: list[Snapshot] = []
+
+    def run(self, start: FloatArray | None) -> MapResult:
+        """Flatten, from an injective map (n, 2) in the piece's unit or from one of the library's own.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            Before there is a first bijective map.
+        """
+        began = time.perf_counter()
+        try:
+            status = self._descended(start)
+        except KeyboardInterrupt:
+            if self._bijective is None:
+                raise
+            status = Status.INTERRUPTED
+        assert self._bijective is not None
+        return MapResult(
+            uv=self._bijective,
+            status=status,
+            certificate=certify(self._piece.F, self._bijective, loops=self._piece.loops),
+            stages=self._stages,
+            history=self._history,
+            path=self._path,
+            linear_solver=self._solver,
+            seconds=time.perf_counter() - began,
+        )
+
+    def _descended(self, start: FloatArray | None) -> Status:
+        """Descend freely, and once more with the boundary guarded if it has ended on itself."""
+        if start is not None:
+            status = self._descent(self._in_scale(start), guarded=False, near=False)
+            if status is not None:
+                return status
+        if self._bijective is None:
+            # Nothing given, or what was given overlapped itself from its beginning to its end.
+            own, near = self._own_start()
+            status = self._descent(own, guarded=False, near=near)
+            if status is not None:
+                return status
+        assert self._bijective is not None
+        status = self._descent(self._bijective, guarded=True, near=True)
+        assert status is not None
+        return status
+
+    def _own_start(self) -> tuple[FloatArray, bool]:
+        """A bijective map, and whether it is near its best already."""
+        began = time.perf_counter()
+        piece, solver = self._piece, self._settings.linear_solver
+        uv, near = None, False
+        if len(piece.F) < _COARSE_FROM:
+            uv = disk_start(piece.V, piece.F, piece.loops, solver)
+        if uv is None:
+            uv, near = coarse_start(piece.V, piece.F, piece.loops, solver), True
+        if uv is None:
+            raise ValueError(
+                "no bijective map to start from was found within double precision: the triangles differ too much in "
+                "size; give one by start"
+            )
+        uv = self._in_scale(uv)
+        energy = self._measure.value(in_units(uv, 0))
+        self._stages.append(Stage("start", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
+        return uv, near
+
+    def _in_scale(self, uv: FloatArray) -> FloatArray:
+        """A map scaled to the surface's area."""
+        centred = uv - uv.mean(axis=0)
+        area = float(signed_areas(self._piece.F, in_units(centred, 0)).sum())
+        scaled = centred * np.sqrt(self._piece.area / area)
+        return scaled if is_injective(self._piece.F, scaled) else uv
+
+    def _descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
+        """Descend from a map, which is bijective if the descent is guarded; None where the end overlaps itself."""
+        began = time.perf_counter()
+        settings, solver = self._settings, self._settings.linear_solver
+        energy = self._piece.energy(settings.density if near else ReweightedDirichlet(), self._weights)
+        descent = GuardedDescent(energy, uv, solver, self._rim) if guarded else FreeDescent(energy, uv, solver)
+        self._solver = descent.system.solver.name
+        first = self._measure.value(descent.w)
+        apart, status, steps = True, Status.STILL_FALLING, 0
+
+        def take(last: bool) -> None:
+            # Once it has met itself it is not asked again before the end.
+            nonlocal apart
+            if (apart or last) and not guarded:
+                apart = not self._rim.meets_itself(descent.uv)
+            if apart:
+                self._bijective = descent.uv
+            self._report(descent)
+
+        try:
+            take(settings.max_iterations == 0)
+            course = descend(descent, settings.density, settings.tolerance)
+            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):  # noqa: B007
+                status = outcome or status
+                take(outcome is not None or steps == settings.max_iterations)
+        finally:
+            seconds, energies = time.perf_counter() - began, (first, self._measure.value(descent.w))
+            name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
+            self._stages.append(Stage(name, steps, seconds, (0, 0), energies, kept=apart))
+        return status if apart else None
+
+    def _report(self, descent: FreeDescent) -> None:
+        settings, number = self._settings, len(self._history)
+        self._history.append(Step(number, 0, self._measure.value(descent.w)))
+        if settings.record and number % settings.record == 0:
+            self._path.append(Snapshot(number, np.ldexp(descent.uv, self._piece.exponent)))
+        if settings.callback is not None:
+            settings.callback(self._history[-1])
