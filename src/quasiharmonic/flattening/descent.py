@@ -5,7 +5,7 @@ One vertex is held, or the map could drift. It may turn: the raised diagonal of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -83,7 +83,7 @@ class GuardedEnergy:
 
 
 class FreeDescent(NewtonDescent):
-    """Steps of a map of which nothing but one vertex is held.
+    """Steps of a map with a free boundary, of which as a rule nothing but one vertex is held.
 
     Parameters
     ----------
@@ -91,10 +91,14 @@ class FreeDescent(NewtonDescent):
     uv : (n, 2) float64
         An injective map, of about unit size.
     linear_solver : str
+    fixed : sequence of int
+        Vertices that are held where they are; one at least, or the map could drift.
     """
 
-    def __init__(self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str) -> None:
-        super().__init__(energy, uv, np.zeros(1, dtype=np.int64), 0, linear_solver)
+    def __init__(
+        self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str, fixed: Sequence[int] | IntArray = (0,)
+    ) -> None:
+        super().__init__(energy, uv, np.asarray(fixed, dtype=np.int64), 0, linear_solver)
 
     @property
     def uv(self) -> FloatArray:
@@ -127,7 +131,7 @@ class GuardedDescent(FreeDescent):
 
     Parameters
     ----------
-    energy, uv, linear_solver
+    energy, uv, linear_solver, fixed
         As `FreeDescent` has them; the map is bijective.
     rim : Rim
         The surface's boundary.
@@ -135,12 +139,19 @@ class GuardedDescent(FreeDescent):
 
     energy: GuardedEnergy  # type: ignore[assignment]
 
-    def __init__(self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str, rim: Rim) -> None:
+    def __init__(
+        self,
+        energy: DeformationEnergy,
+        uv: FloatArray,
+        linear_solver: str,
+        rim: Rim,
+        fixed: Sequence[int] | IntArray = (0,),
+    ) -> None:
         self._rim, self._linear_solver = rim, linear_solver
         self._weights = iter(_WEIGHTS)
         self._weight = next(self._weights)
         self._distortion = np.inf
-        super().__init__(GuardedEnergy(energy), uv, linear_solver)  # type: ignore[arg-type]
+        super().__init__(GuardedEnergy(energy), uv, linear_solver, fixed)  # type: ignore[arg-type]
         self._distortion = self.value
         self._near = rim.contacts(self.w)
         self._known = Contacts.none().corners
@@ -167,8 +178,8 @@ class GuardedDescent(FreeDescent):
         """Take one step, with the contacts there are now."""
         repelling = self._near.within(self.w, 1.0).among(self._known, self.w.size)
         if repelling is None:
-            # The pattern of the system gets those that may come as well, so that it lasts for some steps.
-            self._known = self._near.corners
+            # The pattern of the system gets those that may come as well, or come again, so that it lasts for some steps.
+            self._known = _united(self._known, self._near.corners, self.w.size)
             F = np.concatenate([self.energy.F, self._known.T])
             g = np.concatenate([self.energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
             self.system = NewtonSystem(F, g, self.w.size, self._fixed, self._linear_solver)
@@ -189,6 +200,13 @@ class GuardedDescent(FreeDescent):
                     return True
             self.w, self._deformation, self.value = before
         return False
+
+
+def _united(older: IntArray, newer: IntArray, n: int) -> IntArray:
+    """Pairs (3, c) of either set, without the older ones where these are the most; ``n`` is above all vertices."""
+    both = np.concatenate([newer, older], axis=1)
+    _, first = np.unique(both[0] * n + both[1], return_index=True)
+    return newer if first.size > 2 * newer.shape[1] else both[:, first]
 
 
 def descend(descent: FreeDescent, density: Energy, tolerance: float) -> Iterator[Status | None]:

@@ -81,7 +81,7 @@ class Quadtree:
     def points(self) -> tuple[FloatArray, FloatArray]:
         """A point in every leaf, (k, 2), and the leaves' sides (k,)."""
         level, x, y = self.leaves()
-        size: FloatArray = self.side * 0.5**level
+        size = np.asarray(self.side * 0.5**level, dtype=np.float64)
         shifted = x + np.where(y % 2, 0.75, 0.25)
         points: FloatArray = self.corner + size[:, None] * np.stack([shifted, y + 0.5], axis=1)
         return points, size
