@@ -111,11 +111,11 @@ class NewtonDescent:
         """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
         or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
         """
-        self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
+        self._assemble(negative)
         for shift in _SHIFTS:
             try:
                 self.system.factor(shift)
-                direction = self.system.solve(-gradient)
+                direction = self._solve(-gradient)
             except NotPositiveDefinite:
                 continue
             promise = -_dot(gradient, direction)
@@ -123,6 +123,14 @@ class NewtonDescent:
                 return direction, promise, True
         direction = self.system.solve_diagonal(-gradient)
         return direction, -_dot(gradient, direction), False
+
+    def _assemble(self, negative: float) -> None:
+        """Fill in the system's matrix at the map at hand."""
+        self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
+
+    def _solve(self, load: ComplexArray) -> ComplexArray:
+        """The displacement of the free vertices under a load on them, the matrix being factored."""
+        return self.system.solve(load)
 
     def _search(self, direction: ComplexArray, promise: float) -> bool:
         """Move along a direction, as far as is good; False where no step lowers the energy enough."""

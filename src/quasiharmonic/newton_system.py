@@ -115,6 +115,12 @@ class NewtonSystem:
             self._values[slot] = self._sum_corners @ part.ravel()
         self._diagonal = self._values[self._first]
 
+    def add_blocks(self, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> None:
+        """Add a symmetric 2×2 block at every free vertex to the assembled matrix; (n - k,) float64 each."""
+        for slot, part in zip(self._corner_slots, (xx, xy, yy), strict=True):
+            self._values[slot] += part
+        self._diagonal = self._values[self._first]
+
     def matrix(self) -> csr_array:
         """The assembled matrix, both of its triangles; for study and tests."""
         size = self._first.size
