@@ -1,2 +1,132 @@
-"""stub"""
-def coarse_start(*a): return None
+"""A map to start from by way of coarse meshes: flattened where that costs little, then carried to finer ones.
+
+A limb of a thousand triangles, which a map into a disk shrinks to a millionth, has ten on the coarse mesh, and what
+would be steps of the whole mesh are steps of a small one. The same goes for the way out of an overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.certificate import is_injective
+from quasiharmonic.deformation_energy import DeformationEnergy
+from quasiharmonic.energies import SymmetricDirichlet
+from quasiharmonic.flattening.contacts import Rim
+from quasiharmonic.flattening.descent import FreeDescent, GuardedDescent, descend
+from quasiharmonic.flattening.hierarchy import Hierarchy, Level
+from quasiharmonic.flattening.reweighted import ReweightedDirichlet
+from quasiharmonic.flattening.start import disk_start
+from quasiharmonic.mesh.reference import rest_frames
+from quasiharmonic.newton_descent import in_units
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
+
+# Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has.
+_COARSEST, _RATIO = 150, 3.0
+# How far the maps of coarse meshes are taken: they are only beginnings. Steps at most, on the coarsest and on others.
+_TOLERANCE, _STEPS = 1e-2, (300, 40)
+# Triangles of a coarse mesh are no lower than this share of their longest side: many were never there.
+_LOWEST = 0.05
+# Ears stand so high above their edges, one after the other, until the map is bijective.
+_HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
+# ... and from this height on all of the boundary is put within the coarse image, not only what has met.
+_LATE = 1e-3
+
+
+def coarse_start(
+    V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto", *, guarded: bool = False
+) -> FloatArray | None:
+    """Flatten a coarse mesh and carry its map to the surface.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+        Rest positions, of about unit size.
+    F : (f, 3) int64
+        Triangles of a connected surface without handles.
+    loops : sequence of (l,) int64
+        Its boundary loops.
+    linear_solver : str
+    guarded : bool
+        Keep the boundary from running into itself from the beginning. Otherwise that is done once it has.
+
+    Returns
+    -------
+    (n, 2) float64 or None
+        A bijective map of moderate distortion; None where the way ends in rounding.
+    """
+    hierarchy = Hierarchy(V, F, list(loops), _COARSEST)
+    here: Level | None = None
+    uv: FloatArray | None = None
+    last = stop = hierarchy.stops[-1]
+    for stop in reversed(hierarchy.stops):
+        level = hierarchy.level(stop)
+        if here is None:
+            uv = disk_start(V[level.vertices], level.F, level.loops, linear_solver)
+        elif stop and level.vertices.size < _RATIO * here.vertices.size:
+            continue
+        else:
+            assert uv is not None
+            uv = _carried(hierarchy, here, level, uv, (last, stop), len(V))
+        if uv is None or stop == 0:
+            return uv
+        uv, guarded = _settled(V[level.vertices], level, uv, linear_solver, guarded, _STEPS[here is not None])
+        here, last = level, stop
+    return uv
+
+
+def _carried(
+    hierarchy: Hierarchy, here: Level, there: Level, uv: FloatArray, stops: tuple[int, int], n: int
+) -> FloatArray | None:
+    """A map of one level carried to a finer one, bijective; None where none was found."""
+    w = np.zeros(n, dtype=np.complex128)
+    w[here.vertices] = in_units(uv, 0)
+    rim = Rim(there.loops)
+    wary = np.zeros(n, dtype=bool)
+    for height in _HEIGHTS:
+        carried = hierarchy.prolong(w, *stops, wary, height)[there.vertices]
+        uv = carried.view(np.float64).reshape(-1, 2)
+        met = rim.meetings(uv)
+        if not met.size and is_injective(there.F, uv):
+            return uv
+        # Those that met are put inside, and in the end all.
+        late = height < _LATE
+        wary[there.vertices if late else there.vertices[met]] = True
+    return None
+
+
+def _settled(
+    V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
+) -> tuple[FloatArray, bool]:
+    """A level's map after some steps, bijective, and whether it had to be guarded."""
+    rim = Rim(level.loops)
+    energy = _thick_energy(V, level.F)
+    if not guarded:
+        free = FreeDescent(energy, uv, linear_solver)
+        for _ in islice(descend(free, SymmetricDirichlet(), _TOLERANCE), steps):
+            pass
+        if not rim.meets_itself(free.uv):
+            return free.uv, False
+    energy.energy = SymmetricDirichlet()
+    descent = GuardedDescent(energy, uv, linear_solver, rim)
+    for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
+        pass
+    return descent.uv, True
+
+
+def _thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
+    """The energy of a coarse mesh, its thinnest triangles thickened."""
+    z1, z2 = rest_frames(V, F)
+    longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
+    base = np.where(z1 > 0, z1, longest)
+    laid = np.zeros((len(F), 3, 2))
+    laid[:, 1, 0], laid[:, 2, 0] = base, z2.real
+    laid[:, 2, 1] = np.maximum(z2.imag, _LOWEST * longest**2 / base)
+    corners = np.arange(F.size).reshape(-1, 3)
+    return DeformationEnergy(laid.reshape(-1, 2), F, ReweightedDirichlet(), rest_F=corners)

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.boundary_curves import contacts
+from quasiharmonic.boundary_curves import contacts, judge_loops
 from quasiharmonic.energies import QuadraticForm
 from quasiharmonic.predicates import box_pairs_between
 
@@ -35,9 +35,10 @@ BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
 
 # A gap is kept open from this share of the boundary's edges there on, ...
-_REACH = 0.5
+_REACH = 1.0
 # ... and pairs up to so many times as far apart are looked at during a step, which may bring them nearer.
-_LOOKOUT = 3.0
+_LOOKOUT = 2.0
+_MOST_MEETINGS = 1000
 #: Half the gradients of the hat functions of a triangle v, a, b with its right angle at a and legs of 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 
@@ -132,6 +133,7 @@ class Rim:
     """
 
     def __init__(self, loops: Sequence[IntArray]) -> None:
+        self._loops = list(loops)
         self._vertex = np.concatenate(loops)
         ends = np.cumsum([len(loop) for loop in loops])
         starts = ends - [len(loop) for loop in loops]
@@ -141,14 +143,20 @@ class Rim:
         self._edges = np.stack([self._vertex, self._vertex[self._next]], axis=1)
 
     def meets_itself(self, uv: FloatArray) -> bool:
-        """Whether the boundary touches or crosses itself under a map (n, 2), exactly, on the coordinates as they are.
+        """Whether the boundary touches or crosses itself under a map (n, 2), or lies on the surface, exactly.
 
-        Where it does not, and all triangles are positive, the map of a connected surface without handles is bijective:
-        its loops turn 2 − l times together, one counterclockwise and the others clockwise, and what they wind
-        around a point, which is how often it is covered and so not negative, is 0 or 1.
+        Where it does not, and all triangles are positive, the map is bijective (`quasiharmonic.certificate`). That no
+        two edges meet is not enough: where the triangles at a boundary vertex wind around it by more than a full turn, a
+        loop can be simple and run the wrong way round.
         """
+        return bool(judge_loops(self._loops, uv)[1])
+
+    def meetings(self, uv: FloatArray) -> IntArray:
+        """Vertices (k,) at the ends of the first thousand pairs of edges that meet; none where `meets_itself` is false."""
         tail, head = uv[self._edges[:, 0]], uv[self._edges[:, 1]]
-        return bool((tail == head).all(axis=1).any() or len(contacts(uv, self._edges, 1).pairs))
+        short = self._edges[(tail == head).all(axis=1)]
+        pairs = contacts(uv, self._edges, _MOST_MEETINGS).pairs
+        return np.unique(np.concatenate([short.ravel(), self._edges[pairs].ravel()]))
 
     def contacts(self, w: ComplexArray) -> Contacts:
         """Pairs that are near each other across what is outside the surface.

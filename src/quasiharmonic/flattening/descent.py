@@ -23,9 +23,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
-# Contacts weigh this much of the surface's mean energy, each against one triangle of mean size, and then less and less:
-# what is left of them when they no longer matter is far below a map's usual distance from its minimum.
-_WEIGHTS = 1e-2, 1e-3, 1e-4
+# Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean size;
+# the first stages end sooner, at this multiple of the tolerance, for they are only on the way.
+_STAGES = (1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0)
 # ... where the energy is next to nothing as if it were this.
 _LEAST_ENERGY = 1e-4
 # A step may take the narrowest gap down to this share of what it was, or of its reach.
@@ -148,11 +148,9 @@ class GuardedDescent(FreeDescent):
         fixed: Sequence[int] | IntArray = (0,),
     ) -> None:
         self._rim, self._linear_solver = rim, linear_solver
-        self._weights = iter(_WEIGHTS)
-        self._weight = next(self._weights)
-        self._distortion = np.inf
+        self._stages = iter(_STAGES)
+        self._weight, self._slack = next(self._stages)
         super().__init__(GuardedEnergy(energy), uv, linear_solver, fixed)  # type: ignore[arg-type]
-        self._distortion = self.value
         self._near = rim.contacts(self.w)
         self._known = Contacts.none().corners
 
@@ -168,10 +166,10 @@ class GuardedDescent(FreeDescent):
 
     def ease(self) -> bool:
         """Lower the weight of the contacts; False at the last."""
-        weight = next(self._weights, None)
-        if weight is None:
+        following = next(self._stages, None)
+        if following is None:
             return False
-        self._weight, self._idle = weight, 0
+        (self._weight, self._slack), self._idle = following, 0
         return True
 
     def step(self, tolerance: float) -> Status | None:
@@ -187,7 +185,7 @@ class GuardedDescent(FreeDescent):
         self.energy.contacts = known if known is not None else repelling
         self.energy.stiffness = self._weight * max(self.distortion, _LEAST_ENERGY) / len(self.energy.F)
         self.value = self.energy.value_of(self._deformation)
-        return super().step(tolerance)
+        return super().step(self._slack * tolerance)
 
     def _accept(self, w: ComplexArray, bound: float) -> bool:
         """Go there if, besides, the boundary does not meet itself, exactly, and no gap becomes much narrower."""

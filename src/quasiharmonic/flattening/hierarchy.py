@@ -12,14 +12,14 @@ best shaped, as in `quasiharmonic.prolongation`: inside of its ring, and of the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.flattening.start import fans
 from quasiharmonic.mesh.coarsening import coarsen
-from quasiharmonic.mesh.topology import trace_loops
+from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.prolongation import places
 
 FloatArray = NDArray[np.float64]
@@ -70,12 +70,10 @@ class Hierarchy:
     def __init__(self, V: FloatArray, F: IntArray, loops: list[IntArray], goal: int) -> None:
         self._V = V
         self._n = n = len(V)
-        hubs = [
-            np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)
-        ]
+        filled = fans(loops, n)
         held = np.zeros(n + len(loops), dtype=bool)
         held[n:] = True
-        self._coarsening = coarsen(np.concatenate([F, *hubs]), held.size, held, goal + len(loops))
+        self._coarsening = coarsen(np.concatenate([F, filled]), held.size, held, goal + len(loops))
         self._rounds = len(self._coarsening.rounds)
         # Where there are meshes: before some of the rounds, and after the last.
         self.stops = [*sorted(self._coarsening.levels), self._rounds]
@@ -90,9 +88,9 @@ class Hierarchy:
         number = np.full(self._n, -1)
         number[vertices] = np.arange(vertices.size)
         F = number[T]
-        return Level(vertices, F, _loops(F, vertices.size))
+        return Level(vertices, F, boundary_loops(F, vertices.size))
 
-    def prolong(self, w: ComplexArray, start: int, stop: int, *, inside: float | None = None) -> ComplexArray:
+    def prolong(self, w: ComplexArray, start: int, stop: int, wary: BoolArray, height: float) -> ComplexArray:
         """Carry a map from the mesh at one stop to a finer one.
 
         Parameters
@@ -101,10 +99,12 @@ class Hierarchy:
             By the numbers of the finest mesh; those of the mesh at ``start`` are read.
         start, stop : int
             Stops, ``stop < start``.
-        inside : float, optional
-            Put vertices of the boundary within the coarse image, ears so high above the edge they stand on, as a
-            share of its length: small enough, and the map is bijective if it was. By default they go where the
-            surface says.
+        wary : (n,) bool
+            Vertices of the boundary that are put within the coarse image, so that their edges do not meet others there;
+            the rest goes where the surface says.
+        height : float
+            Of wary ears, which have no place within: so high above the edge they stand on, as a share of its length.
+            If all are wary and this is small enough, the map is bijective where it was.
 
         Returns
         -------
@@ -117,7 +117,7 @@ class Hierarchy:
                 for some, rim in ((~at_rim, False), (at_rim, True)):
                     if some.any():
                         ring = self._opened(rings[some]) if rim else rings[some]
-                        w[vertices[some]] = self._placed(w, vertices[some], ring, rim, inside)
+                        w[vertices[some]] = self._placed(w, vertices[some], ring, rim, wary, height)
         return w
 
     def _opened(self, rings: IntArray) -> IntArray:
@@ -127,27 +127,25 @@ class Hierarchy:
         return np.take_along_axis(rings, turn, axis=1)
 
     def _placed(
-        self, w: ComplexArray, vertices: IntArray, ring: IntArray, rim: bool, inside: float | None
+        self, w: ComplexArray, vertices: IntArray, ring: IntArray, rim: bool, wary: BoolArray, height: float
     ) -> ComplexArray:
+        """Places for vertices whose rings (r, d) are closed, or open where they are of the rim."""
         flat = self._laid_out(vertices, ring, rim)
         around = w[ring]
         place = _carried(flat, around)
         if rim and ring.shape[1] == 2:
-            if inside is not None:
-                # The ear lies to the left of x₁ → x₂, and all else to the right.
-                side = around[:, 1] - around[:, 0]
-                place = around[:, 0] + (0.5 + 1j * inside) * side
-            return place
+            # An ear lies to the left of x₁ → x₂, and all else to the right.
+            return np.where(wary[vertices], around[:, 0] + (0.5 + 1j * height) * (around[:, 1] - around[:, 0]), place)
         good = _keeps_shape(flat, place, around, rim)
-        if rim and inside is not None:
-            good[:] = False
+        if rim:
+            good &= ~wary[vertices]
         poor = np.flatnonzero(~good)
         if poor.size:
-            # Of an open ring either end may be the apex of the fan that fills it.
-            apex_last = around[poor] if not rim else np.where(
-                _fan_positive(around[poor])[:, None], around[poor], np.roll(around[poor], 1, axis=1)
-            )
-            place[poor] = places(apex_last)
+            ring_now = around[poor]
+            if rim:
+                # Of an open ring either end may be the apex of the fan that fills it.
+                ring_now = np.where(_fan_positive(ring_now)[:, None], ring_now, np.roll(ring_now, 1, axis=1))
+            place[poor] = places(ring_now)
         return place
 
     def _laid_out(self, vertices: IntArray, ring: IntArray, rim: bool) -> ComplexArray:
@@ -166,12 +164,6 @@ class Hierarchy:
         turned[:, 1:] = np.cumsum(angle if rim else angle[:, :-1], axis=1)
         size = length.mean(axis=1)
         return length / np.where(size > 0, size, 1)[:, None] * np.exp(1j * turned)
-
-
-def _loops(F: IntArray, n: int) -> list[IntArray]:
-    from quasiharmonic.mesh.topology import edges
-
-    return trace_loops(edges(F, n).boundary)
 
 
 def _carried(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
@@ -204,15 +196,3 @@ def _fan_positive(ring: ComplexArray) -> BoolArray:
     arm = ring[:, 1:] - ring[:, :1]
     positive: BoolArray = ((arm[:, :-1].conj() * arm[:, 1:]).imag > 0).all(axis=1)
     return positive
-
-
-def spread(level: Level, w: ComplexArray, n: int) -> ComplexArray:
-    """A map of a level by the numbers of the finest mesh; (n,) complex128, zero elsewhere."""
-    out = np.zeros(n, dtype=np.complex128)
-    out[level.vertices] = w
-    return out
-
-
-def stations(hierarchy: Hierarchy, ratio: float) -> Iterator[int]:
-    """Stops from the coarsest to the finest, each with so many times the vertices of the one before."""
-    raise NotImplementedError

@@ -28,6 +28,8 @@ IntArray = NDArray[np.int64]
 
 # From so many triangles on the start is flattened by way of coarse meshes.
 _COARSE_FROM = 50_000
+# From so many on that is done where the boundary is guarded.
+_CLEAR_FROM = 50_000
 
 
 @dataclass(frozen=True)
@@ -160,17 +162,21 @@ class Flattening:
     def _descended(self, start: FloatArray | None) -> Status:
         """Descend freely, and once more with the boundary guarded if it has ended on itself."""
         if start is not None:
-            status = self._descent(self._in_scale(start), guarded=False, near=False)
+            start = self._in_scale(start)
+            if not self._rim.meets_itself(start):
+                self._bijective = start
+            status = self._descent(start, guarded=False, near=False)
             if status is not None:
                 return status
         if self._bijective is None:
-            # Nothing given, or what was given overlapped itself from its beginning to its end.
+            # Nothing was given, or what was given overlaps itself and ended so.
             own, near = self._own_start()
             status = self._descent(own, guarded=False, near=near)
             if status is not None:
                 return status
         assert self._bijective is not None
-        status = self._descent(self._bijective, guarded=True, near=True)
+        clear = self._clear_start()
+        status = self._descent(self._bijective if clear is None else clear, guarded=True, near=True)
         assert status is not None
         return status
 
@@ -188,10 +194,24 @@ class Flattening:
                 "no bijective map to start from was found within double precision: the triangles differ too much in "
                 "size; give one by start"
             )
-        uv = self._in_scale(uv)
+        uv = self._bijective = self._in_scale(uv)
         energy = self._measure.value(in_units(uv, 0))
         self._stages.append(Stage("start", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
         return uv, near
+
+    def _clear_start(self) -> FloatArray | None:
+        """A map that has kept clear of itself on its way from a coarse mesh, if it takes one to be quick."""
+        piece = self._piece
+        if len(piece.F) < _CLEAR_FROM:
+            return None
+        began = time.perf_counter()
+        uv = coarse_start(piece.V, piece.F, piece.loops, self._settings.linear_solver, guarded=True)
+        if uv is None:
+            return None
+        uv = self._in_scale(uv)
+        energy = self._measure.value(in_units(uv, 0))
+        self._stages.append(Stage("start anew", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
+        return uv
 
     def _in_scale(self, uv: FloatArray) -> FloatArray:
         """A map scaled to the surface's area."""
@@ -208,24 +228,18 @@ class Flattening:
         descent = GuardedDescent(energy, uv, solver, self._rim) if guarded else FreeDescent(energy, uv, solver)
         self._solver = descent.system.solver.name
         first = self._measure.value(descent.w)
-        apart, status, steps = True, Status.STILL_FALLING, 0
-
-        def take(last: bool) -> None:
-            # Once it has met itself it is not asked again before the end.
-            nonlocal apart
-            if (apart or last) and not guarded:
-                apart = not self._rim.meets_itself(descent.uv)
-            if apart:
-                self._bijective = descent.uv
-            self._report(descent)
-
+        apart, status, steps = guarded, Status.STILL_FALLING, 0
         try:
-            take(settings.max_iterations == 0)
+            self._report(descent)
             course = descend(descent, settings.density, settings.tolerance)
             for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):  # noqa: B007
                 status = outcome or status
-                take(outcome is not None or steps == settings.max_iterations)
+                self._report(descent)
         finally:
+            # Also what Ctrl-C has left half done may be a better map than there was.
+            apart = guarded or not self._rim.meets_itself(descent.uv)
+            if apart:
+                self._bijective = descent.uv
             seconds, energies = time.perf_counter() - began, (first, self._measure.value(descent.w))
             name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
             self._stages.append(Stage(name, steps, seconds, (0, 0), energies, kept=apart))

@@ -39,8 +39,7 @@ def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_sol
     lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
     longest = int(np.argmax([length.sum() for length in lengths]))
     outer = loops[longest]
-    filled, hubs = fans([loop for k, loop in enumerate(loops) if k != longest], len(V))
-    middles = [V[loop].mean(axis=0) for k, loop in enumerate(loops) if k != longest]
+    holes = [loop for k, loop in enumerate(loops) if k != longest]
     # Edges without length get some, so that no two vertices share a place.
     length = lengths[longest] + 1e-6 * lengths[longest].mean()
     angle = 2 * np.pi * np.cumsum(length) / length.sum()
@@ -49,8 +48,8 @@ def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_sol
     radius = np.sqrt(0.5 * float(np.linalg.norm(cross, axis=1).sum()) / np.pi)
     circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     problem = Problem(
-        np.concatenate([V, *(middle[None] for middle in middles)]),
-        np.concatenate([F, filled]),
+        np.concatenate([V, *(V[hole].mean(axis=0)[None] for hole in holes)]),
+        np.concatenate([F, fans(holes, len(V))]),
         outer,
         circle,
         reference="equilateral",
@@ -59,11 +58,9 @@ def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_sol
     return result.uv[: len(V)] if result.injective else None
 
 
-def fans(loops: Sequence[IntArray], n: int) -> tuple[IntArray, IntArray]:
-    """Fill loops, the surface to their left, by fans around new vertices n, n + 1, …: triangles (k, 3) and these vertices."""
-    hubs = n + np.arange(len(loops))
+def fans(loops: Sequence[IntArray], n: int) -> IntArray:
+    """Triangles (k, 3) that fill loops, the surface to their left, around new vertices n, n + 1, …"""
     triangles = [
-        np.stack([np.roll(loop, -1), loop, np.full(len(loop), hub)], axis=1)
-        for loop, hub in zip(loops, hubs.tolist(), strict=True)
+        np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)
     ]
-    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles]), hubs
+    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])
