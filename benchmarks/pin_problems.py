@@ -242,6 +242,13 @@ def _flow(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, f
     return z, strength
 
 
+def _mixed(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
+    """Two to four of these, one after the other, each about as strong as it leaves the map bijective."""
+    for name in rng.choice(["swirl", "overwound", "bend", "pinch", "wave", "flow"], rng.integers(2, 5)).tolist():
+        z, strength = FAMILIES[name](rng, (z - z.mean()) / planar.span(z), F)
+    return z, strength
+
+
 FAMILIES: dict[str, Callable[[Generator, ComplexArray, IntArray], tuple[ComplexArray, float]]] = {
     "swirl": _swirl,
     "overwound": _overwound,
@@ -249,6 +256,7 @@ FAMILIES: dict[str, Callable[[Generator, ComplexArray, IntArray], tuple[ComplexA
     "pinch": _pinch,
     "wave": _wave,
     "flow": _flow,
+    "mixed": _mixed,
 }
 # Strengths below which a problem is not worth its name.
-_WEAKEST = {"swirl": 0.5, "overwound": 4.0, "bend": 0.5, "pinch": 0.4, "wave": 0.3, "flow": 0.1}
+_WEAKEST = {"swirl": 0.5, "overwound": 4.0, "bend": 0.5, "pinch": 0.4, "wave": 0.3, "flow": 0.1, "mixed": 0.0}
