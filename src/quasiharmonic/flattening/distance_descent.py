@@ -31,9 +31,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
-# The pairs that are kept: from every so manieth vertex to so many others, along segments across so many edges. Twice as
-# many pairs lower the error by a fiftieth, half as many raise it by as much.
-_SPARSE, _TARGETS, _CROSSINGS = 4, 120, 3
+# The pairs that are kept: from every so manieth vertex, but at most so many, to so many others, along segments across so
+# many edges. Twice as many pairs lower the error by a hundredth of it, half as many raise it by as much.
+_SPARSE, _SOURCES, _TARGETS, _CROSSINGS = 4, 2500, 120, 3
 # Gradients are followed until the residual has fallen to this share, or there were so many.
 _ACCURACY, _GRADIENTS = 0.1, 20
 
@@ -45,7 +45,7 @@ def keep_distances(
     *,
     rings: int = 20,
     max_iterations: int = 100,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
@@ -54,8 +54,8 @@ def keep_distances(
     What is lowered is the mean, over a sample of pairs of vertices at most ``rings`` edges apart, of how far their
     distance is off, as `distance_error` measures it but for errors below 30 % counting by their squares; and a small
     share of the symmetric Dirichlet energy, which keeps triangles from collapsing
-    (`quasiharmonic.flattening.distance_energy`). The sample has a quarter of the vertices with 120 others each, drawn
-    at random, always the same.
+    (`quasiharmonic.flattening.distance_energy`). The sample has a quarter of the vertices, at most 2,500, with 120
+    others each, drawn at random, always the same.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def keep_distances(
         raise ValueError(f"uv must have shape ({n}, 2), a position for every vertex, not {places.shape}")
     check_finite("uv", "vertex", "vertices", places)
     distances = surface_distances(
-        piece.V, piece.F, rings=rings, sources=-(-n // _SPARSE), targets=_TARGETS, crossings=_CROSSINGS
+        piece.V, piece.F, rings=rings, sources=min(-(-n // _SPARSE), _SOURCES), targets=_TARGETS, crossings=_CROSSINGS
     )
     start = _in_scale(places, distances)
     judged = certify(piece.F, start, loops=piece.loops)
