@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.certificate import is_injective
-from quasiharmonic.deformation_energy import DeformationEnergy
 from quasiharmonic.energies import SymmetricDirichlet
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import FreeDescent, GuardedDescent, descend
 from quasiharmonic.flattening.hierarchy import Hierarchy, Level
-from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.flattening.start import disk_start
-from quasiharmonic.mesh.reference import rest_frames
+from quasiharmonic.flattening.touching_up import thick_energy, touched_up
 from quasiharmonic.newton_descent import in_units
 
 FloatArray = NDArray[np.float64]
@@ -28,11 +26,9 @@ IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
 # Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has.
-_COARSEST, _RATIO = 150, 3.0
+_COARSEST, _RATIO = 150, 8.0
 # How far the maps of coarse meshes are taken: they are only beginnings. Steps at most, on the coarsest and on others.
-_TOLERANCE, _STEPS = 1e-2, (300, 40)
-# Triangles of a coarse mesh are no lower than this share of their longest side: many were never there.
-_LOWEST = 0.05
+_TOLERANCE, _STEPS = 1e-1, (300, 40)
 # Ears stand so high above their edges, one after the other, until the map is bijective.
 _HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
 # ... and from this height on all of the boundary is put within the coarse image, not only what has met.
@@ -74,6 +70,8 @@ def coarse_start(
         else:
             assert uv is not None
             uv = _carried(hierarchy, here, level, uv, (last, stop), len(V))
+            if uv is not None:
+                uv = touched_up(V[level.vertices], level.F, level.loops, uv, linear_solver)
         if uv is None or stop == 0:
             return uv
         uv, guarded = _settled(V[level.vertices], level, uv, linear_solver, guarded, _STEPS[here is not None])
@@ -106,7 +104,7 @@ def _settled(
 ) -> tuple[FloatArray, bool]:
     """A level's map after some steps, bijective, and whether it had to be guarded."""
     rim = Rim(level.loops)
-    energy = _thick_energy(V, level.F)
+    energy = thick_energy(V, level.F)
     if not guarded:
         free = FreeDescent(energy, uv, linear_solver)
         for _ in islice(descend(free, SymmetricDirichlet(), _TOLERANCE), steps):
@@ -118,15 +116,3 @@ def _settled(
     for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
         pass
     return descent.uv, True
-
-
-def _thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
-    """The energy of a coarse mesh, its thinnest triangles thickened."""
-    z1, z2 = rest_frames(V, F)
-    longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
-    base = np.where(z1 > 0, z1, longest)
-    laid = np.zeros((len(F), 3, 2))
-    laid[:, 1, 0], laid[:, 2, 0] = base, z2.real
-    laid[:, 2, 1] = np.maximum(z2.imag, _LOWEST * longest**2 / base)
-    corners = np.arange(F.size).reshape(-1, 3)
-    return DeformationEnergy(laid.reshape(-1, 2), F, ReweightedDirichlet(), rest_F=corners)

@@ -28,6 +28,8 @@ IntArray = NDArray[np.int64]
 
 # From so many triangles on the start is flattened by way of coarse meshes.
 _COARSE_FROM = 50_000
+# A mean energy below this is near enough to the least for Newton's own steps.
+_NEAR = 1.0
 # From so many on that is done where the boundary is guarded.
 _CLEAR_FROM = 50_000
 
@@ -184,11 +186,11 @@ class Flattening:
         """A bijective map, and whether it is near its best already."""
         began = time.perf_counter()
         piece, solver = self._piece, self._settings.linear_solver
-        uv, near = None, False
+        uv = None
         if len(piece.F) < _COARSE_FROM:
             uv = disk_start(piece.V, piece.F, piece.loops, solver)
         if uv is None:
-            uv, near = coarse_start(piece.V, piece.F, piece.loops, solver), True
+            uv = coarse_start(piece.V, piece.F, piece.loops, solver)
         if uv is None:
             raise ValueError(
                 "no bijective map to start from was found within double precision: the triangles differ too much in "
@@ -197,7 +199,7 @@ class Flattening:
         uv = self._bijective = self._in_scale(uv)
         energy = self._measure.value(in_units(uv, 0))
         self._stages.append(Stage("start", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
-        return uv, near
+        return uv, energy < _NEAR
 
     def _clear_start(self) -> FloatArray | None:
         """A map that has kept clear of itself on its way from a coarse mesh, if it takes one to be quick."""
