@@ -3,8 +3,8 @@
     V, F, fixed, target = make("swirl:7", scans)[:4]
 
 A surface is flattened, the flat map is deformed by a known map of the plane as far as it stays bijective, which is
-decided exactly, and 1 to 200 vertices are pinned where they are then. The map is kept as ``hidden``. A family and a seed
-name a problem; with scans, a folder of OBJ files, half of the surfaces are patches of these.
+decided exactly, and 1 to 200 vertices are pinned where they are then. The map is kept as ``hidden``. A family and a
+number name a problem; with scans, a folder of OBJ files, half of the surfaces are patches of these.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 import planar
 import problems
 from quasiharmonic import certify
-from quasiharmonic.io.obj import read_obj
 from quasiharmonic.flattening.flatten import flatten
+from quasiharmonic.io.obj import read_obj
 from quasiharmonic.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.surfaces import cat
 
@@ -118,7 +118,7 @@ def _scan(path: Path) -> tuple[FloatArray, IntArray]:
 
 
 def _patch(rng: Generator, V: FloatArray, F: IntArray, size: int) -> tuple[FloatArray, IntArray] | None:
-    """About ``size`` triangles around a random vertex, or all if there are no more; None where they make no good surface."""
+    """About ``size`` triangles around a random vertex, or all if there are no more; None where they fit no plane."""
     if len(F) > 1.5 * size:
         distance = _rings(F, len(V), int(rng.integers(len(V))))
         order = np.argsort(distance[F].max(axis=1), kind="stable")
@@ -164,9 +164,7 @@ def _chosen(rng: Generator, F: IntArray, n: int) -> IntArray:
     return rng.choice(pool, min(count, len(pool)), replace=False)
 
 
-def _bijective(
-    z: Callable[[float], ComplexArray], F: IntArray, strength: float
-) -> tuple[ComplexArray, float]:
+def _bijective(z: Callable[[float], ComplexArray], F: IntArray, strength: float) -> tuple[ComplexArray, float]:
     """Points moved as strongly as asked for, or as it leaves them bijective."""
     for _ in range(40):
         image = z(strength)
@@ -200,7 +198,9 @@ def _bend(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, f
     """Straight lines become arcs."""
     turn = np.exp(2j * np.pi * rng.random())
     w = z * turn
-    return _bijective(lambda t: 1j / t * (1 - np.exp(1j * t * w.real) * (1 - t * w.imag)) if t else w, F, rng.uniform(1, 5))
+    return _bijective(
+        lambda t: 1j / t * (1 - np.exp(1j * t * w.real) * (1 - t * w.imag)) if t else w, F, rng.uniform(1, 5)
+    )
 
 
 def _pinch(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:

@@ -1,13 +1,14 @@
-"""Vertices held and the boundary free: thousands of problems that are feasible by construction, what is solved and what not.
+"""Vertices held and the boundary free: thousands of problems that are feasible by construction, and what is solved.
 
     python benchmarks/pins.py -n 2000 -o pins.jsonl [--scans FOLDER] [--families swirl,bend]
     python benchmarks/pins.py --summary pins.jsonl
     python benchmarks/pins.py --case swirl:7 [--scans FOLDER]
 
-`pin_problems` makes them. One line of JSON a problem is written as soon as that is done, and what the file already has is
-skipped: it may be interrupted or killed at any moment and started again. A problem is *solved* when the map is bijective
-by the exact verdict and every pin in its place to the last bit; whatever raises or warns is not. Seconds are CPU
-seconds of one process, from arrays to a map of converged distortion; `placing` of these until it was bijective.
+`pin_problems` makes them. One line of JSON a problem is written as soon as that is done, and what the file already has
+is skipped: it may be interrupted or killed at any moment and started again. A problem is *solved* when the map is
+bijective by the exact verdict and every pin in its place to the last bit; whatever raises or warns is not. Seconds are
+CPU seconds of one process, from arrays to a map of converged distortion; ``placing`` are those of the clock until the
+map was bijective.
 """
 
 from __future__ import annotations

@@ -63,9 +63,7 @@ def _shared_places(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]
             yield Obstruction(Kind.PIN, Forbids.BIJECTIVE, message, vertices=group)
 
 
-def _wound_wrongly(
-    F: IntArray, held: NDArray[np.bool_], where: FloatArray, found: Edges
-) -> Iterator[Obstruction]:
+def _wound_wrongly(F: IntArray, held: NDArray[np.bool_], where: FloatArray, found: Edges) -> Iterator[Obstruction]:
     whole = np.flatnonzero(held[F].all(axis=1))
     corners = F[whole]
     sign = orientation(*(where[corners[:, k]] for k in range(3)))
@@ -81,9 +79,7 @@ def _wound_wrongly(
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
 
 
-def _crossing(
-    held: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: IntArray
-) -> Iterator[Obstruction]:
+def _crossing(held: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: IntArray) -> Iterator[Obstruction]:
     """Edges between pins that meet other such edges or other pins."""
     inner, outer = (pairs[held[pairs].all(axis=1)] for pairs in (found.interior, found.boundary))
     segments = np.concatenate([inner, outer, np.stack([fixed, fixed], axis=1)])
