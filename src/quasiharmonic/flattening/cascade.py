@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
-# Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has.
+# Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has at least.
 _COARSEST, _RATIO = 150, 8.0
 # How far the maps of coarse meshes are taken: they are only beginnings. Steps at most, on the coarsest and on others.
 _TOLERANCE, _STEPS = 1e-1, (300, 40)
@@ -60,13 +60,11 @@ def coarse_start(
     hierarchy = Hierarchy(V, F, list(loops), _COARSEST)
     here: Level | None = None
     uv: FloatArray | None = None
-    last = stop = hierarchy.stops[-1]
-    for stop in reversed(hierarchy.stops):
+    last = 0
+    for stop in hierarchy.stations(_RATIO):
         level = hierarchy.level(stop)
         if here is None:
             uv = disk_start(V[level.vertices], level.F, level.loops, linear_solver)
-        elif stop and level.vertices.size < _RATIO * here.vertices.size:
-            continue
         else:
             assert uv is not None
             uv = _carried(hierarchy, here, level, uv, (last, stop), len(V))

@@ -118,8 +118,6 @@ def flatten(
     if (fixed is None) != (target is None):
         raise ValueError("fixed and target belong together: vertices that are held, and where")
     if fixed is not None and unit_square:
-        raise ValueError("the target of held vertices says where the map lies: leave unit_square out")
-    if fixed is not None and unit_square:
         raise ValueError("vertices that are held decide the map's size: leave unit_square out")
     whole_number("max_iterations", max_iterations, least=0)
     whole_number("record", record, least=0)
@@ -127,22 +125,6 @@ def flatten(
     name = energy if isinstance(energy, str) else type(energy).__name__
     settings = Settings(energy_named(energy), name, tolerance, max_iterations, linear_solver, callback, record)
     V, F = real_array("V", V), index_array("F", F)
-    whole_number("max_iterations", max_iterations, least=0)
-    whole_number("record", record, least=0)
-    not_negative("tolerance", tolerance)
-    name = energy if isinstance(energy, str) else type(energy).__name__
-    settings = Settings(energy_named(energy), name, tolerance, max_iterations, linear_solver, callback, record)
-    V, F = real_array("V", V), index_array("F", F)
-    if fixed is not None:
-        from quasiharmonic.flattening.pins import pinned
-
-        weights = None if weights is None else _positive(weights, len(F))
-        given = None if start is None else _injective(start, V, F)
-    if fixed is not None and target is not None:
-        from quasiharmonic.flattening.pins import pinned
-
-        return replace(pinned(V, F, fixed, target, settings, weights, given), seconds=time.perf_counter() - began)
-        return pinned(V, F, fixed, target, settings, weights, given)
     weights = None if weights is None else _positive(weights, len(F))
     given = None if start is None else _injective(start, V, F)
     if fixed is not None and target is not None:

@@ -78,6 +78,18 @@ class Hierarchy:
         # Where there are meshes: before some of the rounds, and after the last.
         self.stops = [*sorted(self._coarsening.levels), self._rounds]
 
+    def stations(self, ratio: float) -> list[int]:
+        """Some of the `stops`, coarsest first: each mesh has so many times the vertices of the one before, or more."""
+        removed = [0, *(sum(vertices.size for vertices, _ in removals) for removals in self._coarsening.rounds)]
+        left = self._n - np.cumsum(removed)
+        chosen = [0]
+        for stop in self.stops[1:]:
+            if left[stop] * ratio <= left[chosen[-1]]:
+                chosen.append(stop)
+        if len(chosen) == 1:
+            chosen.append(self.stops[-1])
+        return chosen[::-1]
+
     def level(self, stop: int) -> Level:
         """The mesh after so many rounds, one of `stops`."""
         T = self._coarsening.F if stop == self._rounds else self._coarsening.levels[stop]

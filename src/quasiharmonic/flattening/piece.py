@@ -30,6 +30,8 @@ IntArray = NDArray[np.int64]
 _COARSE_FROM = 50_000
 # A mean energy below this is near enough to the least for Newton's own steps.
 _NEAR = 1.0
+# Energies are equal if they differ by no more than this part of them.
+_SAME = 1e-6
 # From so many on that is done where the boundary is guarded.
 _CLEAR_FROM = 50_000
 
@@ -150,10 +152,13 @@ class Flattening:
                 raise
             status = Status.INTERRUPTED
         assert self._bijective is not None
+        uv = self._bijective
+        if self._blind_to_scale(uv):
+            uv = self._in_scale(uv)
         return MapResult(
-            uv=self._bijective,
+            uv=uv,
             status=status,
-            certificate=certify(self._piece.F, self._bijective, loops=self._piece.loops),
+            certificate=certify(self._piece.F, uv, loops=self._piece.loops),
             stages=self._stages,
             history=self._history,
             path=self._path,
@@ -214,6 +219,11 @@ class Flattening:
         energy = self._measure.value(in_units(uv, 0))
         self._stages.append(Stage("start anew", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
         return uv
+
+    def _blind_to_scale(self, uv: FloatArray) -> bool:
+        """Whether a map of twice the size would be as good."""
+        w = in_units(uv, 0)
+        return abs(self._measure.value(2 * w) / self._measure.value(w) - 1) < _SAME
 
     def _in_scale(self, uv: FloatArray) -> FloatArray:
         """A map scaled to the surface's area."""
