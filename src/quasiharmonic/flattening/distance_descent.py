@@ -31,8 +31,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
-# The pairs that are kept: from every so manieth vertex, but at most so many, to so many others, along segments across so
-# many edges. Twice as many pairs lower the error by a hundredth of it, half as many raise it by as much.
+# The pairs that are kept: from every so manieth vertex, but at most so many, to so many others, along segments across
+# so many edges. Twice as many pairs lower the error by a hundredth of it, half as many raise it by as much.
 _SPARSE, _SOURCES, _TARGETS, _CROSSINGS = 4, 2500, 120, 3
 # Gradients are followed until the residual has fallen to this share, or there were so many.
 _ACCURACY, _GRADIENTS = 0.1, 20

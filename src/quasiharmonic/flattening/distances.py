@@ -5,7 +5,9 @@ apart, along the surface and straight in the plane. *Rings* count edges: two ver
 way along edges has k of them. What is measured here, all of which belongs beside any figure:
 
 - *Pairs*: sources drawn at random among the vertices, and for each all vertices at most so many rings away, or so many
-  of these, drawn at random. All pairs count alike; so do all vertices, whatever their area.
+  of these, drawn at random. All pairs count alike; so do all vertices, whatever their area. Errors gather in places:
+  on a cortex of 9,465 vertices a thousand sources leave the mean uncertain by 0.3 % of the distances. To compare maps
+  that does not matter, as long as it is the same sample; for a figure to be quoted take all vertices as sources.
 - *Along the surface*: the shortest chain of straight segments that cross at most so many edges each
   (`quasiharmonic.flattening.geodesics`), on the surface as it has been cut: no way leads across a cut. Never too short,
   and with 5 crossings 0.2 % too long on average on a folded surface, with 3 crossings 0.6 %.
