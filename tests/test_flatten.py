@@ -23,7 +23,8 @@ def cylinder(turns, cells=(90, 6), height=0.6, radius=1.0, steep=0.0):
     square, F = grid(*cells)
     angle = 2 * np.pi * turns * square[:, 0]
     r = radius + steep * square[:, 1]
-    return np.stack([r * np.cos(angle), r * np.sin(angle), height * square[:, 1] + 0.9 * turns * square[:, 0]], axis=1), F
+    up = height * square[:, 1] + 0.9 * turns * square[:, 0]
+    return np.stack([r * np.cos(angle), r * np.sin(angle), up], axis=1), F
 
 
 def overlapping_ring(degrees=420.0, around=80):

@@ -26,7 +26,7 @@ IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
 # Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has at least.
-_COARSEST, _RATIO = 150, 8.0
+_COARSEST, _RATIO = 150, 4.0
 # How far the maps of coarse meshes are taken: they are only beginnings. Steps at most, on the coarsest and on others.
 _TOLERANCE, _STEPS = 1e-1, (300, 40)
 # Ears stand so high above their edges, one after the other, until the map is bijective.

@@ -146,13 +146,13 @@ class Rim:
         """Whether the boundary touches or crosses itself under a map (n, 2), or lies on the surface, exactly.
 
         Where it does not, and all triangles are positive, the map is bijective (`quasiharmonic.certificate`). That no
-        two edges meet is not enough: where the triangles at a boundary vertex wind around it by more than a full turn, a
-        loop can be simple and run the wrong way round.
+        two edges meet is not enough: where the triangles at a boundary vertex wind around it by more than a full turn,
+        a loop can be simple and run the wrong way round.
         """
         return bool(judge_loops(self._loops, uv)[1])
 
     def meetings(self, uv: FloatArray) -> IntArray:
-        """Vertices (k,) at the ends of the first thousand pairs of edges that meet; none where `meets_itself` is false."""
+        """List the vertices (k,) at the ends of the first thousand pairs of edges that meet, if any do."""
         tail, head = uv[self._edges[:, 0]], uv[self._edges[:, 1]]
         short = self._edges[(tail == head).all(axis=1)]
         pairs = contacts(uv, self._edges, _MOST_MEETINGS).pairs
@@ -211,7 +211,7 @@ def _planar(w: ComplexArray) -> FloatArray:
 
 
 def _nearest(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    """Distance of points from segments, the unit vectors from the nearest points, and these points' places s on them."""
+    """Distances of points from segments, unit vectors from the nearest points, and these points' places s."""
     along = b - a
     square = along.real**2 + along.imag**2
     s = np.clip(((v - a) * along.conj()).real / np.where(square > 0, square, 1), 0, 1)

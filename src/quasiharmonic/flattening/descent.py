@@ -23,8 +23,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
-# Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean size;
-# the first stages end sooner, at this multiple of the tolerance, for they are only on the way.
+# Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean
+# size; the first stages end sooner, at this multiple of the tolerance, for they are only on the way.
 _STAGES = (1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0)
 # ... where the energy is next to nothing as if it were this.
 _LEAST_ENERGY = 1e-4
@@ -176,15 +176,16 @@ class GuardedDescent(FreeDescent):
         """Take one step, with the contacts there are now."""
         repelling = self._near.within(self.w, 1.0).among(self._known, self.w.size)
         if repelling is None:
-            # The pattern of the system gets those that may come as well, or come again, so that it lasts for some steps.
+            # The pattern of the system gets those that may come as well, or come again, so that it lasts a while.
             self._known = _united(self._known, self._near.corners, self.w.size)
             F = np.concatenate([self.energy.F, self._known.T])
             g = np.concatenate([self.energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
             self.system = NewtonSystem(F, g, self.w.size, self._fixed, self._linear_solver)
-        known = self._near.among(self._known, self.w.size)
-        self.energy.contacts = known if known is not None else repelling
+        contacts = self._near.among(self._known, self.w.size) or repelling
+        assert contacts is not None
+        self.energy.contacts = contacts
         self.energy.stiffness = self._weight * max(self.distortion, _LEAST_ENERGY) / len(self.energy.F)
-        self.value = self.energy.value_of(self._deformation)
+        self.value = self.energy.value_of(self._deformation)  # type: ignore[arg-type]
         return super().step(self._slack * tolerance)
 
     def _accept(self, w: ComplexArray, bound: float) -> bool:

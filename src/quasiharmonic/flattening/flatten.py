@@ -1,11 +1,11 @@
 """A surface flattened with nothing given: a bijective map into the plane, of little distortion.
 
-    V, F ─▶ connected pieces ─▶ start: a disk ─▶ free descent ─▶ does the boundary meet itself? ─ no ─▶ laid out ─▶ certified
-                                                   │                       │ yes                          ▲
-                                                   └─ last bijective map ──┴─▶ guarded descent ───────────┘
+    V, F ─▶ connected pieces ─▶ start, a disk ─▶ free descent ─▶ does the boundary meet itself? ─ no ─▶ laid out,
+                                      │                                       │ yes                  ▲  certified
+                                      └───────────────────────────────────────┴─▶ guarded descent ───┘
 
 Overlap is rare, and what guards against it takes longer than the descent itself. So the boundary is first let go where
-it likes, and only where it has come to rest on itself is it taken back to where it was still apart.
+it likes, and only where it has come to rest on itself is it taken back to the start.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def flatten(
     Returns
     -------
     MapResult
-        Its ``uv`` is bijective, certified; the principal axis lies along x and the bounding box begins at the origin; several
-        pieces stand side by side. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration, ``EXHAUSTED``
-        when doubles cannot express a better map, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+        Its ``uv`` is bijective, certified; the principal axis lies along x, the bounding box begins at the origin, and
+        several pieces stand side by side. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration,
+        ``EXHAUSTED`` when doubles cannot express a better map, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def _piece(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) 
     try:
         return Piece(V[vertices], number[F[triangles]])
     except ValueError as error:
-        raise ValueError(f"the piece around vertex {vertices[0]}, its elements numbered for themselves: {error}") from None
+        raise ValueError(f"the piece around vertex {vertices[0]}, its elements numbered anew: {error}") from None
 
 
 def _positive(weights: ArrayLike, f: int) -> FloatArray:
@@ -212,7 +212,7 @@ def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
 
 
 def _laid_out(piece: Piece, uv: FloatArray) -> FloatArray:
-    """A piece's map in the surface's unit, along its axis; as it is where turning it would cost an inverted triangle."""
+    """A piece's map in the surface's unit, along its axis; unturned where that would cost an inverted triangle."""
     laid = np.ldexp(laid_along_axis(piece.F, uv), piece.exponent)
     if certify(piece.F, laid, loops=piece.loops).bijective:
         return laid

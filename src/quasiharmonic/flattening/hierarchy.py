@@ -1,6 +1,6 @@
 """Coarse meshes of a surface whose boundary is coarsened too, and the way back.
 
-Each boundary loop is filled by a fan around a vertex of its own, its *hub*, which makes the boundary's vertices interior
+Each boundary loop is filled by a fan around a vertex of its own, its *hub*, which makes the boundary's vertices inner
 ones and lets `quasiharmonic.mesh.coarsening` take them out as any other; hubs stay, and no new edge ends at
 them. So what is left without the hubs is a coarse mesh with coarse loops.
 
@@ -93,7 +93,7 @@ class Hierarchy:
     def level(self, stop: int) -> Level:
         """The mesh after so many rounds, one of `stops`."""
         T = self._coarsening.F if stop == self._rounds else self._coarsening.levels[stop]
-        T = T[(T < self._n).all(axis=1)]
+        T = T[T.max(axis=1) < self._n]
         used = np.zeros(self._n, dtype=bool)
         used[T] = True
         vertices = np.flatnonzero(used)
@@ -199,7 +199,8 @@ def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, 
     area = (now.conj() * np.roll(now, -1, axis=1)).imag[:, :last]
     rest = (then.conj() * np.roll(then, -1, axis=1)).imag[:, :last]
     scale = area.sum(axis=1) / rest.sum(axis=1)
-    good: BoolArray = (area > _LEAST * scale[:, None] * np.maximum(rest, 0)).all(axis=1) & (area > 0).all(axis=1)
+    least = np.maximum(_LEAST * scale[:, None] * np.maximum(rest, 0), 0)
+    good: BoolArray = (area > least).all(axis=1)
     return good
 
 

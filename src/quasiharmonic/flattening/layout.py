@@ -53,7 +53,7 @@ def side_by_side(parts: Sequence[FloatArray]) -> list[FloatArray]:
     gap = _GAP * max(float(part.max()) for part in parts)
     shifted, right = [], 0.0
     for part in parts:
-        shifted.append(part + (right, 0.0))
+        shifted.append(part + np.array([right, 0.0]))
         right = float(shifted[-1][:, 0].max()) + gap
     return shifted
 

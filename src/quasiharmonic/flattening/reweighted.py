@@ -1,10 +1,10 @@
 """Symmetric Dirichlet with the second derivatives of reweighted rigid proxies, for maps far from their best.
 
 Where a triangle has collapsed to ``σ ≪ 1`` the energy is ``σ⁻²``, and Newton's step takes it to 4/3 σ. The proxy
-``k/2 (σ − 1)²`` with the energy's own slope, ``k = φ'(σ)/(σ − 1)``, has its minimum where the triangle is as large as at
-rest, and a step goes as far in its direction as other triangles allow [1]_: a map that Newton's method brings down by a
-factor of two or three a step falls by a factor of a hundred. Near the minimum the proxies forget how
-triangles resist shear, and Newton's own second derivatives are better.
+``k/2 (σ − 1)²`` with the energy's own slope, ``k = φ'(σ)/(σ − 1)``, has its minimum where the triangle is as large as
+at rest, and a step goes as far in its direction as other triangles allow [1]_: a map that Newton's method brings down
+by a factor of two or three a step falls by a factor of a hundred. Near the minimum the proxies forget how triangles
+resist shear, and Newton's own second derivatives are better.
 
 References
 ----------

@@ -59,8 +59,6 @@ def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_sol
 
 
 def fans(loops: Sequence[IntArray], n: int) -> IntArray:
-    """Triangles (k, 3) that fill loops, the surface to their left, around new vertices n, n + 1, …"""
-    triangles = [
-        np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)
-    ]
+    """Fill loops, the surface to their left, by triangles (k, 3) around new vertices from ``n`` on."""
+    triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
     return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])

@@ -1,7 +1,7 @@
 """A map that has come from a coarser mesh made ready for Newton's steps: smoothed, and its worst triangles opened up.
 
-Most vertices have come to a good place. What the others, one in a hundred, cost the whole mesh in steps costs next to nothing
-where they are.
+Most vertices have come to a good place. What the others, one in a hundred, cost the whole mesh in steps costs next to
+nothing where they are.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ ComplexArray = NDArray[np.complex128]
 _LOWEST = 0.05
 # Towards the weighted middle of its neighbours a vertex goes this share of the way, so often; no weight is below this.
 _SHARE, _SWEEPS, _LEAST_WEIGHT = 0.8, 4, 0.02
-# Triangles are opened up whose density is so many times that of three quarters of all, with so many rings around them, if it
-# is not most of the mesh, in so many steps at most, to this tolerance.
+# Triangles are opened up whose density is so many times that of three quarters of all, with so many rings around them,
+# if it is not most of the mesh, in so many steps at most, to this tolerance.
 _BAD, _RINGS, _MOST, _STEPS, _TOLERANCE = 20.0, 2, 0.4, 20, 1e-2
 
 
@@ -78,7 +78,7 @@ def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
 
 
 def _smoothed(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: ComplexArray) -> ComplexArray:
-    """Inner vertices moved towards the middles of their neighbours, weighted as in the Laplacian, none inverted by it."""
+    """Move inner vertices towards the middles of their neighbours, weighted as in the Laplacian, and invert none."""
     n = len(V)
     z1, z2 = rest_frames(V, F)
     corners = np.stack([np.zeros(z2.shape), z1, z2])
