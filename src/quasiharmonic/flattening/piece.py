@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,8 +33,9 @@ _COARSE_FROM = 50_000
 _NEAR = 1.0
 # Energies are equal if they differ by no more than this part of them.
 _SAME = 1e-6
-# From so many on that is done where the boundary is guarded.
-_CLEAR_FROM = 50_000
+# Of so many last maps of a free descent the latest is looked for that is bijective, if its energy is at most so many
+# times the last one's: far from that the start is the better place to begin anew.
+_RECENT, _NOT_FAR = 12, 10.0
 
 
 @dataclass(frozen=True)
@@ -182,8 +184,7 @@ class Flattening:
             if status is not None:
                 return status
         assert self._bijective is not None
-        clear = self._clear_start()
-        status = self._descent(self._bijective if clear is None else clear, guarded=True, near=True)
+        status = self._descent(self._bijective, guarded=True, near=True)
         assert status is not None
         return status
 
@@ -206,20 +207,6 @@ class Flattening:
         self._stages.append(Stage("start", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
         return uv, energy < _NEAR
 
-    def _clear_start(self) -> FloatArray | None:
-        """A map that has kept clear of itself on its way from a coarse mesh, if it takes one to be quick."""
-        piece = self._piece
-        if len(piece.F) < _CLEAR_FROM:
-            return None
-        began = time.perf_counter()
-        uv = coarse_start(piece.V, piece.F, piece.loops, self._settings.linear_solver, guarded=True)
-        if uv is None:
-            return None
-        uv = self._in_scale(uv)
-        energy = self._measure.value(in_units(uv, 0))
-        self._stages.append(Stage("start anew", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
-        return uv
-
     def _blind_to_scale(self, uv: FloatArray) -> bool:
         """Whether a map of twice the size would be as good."""
         w = in_units(uv, 0)
@@ -241,21 +228,33 @@ class Flattening:
         self._solver = descent.system.solver.name
         first = self._measure.value(descent.w)
         apart, status, steps = guarded, Status.STILL_FALLING, 0
+        recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)
         try:
             self._report(descent)
             course = descend(descent, settings.density, settings.tolerance)
             for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):  # noqa: B007
                 status = outcome or status
+                recent.append((self._measure.value(descent.w), descent.uv))
                 self._report(descent)
         finally:
             # Also what Ctrl-C has left half done may be a better map than there was.
+            last = self._measure.value(descent.w)
             apart = guarded or not self._rim.meets_itself(descent.uv)
             if apart:
                 self._bijective = descent.uv
-            seconds, energies = time.perf_counter() - began, (first, self._measure.value(descent.w))
+            else:
+                self._bijective = self._latest_bijective(recent, _NOT_FAR * last)
+            seconds = time.perf_counter() - began
             name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
-            self._stages.append(Stage(name, steps, seconds, (0, 0), energies, kept=apart))
+            self._stages.append(Stage(name, steps, seconds, (0, 0), (first, last), kept=apart))
         return status if apart else None
+
+    def _latest_bijective(self, recent: Iterable[tuple[float, FloatArray]], most: float) -> FloatArray | None:
+        """The latest of some maps with their energies that is bijective and of no more energy; else what there was."""
+        for energy, uv in reversed([*recent]):
+            if energy <= most and not self._rim.meets_itself(uv):
+                return uv
+        return self._bijective
 
     def _report(self, descent: FreeDescent) -> None:
         settings, number = self._settings, len(self._history)
