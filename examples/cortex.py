@@ -9,7 +9,7 @@ each vertex.
 What is measured are distances between vertices at most 20 edges apart, from every vertex to 150 others drawn at random:
 along the surface, as chains of straight segments that cross at most five edges each and no cut, and in the plane. The
 error of a pair is |scale · plane / surface − 1|, with the scale, one for each map, for which the mean is least; "rms"
-is the root of its mean square. All maps are measured alike, whatever made them. Seconds are the processor's, on one core.
+is the root of its mean square. All maps are measured alike, whatever made them. Seconds are those of one core.
 
 =============================== ======= =================== ==================== ====== ==============
 map                             seconds symmetric Dirichlet distance error, mean rms    bijective
