@@ -38,6 +38,7 @@ from quasiharmonic import certify, distortion, io, surfaces
 from quasiharmonic.deformation_energy import DeformationEnergy
 from quasiharmonic.energies import SymmetricDirichlet
 from quasiharmonic.flattening.flatten import flatten
+from quasiharmonic.flattening.start import fans
 from quasiharmonic.mesh.topology import boundary_loops
 
 FloatArray = NDArray[np.float64]
@@ -80,7 +81,7 @@ def ours(V: FloatArray, F: IntArray) -> tuple[Found, list[tuple[float, float]]]:
 
 
 def tutte(V: FloatArray, F: IntArray) -> FloatArray:
-    """Tutte's embedding of the longest loop onto a circle of the surface's area."""
+    """Tutte's embedding, holes filled, of the longest loop onto a circle of the surface's area."""
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import spsolve
 
@@ -91,16 +92,18 @@ def tutte(V: FloatArray, F: IntArray) -> FloatArray:
     cross = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
     radius = np.sqrt(0.5 * np.linalg.norm(cross, axis=1).sum() / np.pi)
     angle = 2 * np.pi * np.cumsum(length) / length.sum()
-    uv = np.zeros((len(V), 2))
+    filled = np.concatenate([F, fans([hole for k, hole in enumerate(loops) if k != longest], len(V))])
+    n = int(filled.max()) + 1
+    uv = np.zeros((n, 2))
     uv[loop] = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
-    graph = coo_array((np.ones(tail.size), (tail, head)), shape=(len(V), len(V))).tocsr()
+    tail, head = filled.ravel(), np.roll(filled, -1, axis=1).ravel()
+    graph = coo_array((np.ones(tail.size), (tail, head)), shape=(n, n)).tocsr()
     graph = ((graph + graph.T) > 0).astype(np.float64)
-    laplacian = (diags_array(graph @ np.ones(len(V))) - graph).tocsr()
-    free = np.setdiff1d(np.arange(len(V)), loop)
+    laplacian = (diags_array(graph @ np.ones(n)) - graph).tocsr()
+    free = np.setdiff1d(np.arange(n), loop)
     if free.size:
         uv[free] = spsolve(laplacian[free][:, free].tocsc(), -laplacian[free][:, loop] @ uv[loop]).reshape(-1, 2)
-    return uv
+    return uv[: len(V)]
 
 
 def slim(V: FloatArray, F: IntArray, iterations: int) -> FloatArray:

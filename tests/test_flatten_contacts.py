@@ -95,12 +95,29 @@ def test_curvature_of_one_contact():
     assert float((along_p.conj() * dp + along_q.conj() * dq).real.sum()) == pytest.approx(second)
 
 
-def test_among_keeps_reaches_and_misses_none(pairs):
+def test_split_keeps_reaches_and_loses_none(pairs):
     found, w = pairs
-    known = found.corners[:, ::-1]
-    np.testing.assert_array_equal(found.among(known, w.size).reach, found.reach[::-1])
-    assert found.among(known[:, 1:], w.size) is None
-    assert Contacts.none().among(known, w.size).reach.max() == 0
+    known, strangers = found.split(found.corners[:, ::-1], w.size)
+    np.testing.assert_array_equal(known.reach, found.reach[::-1])
+    assert not strangers.reach.size
+    known, strangers = found.split(found.corners[:, 2:], w.size)
+    np.testing.assert_array_equal(strangers.corners, found.corners[:, :2])
+    assert known.value(w) + strangers.value(w) == pytest.approx(found.value(w))
+    assert Contacts.none().split(found.corners, w.size)[0].reach.max() == 0
+    assert found.split(Contacts.none().corners, w.size)[1].reach.size == found.reach.size
+
+
+def test_blocks_bound_the_curvature(pairs):
+    found, w = pairs
+    form, (xx, xy, yy) = found.curvature(w), found.blocks(w)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        move = rng.normal(size=w.size) + 1j * rng.normal(size=w.size)
+        dp, dq = (HATS.conj() @ move[found.corners]), (HATS @ move[found.corners])
+        along_p, along_q = form.apply(dp, dq)
+        coupled = float((along_p.conj() * dp + along_q.conj() * dq).real.sum())
+        apart = float((xx * move.real**2 + 2 * xy * move.real * move.imag + yy * move.imag**2).sum())
+        assert 0 <= coupled <= apart
 
 
 @pytest.mark.parametrize("gap", [0.03, -0.03])

@@ -81,6 +81,7 @@ class NewtonDescent:
         self._deformation = self.energy.deform(self.w)
         self.value = self.first = self.energy.value_of(self._deformation)
         self._cut = True
+        self._shift = 0
         self._idle = 0
 
     def positions(self, w: ComplexArray) -> FloatArray:
@@ -112,12 +113,14 @@ class NewtonDescent:
         or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
         """
         self._assemble(negative)
-        for shift in _SHIFTS:
+        # While steps are cut short, what was too little for the last matrix is for this one.
+        for number in range(self._shift if self._cut else 0, len(_SHIFTS)):
             try:
-                self.system.factor(shift)
+                self.system.factor(_SHIFTS[number])
                 direction = self._solve(-gradient)
             except NotPositiveDefinite:
                 continue
+            self._shift = number
             promise = -_dot(gradient, direction)
             if promise >= 0:
                 return direction, promise, True

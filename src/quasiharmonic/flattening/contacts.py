@@ -84,8 +84,7 @@ class Contacts:
     def curvature(self, w: ComplexArray) -> QuadraticForm:
         """Its second derivative along the present directions of contact, in the derivatives that `HATS` defines."""
         d, normal, s = _nearest(*w[self.corners])
-        ratio = self.reach / d
-        half = np.where(ratio > 1, ratio * (3 * ratio - 2) / d**2, 0.0)
+        half = 0.5 * self._stiffness(d)
         # dv − da = dp + dq and db − da = i (dp − dq).
         alpha, beta = normal.conj() * (1 - 1j * s), normal.conj() * (1 + 1j * s)
         return QuadraticForm(
@@ -97,27 +96,41 @@ class Contacts:
             pqc=2 * half * alpha * beta.conj(),
         )
 
-    def among(self, known: IntArray, n: int) -> Contacts | None:
-        """The same in a larger set (3, k) of pairs of ``n`` vertices, or None where one that repels is not in it.
+    def blocks(self, w: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Bound its second derivative by one that does not couple vertices: blocks xx, xy, yy, (n,) float64 each.
 
-        Of the others in the set the reach is 0.
+        Of three terms the square of the sum is at most three times the sum of the squares.
         """
+        d, normal, s = _nearest(*w[self.corners])
+        bound = 3 * self._stiffness(d) * np.stack([np.ones(s.shape), (1 - s) ** 2, s**2])
+        at = self.corners.ravel()
+        xx, xy, yy = (
+            np.bincount(at, (bound * part).ravel(), minlength=w.size)
+            for part in (normal.real**2, normal.real * normal.imag, normal.imag**2)
+        )
+        return xx, xy, yy
+
+    def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
+        """Those of a set (3, k) of pairs of ``n`` vertices, all of it with a reach of 0 for the others, and the rest."""
         keys, own = (pairs[0] * n + pairs[1] for pairs in (known, self.corners))
         order = np.argsort(keys)
-        place = np.searchsorted(keys, own, sorter=order)
-        here = order[np.minimum(place, order.size - 1)] if order.size else np.zeros(own.size, dtype=np.int64)
-        found = keys[here] == own if order.size else np.zeros(own.size, dtype=bool)
-        if not found.all():
-            return None
+        keys = np.append(keys[order], np.iinfo(np.int64).max)
+        place = np.searchsorted(keys, own)
+        found = keys[place] == own
         reach = np.zeros(known.shape[1])
-        reach[here] = self.reach
-        return Contacts(known, reach)
+        reach[order[place[found]]] = self.reach[found]
+        return Contacts(known, reach), Contacts(self.corners[:, ~found], self.reach[~found])
 
     def within(self, w: ComplexArray, most: float) -> Contacts:
         """Those whose distance is below so many times their reach."""
         d, _, _ = _nearest(*w[self.corners])
         near = d < most * self.reach
         return Contacts(self.corners[:, near], self.reach[near])
+
+    def _stiffness(self, d: FloatArray) -> FloatArray:
+        """The barriers' second derivatives by the distances."""
+        ratio = self.reach / d
+        return np.where(ratio > 1, 2 * ratio * (3 * ratio - 2) / d**2, 0.0)
 
     def _excess(self, d: FloatArray) -> FloatArray:
         return np.maximum(self.reach / d - 1, 0)

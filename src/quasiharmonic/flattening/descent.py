@@ -26,6 +26,8 @@ ComplexArray = NDArray[np.complex128]
 # Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean
 # size; the first stages end sooner, at this multiple of the tolerance, for they are only on the way.
 _STAGES = (1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0)
+# The pattern of the system is made anew when this share of the contacts that repel is not in it.
+_STRANGE = 0.3
 # ... where the energy is next to nothing as if it were this.
 _LEAST_ENERGY = 1e-4
 # A step may take the narrowest gap down to this share of what it was, or of its reach.
@@ -49,6 +51,9 @@ class GuardedEnergy:
     Attributes
     ----------
     contacts : Contacts
+        Those that couple their vertices in the Newton system.
+    strangers : Contacts
+        Others, for which it has no place.
     stiffness : float
         The factor on each contact's barrier.
     """
@@ -56,7 +61,7 @@ class GuardedEnergy:
     def __init__(self, surface: DeformationEnergy) -> None:
         self.surface = surface
         self.F, self.g = surface.F, surface.g
-        self.contacts, self.stiffness = Contacts.none(), 0.0
+        self.contacts, self.strangers, self.stiffness = Contacts.none(), Contacts.none(), 0.0
 
     def deform(self, w: ComplexArray) -> _Moment:
         """What the other methods read of a map."""
@@ -64,11 +69,15 @@ class GuardedEnergy:
 
     def value_of(self, moment: _Moment) -> float:
         """The mean energy of the surface, and the barriers."""
-        return self.surface.value_of(moment.surface) + self.stiffness * self.contacts.value(moment.w)
+        return self.surface.value_of(moment.surface) + self.stiffness * (
+            self.contacts.value(moment.w) + self.strangers.value(moment.w)
+        )
 
     def gradient_of(self, moment: _Moment, n: int) -> ComplexArray:
         """The derivative by ``n`` positions; (n,) complex128."""
-        return self.surface.gradient_of(moment.surface, n) + self.stiffness * self.contacts.gradient(moment.w)
+        return self.surface.gradient_of(moment.surface, n) + self.stiffness * (
+            self.contacts.gradient(moment.w) + self.strangers.gradient(moment.w)
+        )
 
     def curvature_of(self, moment: _Moment, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivatives on the surface's triangles, and then on the contacts'."""
@@ -174,19 +183,26 @@ class GuardedDescent(FreeDescent):
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step, with the contacts there are now."""
-        repelling = self._near.within(self.w, 1.0).among(self._known, self.w.size)
-        if repelling is None:
-            # The pattern of the system gets those that may come as well, or come again, so that it lasts a while.
+        known, strangers = self._near.split(self._known, self.w.size)
+        repelling = self._near.within(self.w, 1.0).reach.size
+        if strangers.within(self.w, 1.0).reach.size > _STRANGE * repelling:
+            # A new pattern gets those that may come as well, or come again, so that it lasts a while.
             self._known = _united(self._known, self._near.corners, self.w.size)
             F = np.concatenate([self.energy.F, self._known.T])
             g = np.concatenate([self.energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
             self.system = NewtonSystem(F, g, self.w.size, self._fixed, self._linear_solver)
-        contacts = self._near.among(self._known, self.w.size) or repelling
-        assert contacts is not None
-        self.energy.contacts = contacts
+            known, strangers = self._near.split(self._known, self.w.size)
+        self.energy.contacts, self.energy.strangers = known, strangers
         self.energy.stiffness = self._weight * max(self.distortion, _LEAST_ENERGY) / len(self.energy.F)
         self.value = self.energy.value_of(self._deformation)  # type: ignore[arg-type]
         return super().step(self._slack * tolerance)
+
+    def _assemble(self, negative: float) -> None:
+        """Fill in the system's matrix, with strangers on its diagonal alone."""
+        super()._assemble(negative)
+        if self.energy.strangers.reach.size:
+            stiffness, free = self.energy.stiffness, self.system.free
+            self.system.add_blocks(*(stiffness * part[free] for part in self.energy.strangers.blocks(self.w)))
 
     def _accept(self, w: ComplexArray, bound: float) -> bool:
         """Go there if, besides, the boundary does not meet itself, exactly, and no gap becomes much narrower."""
