@@ -339,6 +339,23 @@ def test_no_boundary_runs_into_itself():
     assert sample.error(as_it_would).mean < sample.error(result.uv).mean < 0.5 * sample.error(start).mean
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_start_that_rounding_would_invert_is_taken_as_it_is(seed):
+    V, F = surfaces.grid(4, 4)
+    uv = V.copy()
+    # Three vertices of a triangle so near to a line that hardly any scale keeps its sign.
+    corner = F[3]
+    a, b = uv[corner[0]], uv[corner[1]]
+    middle = 0.3 * a + 0.7 * b
+    inside = uv[corner[2]] - middle
+    rng = np.random.default_rng(seed)
+    uv[corner[2]] = middle + inside * 2.0 ** -rng.uniform(40, 52)
+    uv = uv @ np.array([[0.8, 0.6], [-0.6, 0.8]])
+    if not certify(F, uv).bijective:
+        pytest.skip("the start itself did not survive rounding")
+    assert keep_distances(V, F, uv, rings=4).certificate.bijective
+
+
 def test_ctrl_c_hands_back_the_best_map_so_far(dome):
     V, F = dome
 

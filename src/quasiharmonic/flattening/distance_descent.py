@@ -89,6 +89,22 @@ def keep_distances(
     ValueError
         When the input is malformed (see `Problem`), the surface has handles, a rest triangle has no area, or ``uv`` is
         not bijective; the message says where.
+
+    Examples
+    --------
+    A dome seen from above, its rim pressed together, is spread out:
+
+    >>> import numpy as np
+    >>> from quasiharmonic.flattening.distances import distance_error
+    >>> from quasiharmonic.surfaces import disk
+    >>> flat, F = disk(12)
+    >>> V = np.column_stack([flat, np.sqrt(1.1 - (flat**2).sum(axis=1))])
+    >>> result = keep_distances(V, F, flat, rings=8)
+    >>> result.certificate.bijective
+    True
+    >>> errors = [distance_error(V, F, uv, rings=8).mean for uv in (flat, result.uv)]
+    >>> errors[1] < 0.5 * errors[0]
+    True
     """
     began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=0)
@@ -99,13 +115,13 @@ def keep_distances(
     if places.shape != (n, 2):
         raise ValueError(f"uv must have shape ({n}, 2), a position for every vertex, not {places.shape}")
     check_finite("uv", "vertex", "vertices", places)
+    judged = certify(piece.F, places, loops=piece.loops)
+    if not judged.bijective:
+        raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
     distances = surface_distances(
         piece.V, piece.F, rings=rings, sources=min(-(-n // _SPARSE), _SOURCES), targets=_TARGETS, crossings=_CROSSINGS
     )
-    start = _in_scale(places, distances)
-    judged = certify(piece.F, start, loops=piece.loops)
-    if not judged.bijective:
-        raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
+    start = _in_scale(places, distances, piece)
     with np.errstate(all="ignore"):
         energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), n)
         descent = DistanceDescent(energy, start, linear_solver, Rim(piece.loops))
@@ -185,12 +201,16 @@ class DistanceDescent(GuardedDescent):
         return direction
 
 
-def _in_scale(uv: FloatArray, distances: SurfaceDistances) -> FloatArray:
-    """A map scaled such that its distances are nearest to the surface's, its middle at the origin."""
+def _in_scale(uv: FloatArray, distances: SurfaceDistances, piece: Piece) -> FloatArray:
+    """A bijective map scaled such that its distances are nearest to the surface's, its middle at the origin."""
     # A power of two first, so that squares of lengths neither overflow nor vanish.
     uv = np.ldexp(uv, -int(np.frexp(np.ptp(uv, axis=0).max())[1]))
-    uv = uv - uv.mean(axis=0)
-    return uv * distances.error(uv).scale
+    scale = distances.error(uv).scale
+    scaled = scale * (uv - uv.mean(axis=0))
+    if certify(piece.F, scaled, loops=piece.loops).bijective:
+        return scaled
+    # Triangles so thin that rounding inverts them: powers of two leave them as they are.
+    return np.ldexp(uv, int(np.rint(np.log2(scale))))
 
 
 def _dot(a: ComplexArray, b: ComplexArray) -> float:

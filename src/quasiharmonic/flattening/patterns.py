@@ -75,6 +75,16 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
         their allowances would overlap.
     ImportError
         When there is an allowance and Shapely is not installed.
+
+    Examples
+    --------
+    A square of 4 cm with 1 cm around it:
+
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> lines = pattern(F, 4 * V, unit="cm", allowance=1)
+    >>> [(float(line[0].min()), float(line[0].max())) for line in (lines.seam, lines.cut)]
+    [(0.0, 40.0), (-10.0, 50.0)]
     """
     if unit not in UNITS:
         raise ValueError(f"unit must be one of {', '.join(UNITS)}, not {unit!r}")
