@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .cutting import Opened, cut_open
     from .diagnosis import Diagnosis, diagnose
     from .energies import Energy
+    from .flattening.flatten import flatten
     from .harmonising import harmonise
     from .inject import injective_map, quasi_harmonic_map, solve
     from .inverse import InverseMap, SurfacePoints
@@ -58,6 +59,7 @@ _HOME = {
     "cut_open": "cutting",
     "diagnose": "diagnosis",
     "distortion": "measures",
+    "flatten": "flattening.flatten",
     "flipped_triangles": "certificate",
     "harmonise": "harmonising",
     "injective_map": "inject",
@@ -101,6 +103,7 @@ __all__ = [
     "cut_open",
     "diagnose",
     "distortion",
+    "flatten",
     "flipped_triangles",
     "harmonise",
     "injective_map",

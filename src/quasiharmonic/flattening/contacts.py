@@ -111,7 +111,7 @@ class Contacts:
         return xx, xy, yy
 
     def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
-        """Those of a set (3, k) of pairs of ``n`` vertices, all of it with a reach of 0 for the others, and the rest."""
+        """Those of a known set (3, k) of pairs of ``n`` vertices, with reach 0 for the others in it, and the rest."""
         keys, own = (pairs[0] * n + pairs[1] for pairs in (known, self.corners))
         order = np.argsort(keys)
         keys = np.append(keys[order], np.iinfo(np.int64).max)
