@@ -339,21 +339,21 @@ def test_no_boundary_runs_into_itself():
     assert sample.error(as_it_would).mean < sample.error(result.uv).mean < 0.5 * sample.error(start).mean
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [1, 8, 13])
 def test_a_start_that_rounding_would_invert_is_taken_as_it_is(seed):
     V, F = surfaces.grid(4, 4)
-    uv = V.copy()
-    # Three vertices of a triangle so near to a line that hardly any scale keeps its sign.
-    corner = F[3]
-    a, b = uv[corner[0]], uv[corner[1]]
-    middle = 0.3 * a + 0.7 * b
-    inside = uv[corner[2]] - middle
     rng = np.random.default_rng(seed)
-    uv[corner[2]] = middle + inside * 2.0 ** -rng.uniform(40, 52)
-    uv = uv @ np.array([[0.8, 0.6], [-0.6, 0.8]])
-    if not certify(F, uv).bijective:
-        pytest.skip("the start itself did not survive rounding")
-    assert keep_distances(V, F, uv, rings=4).certificate.bijective
+    uv = turned(V, rng.uniform(0.2, 1.3))
+    # A vertex so near to the opposite side that few scales keep it there: of these seeds the one wanted does not.
+    a, b, c = (0, 1, 6)
+    foot = 0.3 * uv[a] + 0.7 * uv[b]
+    uv[c] = foot + (uv[c] - foot) * 2.0 ** -rng.uniform(49, 54)
+    assert certify(F, uv).bijective
+    scale = surface_distances(V, F, rings=4, sources=7, targets=120, crossings=3).error(uv).scale
+    assert not certify(F, scale * (uv - uv.mean(axis=0))).bijective
+    result = keep_distances(V, F, uv, rings=4)
+    assert result.certificate.bijective
+    assert result.history[-1].energy < result.history[0].energy
 
 
 def test_ctrl_c_hands_back_the_best_map_so_far(dome):
