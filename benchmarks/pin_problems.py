@@ -33,7 +33,7 @@ Generator = np.random.Generator
 
 _SMALLEST, _LARGEST = 500, 4000
 # Surfaces drawn until one bears a deformation of some strength.
-_ATTEMPTS = 40
+_ATTEMPTS = 200
 
 
 class Pinned(NamedTuple):

@@ -32,6 +32,7 @@ from quasiharmonic.mesh.topology import edge_keys, edges, named
 from quasiharmonic.problem import Problem
 from quasiharmonic.refinement import refine
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.strategy import Descent, speed
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -41,6 +42,9 @@ BoolArray = NDArray[np.bool_]
 _TOLERANCE, _STEPS = 1e-2, 40
 # Distance of the frame over the longer side of the box around surface and pins, in one try after the other.
 _MARGINS = 0.5, 1.5
+# Iterations after which tensors are left for vertices, and how many of these: three times as quick in hard cases as to
+# wait until tensors have settled, and as sure, since what is tried otherwise comes after.
+_FIRST, _UNTANGLING = 60, 300
 # Linear solves at most in each try, and times that edges of air are split as a diagnosis says.
 _ITERATIONS, _SPLITS = 2000, 4
 
@@ -121,6 +125,18 @@ def moved_onto(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArra
     if not 0 < abs(factor) < np.inf:
         factor = 1.0
     return ((w - here.mean()) * factor + there.mean()).view(np.float64).reshape(-1, 2)
+
+
+def _stages(problem: Problem) -> list[Descent]:
+    """What is tried, in which order: air gives way, so that vertices can be moved soon."""
+    stages = speed(problem)
+    if stages[0].optimizer == "coarse-to-fine":
+        return stages
+    return [
+        Descent(parameterization="si-log", iterations=_FIRST),
+        Descent("untangling", iterations=_UNTANGLING, resume=True),
+        *stages,
+    ]
 
 
 def _pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
@@ -209,6 +225,7 @@ class _Pinned:
             settings = self._settings
             found = solve(
                 problem,
+                strategy=_stages(problem),
                 max_iterations=_ITERATIONS,
                 linear_solver=settings.linear_solver,
                 callback=settings.callback,
