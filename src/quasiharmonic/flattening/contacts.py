@@ -84,9 +84,10 @@ class Contacts:
     def curvature(self, w: ComplexArray) -> QuadraticForm:
         """Its second derivative along the present directions of contact, in the derivatives that `HATS` defines."""
         d, normal, s = _nearest(*w[self.corners])
-        half = 0.5 * self._stiffness(d)
+        half: FloatArray = 0.5 * self._stiffness(d)
         # dv − da = dp + dq and db − da = i (dp − dq).
-        alpha, beta = normal.conj() * (1 - 1j * s), normal.conj() * (1 + 1j * s)
+        alpha: ComplexArray = normal.conj() * (1 - 1j * s)
+        beta: ComplexArray = normal.conj() * (1 + 1j * s)
         return QuadraticForm(
             pp=half * (1 + s**2),
             qq=half * (1 + s**2),
@@ -104,11 +105,12 @@ class Contacts:
         d, normal, s = _nearest(*w[self.corners])
         bound = 3 * self._stiffness(d) * np.stack([np.ones(s.shape), (1 - s) ** 2, s**2])
         at = self.corners.ravel()
-        xx, xy, yy = (
-            np.bincount(at, (bound * part).ravel(), minlength=w.size)
-            for part in (normal.real**2, normal.real * normal.imag, normal.imag**2)
-        )
-        return xx, xy, yy
+
+        def summed(part: FloatArray) -> FloatArray:
+            # Of nothing bincount makes integers.
+            return np.bincount(at, (bound * part).ravel(), minlength=w.size).astype(np.float64, copy=False)
+
+        return summed(normal.real**2), summed(normal.real * normal.imag), summed(normal.imag**2)
 
     def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
         """Those of a known set (3, k) of pairs of ``n`` vertices, with reach 0 for the others in it, and the rest."""

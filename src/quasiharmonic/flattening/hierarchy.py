@@ -207,5 +207,6 @@ def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, 
 def _fan_positive(ring: ComplexArray) -> BoolArray:
     """Whether the fan from the first vertex of each ring has only positive triangles."""
     arm = ring[:, 1:] - ring[:, :1]
-    positive: BoolArray = ((arm[:, :-1].conj() * arm[:, 1:]).imag > 0).all(axis=1)
+    twice_area: FloatArray = (arm[:, :-1].conj() * arm[:, 1:]).imag
+    positive: BoolArray = np.all(twice_area > 0, axis=1)
     return positive
