@@ -127,6 +127,30 @@ def test_figure_18(example):
         assert row["known obstructions"]
 
 
+def test_cortex(example):
+    pytest.importorskip("nilearn")
+    numbers = example("cortex", rings=5)
+    assert numbers["triangles"] == 18_654
+    maps = [numbers[name] for name in ("published", "symmetric Dirichlet", "distances")]
+    assert all(row["bijective"] for row in maps)
+    assert maps[2]["distance error, mean"] < 0.95 * min(row["distance error, mean"] for row in maps[:2])
+    assert maps[2]["distance error, rms"] < 0.95 * min(row["distance error, rms"] for row in maps[:2])
+
+
+def test_pattern(example, tmp_path):
+    pytest.importorskip("shapely")
+    panels = list(example("pattern", size=10).values())
+    assert (tmp_path / "pattern.svg").exists()
+    assert all(panel["bijective"] for panel in panels)
+    assert all(0.9 < panel["strongest shrinking"] < panel["strongest stretch"] < 1.2 for panel in panels)
+    upper, lower = panels[0], panels[2]
+    assert upper["seam along the side, mm"] == pytest.approx(lower["seam along the side, mm"], rel=5e-3)
+    right, left = panels[:2]
+    assert right["seam along the back or belly, mm"] == pytest.approx(
+        left["seam along the back or belly, mm"], rel=1e-3
+    )
+
+
 def test_all_are_tested():
     assert {f"test_{name}" for name in SCRIPTS} <= set(globals())
 

@@ -88,8 +88,8 @@ def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
     brought = re.search(r"\[(.*)\]", extras["test"][0]).group(1).split(",")
     installed = " ".join(line for name in ("test", *brought) for line in extras[name])
     optional = (ROOT / ".ci" / "optional").read_text(encoding="utf-8")
-    assert "'.[test,view]' gmsh vtk" in optional
+    assert "'.[test,view,cortex]' gmsh vtk" in optional
     assert "scikit-sparse" in optional
     assert {"igl", "polyscope"} <= wanted
-    known = f"{installed} {' '.join(extras['view'])}"
+    known = f"{installed} {' '.join(extras['view'] + extras['cortex'])}"
     assert not [name for name in wanted if name not in sys.stdlib_module_names and name not in known]

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from quasiharmonic.energy.polishing import polish
     from quasiharmonic.exact.certificate import Certificate, certify, flipped_triangles, is_injective
     from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
+    from quasiharmonic.flattening.flattened import flatten
     from quasiharmonic.mesh.refinement import Refined, refine
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
@@ -59,6 +60,7 @@ _HOME = {
     "cut_open": "apply.cutting",
     "diagnose": "exact.diagnosis",
     "distortion": "energy.measures",
+    "flatten": "flattening.flattened",
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
     "injective_map": "search.inject",
@@ -102,6 +104,7 @@ __all__ = [
     "cut_open",
     "diagnose",
     "distortion",
+    "flatten",
     "flipped_triangles",
     "harmonise",
     "injective_map",

@@ -19,6 +19,7 @@ from quasiharmonic.cli import (
     check,
     demo,
     diagnose,
+    flatten,
     harmonise,
     map,
     measure,
@@ -33,6 +34,7 @@ from quasiharmonic.cli.report import ReportError
 
 COMMANDS = (
     map,
+    flatten,
     morph,
     repair,
     polish,

@@ -251,7 +251,7 @@ class RegularisedDescent:
         found = system.descent(gradient, _SHIFTS)
         if found is None or not found[1] > 0:
             return None
-        direction, promise = found
+        direction, promise, _ = found
         full = np.zeros_like(self.w)
         full[system.free] = direction
         start = self.w

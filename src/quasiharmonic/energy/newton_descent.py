@@ -80,6 +80,7 @@ class NewtonDescent:
         self._deformation = self.energy.deform(self.w)
         self.value = self.first = self.energy.value_of(self._deformation)
         self._cut = True
+        self._shift = 0
         self._idle = 0
 
     @property
@@ -123,12 +124,33 @@ class NewtonDescent:
         """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
         or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
         """
-        self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
-        found = self.system.descent(gradient, _SHIFTS)
+        self.assemble(negative)
+        # While steps are cut short, what was too little for the last matrix is for this one.
+        skipped = self._shift if self._cut else 0
+        found = self.system.descent(gradient, _SHIFTS[skipped:], self.solve)
         if found is not None:
-            return *found, True
+            direction, promise, tried = found
+            self._shift = skipped + tried
+            return direction, promise, True
         direction = self.system.solve_diagonal(-gradient)
         return direction, -work(gradient, direction), False
+
+    def assemble(self, negative: float) -> None:
+        """Fill in the system's matrix at the map at hand."""
+        self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
+
+    def solve(self, load: ComplexArray) -> ComplexArray:
+        """The displacement of the free vertices under a load on them, the matrix being factored."""
+        return self.system.solve(load)
+
+    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+        """The energy of a map (n,) complex128, and the map with its Jacobians if it may be gone on from: if its energy
+        is below a bound and every triangle, exactly, positive.
+        """
+        deformation = self.energy.deform(w)
+        value = self.energy.value_of(deformation)
+        accepted = value < bound and is_injective(self.energy.F, self.positions(w))
+        return value, (w, deformation) if accepted else None
 
     def _search(self, direction: ComplexArray, promise: float) -> bool:
         """Move along a direction, as far as is good; False where no step lowers the energy enough."""
@@ -140,12 +162,7 @@ class NewtonDescent:
         start, before = self.w, self.value
 
         def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
-            """Accept what is below the bound, and every triangle, exactly, positive."""
-            w = start + t * full
-            deformation = self.energy.deform(w)
-            value = self.energy.value_of(deformation)
-            accepted = value < bound and is_injective(self.energy.F, self.positions(w))
-            return value, (w, deformation) if accepted else None
+            return self.tried(start + t * full, bound)
 
         taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=HALVINGS)
         if taken is None:

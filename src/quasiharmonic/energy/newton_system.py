@@ -7,7 +7,7 @@ values that the factorisation reads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array, triu
@@ -113,6 +113,12 @@ class NewtonSystem:
             self._values[slot] = self._sum_corners @ part.ravel()
         self._diagonal = self._values[self._first]
 
+    def add_blocks(self, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> None:
+        """Add a symmetric 2×2 block at every free vertex to the assembled matrix; (n - k,) float64 each."""
+        for slot, part in zip(self._corner_slots, (xx, xy, yy), strict=True):
+            self._values[slot] += part
+        self._diagonal = self._values[self._first]
+
     def matrix(self) -> csr_array:
         """The assembled matrix, both of its triangles; for study and tests."""
         size = self._first.size
@@ -148,7 +154,12 @@ class NewtonSystem:
         """
         return self.solver.solve(np.ascontiguousarray(load).view(np.float64)).view(np.complex128)
 
-    def descent(self, gradient: ComplexArray, shifts: Sequence[float]) -> tuple[ComplexArray, float] | None:
+    def descent(
+        self,
+        gradient: ComplexArray,
+        shifts: Sequence[float],
+        solve: Callable[[ComplexArray], ComplexArray] | None = None,
+    ) -> tuple[ComplexArray, float, int] | None:
         """Newton's direction by the assembled matrix, its diagonal raised as much as a factorisation needs.
 
         Parameters
@@ -157,23 +168,26 @@ class NewtonSystem:
             By the free vertices' positions.
         shifts : sequence of float
             Fractions by which the diagonal is raised, tried in turn.
+        solve : callable, optional
+            From a load to the displacements under it, with the matrix factored; `solve` by default.
 
         Returns
         -------
         direction : (n - k,) complex128
         promise : float
-            The rate at which the energy falls along it (the squared decrement); not negative. Instead of both, None
-            where no shift leaves a positive definite matrix.
+            The rate at which the energy falls along it (the squared decrement); not negative.
+        number : int
+            Of the shift that did. Instead of all three, None where no shift leaves a positive definite matrix.
         """
-        for shift in shifts:
+        for number, shift in enumerate(shifts):
             try:
                 self.factor(shift)
-                direction = self.solve(-gradient)
+                direction = (solve or self.solve)(-gradient)
             except NotPositiveDefinite:
                 continue
             promise = -work(gradient, direction)
             if promise >= 0:
-                return direction, promise
+                return direction, promise, number
         return None
 
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:

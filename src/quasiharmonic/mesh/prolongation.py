@@ -106,16 +106,17 @@ def _smooth(w: ComplexArray, T: IntArray, held: BoolArray) -> None:
         new = w.copy()
         new[moving] += _SHARE * ((real + 1j * imag) / degree[moving] - w[moving])
         back = np.zeros(w.size, dtype=bool)
-        inverted = T.compress(~_positive(new, T), axis=0)
+        inverted = T.compress(~positive(new, T), axis=0)
         while len(inverted) and not back[inverted].all():
             back[inverted] = True
             new[inverted] = w[inverted]
             touched = T.compress(touching(T, back), axis=0)
-            inverted = touched.compress(~_positive(new, touched), axis=0)
+            inverted = touched.compress(~positive(new, touched), axis=0)
         w[:] = new
 
 
-def _positive(w: ComplexArray, T: IntArray) -> BoolArray:
+def positive(w: ComplexArray, T: IntArray) -> BoolArray:
+    """Whether triangles (t, 3) of a map are positive, in floating point; (t,) bool."""
     corners = w.take(T)
     positive: BoolArray = ((corners[:, 1] - corners[:, 0]).conj() * (corners[:, 2] - corners[:, 0])).imag > 0
     return positive

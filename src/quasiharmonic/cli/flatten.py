@@ -1,0 +1,144 @@
+"""``qhm flatten``: a mesh file → a bijective map of it, its boundary where distortion is least."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.io import MeshData
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.cli import arguments
+
+    parser = commands.add_parser(
+        "flatten",
+        help="lay a surface flat, its boundary free, without overlap",
+        description="Map a surface with a boundary into the plane, its boundary going where distortion is least. No "
+        "triangle is inverted, and nothing overlaps.",
+        epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
+        "written. Ctrl-C writes the best map so far.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ or OFF file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument(
+        "--energy",
+        choices=arguments.ENERGIES,
+        default="symmetric-dirichlet",
+        help="what is lowered; mips is for angles alone (default: symmetric-dirichlet)",
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="FILE", help="how much each triangle counts, a positive number on each line"
+    )
+    parser.add_argument(
+        "--start", action="store_true", help="begin with the map in the input's texture coordinates (vt)"
+    )
+    parser.add_argument(
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="vertices, 0-based, one a line, that are held where the input's vt have them",
+    )
+    parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
+    parser.add_argument(
+        "--cut", action="store_true", help="cut a closed surface, or one with handles, open first (copies vertices)"
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=500, metavar="N", help="(default: 500)")
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, flatten, write, read back, judge, report."""
+    from quasiharmonic import io
+    from quasiharmonic.cli import progress, report
+    from quasiharmonic.energy.measures import distortion
+    from quasiharmonic.exact.certificate import certify
+    from quasiharmonic.flattening.flattened import flatten
+
+    began = time.perf_counter()
+    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.weights, options.fixed))
+    mesh = io.read_mesh(options.input)
+    given: dict[str, Any] = {}
+    if options.start:
+        given["start"] = io.map_of(mesh)
+    if options.fixed is not None:
+        _, _, given["fixed"], given["target"] = io.problem_arrays(mesh, io.read_handles(options.fixed, len(mesh.V)))
+    if options.weights is not None:
+        given["weights"] = _numbers(options.weights)
+    copies = 0
+    with report.about(options.input):
+        if options.cut:
+            if given:
+                raise ValueError("--cut makes new vertices, to which --start and --fixed say nothing: leave them out")
+            mesh, copies = _opened(mesh)
+        with progress.line() as show:
+            result = flatten(
+                mesh.V,
+                mesh.F,
+                energy=options.energy,
+                unit_square=options.unit_square,
+                max_iterations=options.max_iterations,
+                linear_solver=options.linear_solver,
+                callback=show,
+                **given,
+            )
+    io.write_map(options.output, mesh, result.uv)
+    with report.after_writing(options.output):
+        written = io.read_mesh(options.output)
+        certificate = certify(written.F, io.map_of(written))
+        measured = distortion(mesh.V, mesh.F, result.uv)
+        facts = {
+            **result.to_dict(),
+            **report.verdict(certificate),
+            "vertices": len(mesh.V),
+            "triangles": len(mesh.F),
+            "copied_vertices": copies,
+            "energy": options.energy,
+            "mean_energy": result.history[-1].energy if result.history else None,
+            "distortion": measured.to_dict(),
+            "input": str(options.input),
+            "output": str(options.output),
+            "seconds_in_all": time.perf_counter() - began,
+        }
+        worst = measured.summary("isometric").maximum
+        lines = [report.of_map(result, certificate, options.output)]
+        if copies:
+            lines.append(f"cut open: {copies} vertices along the cut have a copy at the end of the list")
+        lines += [f"stretched {worst:.3g} times at worst", result.status.value]
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0 if certificate.bijective else 1
+
+
+def _opened(mesh: MeshData) -> tuple[MeshData, int]:
+    """The mesh cut open, if it is closed or has handles, and how many vertices that has copied."""
+    from quasiharmonic.apply.cutting import cut_open
+    from quasiharmonic.mesh.topology import edges, trace_loops
+
+    found = edges(mesh.F, len(mesh.V))
+    euler = len(mesh.V) - len(found.interior) - len(found.boundary) + len(mesh.F)
+    if len(found.boundary) and euler == 2 - len(trace_loops(found.boundary)):
+        return mesh, 0
+    opened = cut_open(mesh.V, mesh.F)
+    extra = None if mesh.extra is None else mesh.extra[opened.origin]
+    return replace(mesh, V=opened.V, F=opened.F, extra=extra), len(opened.V) - len(mesh.V)
+
+
+def _numbers(path: Path) -> list[float]:
+    """One number on each line."""
+    values = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        text = line.split("#")[0].strip()
+        if text:
+            try:
+                values.append(float(text))
+            except ValueError:
+                raise ValueError(f"{path}, line {number}: {text!r} is not a number") from None
+    return values

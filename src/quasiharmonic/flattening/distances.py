@@ -1,0 +1,233 @@
+"""Distances along a surface, a sample of them, and how well a flat map keeps them.
+
+This is how brain mapping judges flat maps: not triangle by triangle, but by distances between vertices up to some rings
+apart, along the surface and straight in the plane. *Rings* count edges: two vertices are k rings apart if the shortest
+way along edges has k of them. What is measured here, all of which belongs beside any figure:
+
+- *Pairs*: sources drawn at random among the vertices, and for each all vertices at most so many rings away, or so many
+  of these, drawn at random. All pairs count alike; so do all vertices, whatever their area. Errors gather in places:
+  on a cortex of 9,465 vertices a thousand sources leave the mean uncertain by 0.3 % of the distances. To compare maps
+  that does not matter, as long as it is the same sample; for a figure to be quoted take all vertices as sources.
+- *Along the surface*: the shortest chain of straight segments that cross at most so many edges each
+  (`quasiharmonic.flattening.geodesics`), on the surface as it has been cut: no way leads across a cut. Never too short,
+  and with 5 crossings 0.2 % too long on average on a folded surface, with 3 crossings 0.6 %.
+- *In the plane*: straight, whatever lies between.
+- *Scale*: the map as a whole is scaled by the factor for which the mean error is least.
+- *Error*: of each pair ``|scale · d_plane / d_surface − 1|``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, real_array, whole_number
+from quasiharmonic.flattening.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
+
+# The farthest vertices are looked for up to so many mean edges for each ring.
+_REACH = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceError:
+    """How far the distances of a map are off; made by `distance_error`.
+
+    Attributes
+    ----------
+    scale : float
+        What the map was multiplied by: the factor for which `mean` is least.
+    relative : (k,) float64
+        ``scale · d_plane / d_surface − 1`` of every pair: positive where the map has it longer.
+    """
+
+    scale: float
+    relative: FloatArray
+
+    @property
+    def mean(self) -> float:
+        """Of the absolute values; 0.15 when distances are 15 % off on average."""
+        return float(np.abs(self.relative).mean())
+
+    @property
+    def median(self) -> float:
+        """Of the absolute values."""
+        return float(np.median(np.abs(self.relative)))
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square, which minds large errors more."""
+        return float(np.sqrt(np.mean(self.relative**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceDistances:
+    """Distances along a surface between some pairs of its vertices; made by `surface_distances`.
+
+    Attributes
+    ----------
+    source, target : (k,) int64
+        Vertices; sources ascending.
+    length : (k,) float64
+        Along the surface, positive.
+    """
+
+    source: IntArray
+    target: IntArray
+    length: FloatArray
+
+    def error(self, uv: ArrayLike) -> DistanceError:
+        """Compare with distances in the plane.
+
+        Parameters
+        ----------
+        uv : (n, 2) array
+            A map, injective or not.
+
+        Returns
+        -------
+        DistanceError
+        """
+        places = real_array("uv", uv)
+        if places.ndim != 2 or places.shape[1] != 2:
+            raise ValueError(f"uv must have shape (n, 2), not {places.shape}")
+        check_range("a pair", np.concatenate([self.source, self.target]), len(places))
+        check_finite("uv", "vertex", "vertices", places)
+        apart = places[self.source] - places[self.target]
+        ratio = np.hypot(apart[:, 0], apart[:, 1]) / self.length
+        scale = _best_scale(ratio)
+        return DistanceError(scale, scale * ratio - 1)
+
+
+def surface_distances(
+    V: ArrayLike,
+    F: ArrayLike,
+    *,
+    rings: int = 20,
+    sources: int = 1000,
+    targets: int | None = None,
+    crossings: int = 5,
+    seed: int = 0,
+) -> SurfaceDistances:
+    """Sample distances along a surface.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles of a surface, consistently oriented.
+    rings : int
+        How many edges apart vertices of a pair are at most.
+    sources : int
+        Vertices from which distances are taken, drawn at random without repetition; all, if there are no more.
+    targets : int, optional
+        Vertices to which they are taken from each source, drawn at random; by default all within so many rings.
+    crossings : int
+        How many edges each straight segment of a path may cross; see the module's description.
+    seed : int
+        Of what is drawn: the same for the same surface and numbers.
+
+    Returns
+    -------
+    SurfaceDistances
+        In the unit of ``V``.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape, an index is out of range, a coordinate is not finite, a triangle has no
+        area, or a number is not a whole number of at least 1 (``crossings`` and ``seed``: 0).
+    """
+    V, F = real_array("V", V), index_array("F", F)
+    if F.ndim != 2 or F.shape[1] != 3 or not len(F):
+        raise ValueError(f"F must have shape (f, 3) with at least one triangle, not {F.shape}")
+    if V.ndim != 2 or V.shape[1] not in (2, 3):
+        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
+    check_range("F", F, len(V))
+    check_finite("V", "vertex", "vertices", V)
+    for name, value in (("rings", rings), ("sources", sources)):
+        whole_number(name, value, least=1)
+    for name, value in (("crossings", crossings), ("seed", seed)):
+        whole_number(name, value, least=0)
+    if targets is not None:
+        whole_number("targets", targets, least=1)
+    dice = np.random.default_rng(seed)
+    used = np.unique(F)
+    source = used if sources >= used.size else np.sort(dice.choice(used, sources, replace=False))
+    edges = edge_graph(F, len(V))
+    row, target = neighbours_within(edges, source, rings)
+    if targets is not None:
+        kept = _some_of_each(row, targets, dice)
+        row, target = row[kept], target[kept]
+    segments = straight_segments(V, F, crossings)
+    mean_edge = (segments * edges).sum() / edges.nnz
+    length = chain_lengths(segments, source, row, target, float(_REACH * rings * mean_edge))
+    return SurfaceDistances(source[row], target, length)
+
+
+def distance_error(
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int = 20, sources: int = 1000, crossings: int = 5
+) -> DistanceError:
+    """Measure how far the distances of a map are off.
+
+    Sources are drawn at random among the vertices, always the same; from each the distances to all vertices at most
+    ``rings`` edges away are compared, along the surface against straight in the plane. All pairs count alike, and the
+    map is scaled as a whole such that their mean error is least. To judge several maps of one surface, sample it once
+    with `surface_distances` and ask that for the ``error`` of each.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles of a surface, consistently oriented.
+    uv : (n, 2) array
+        The map, injective or not.
+    rings, sources, crossings
+        As `surface_distances` has them. Shortest paths are chains of straight segments that cross at most
+        ``crossings`` edges each: never too short, and with 5 on average 0.2 % too long where a surface is folded.
+
+    Returns
+    -------
+    DistanceError
+        With `~DistanceError.mean`, `~DistanceError.median` and `~DistanceError.rms` of ``|relative|``.
+
+    Raises
+    ------
+    ValueError
+        As `surface_distances` does, or when ``uv`` has the wrong shape or is not finite.
+
+    Examples
+    --------
+    A square of 2 by 2 stretched to 4 by 2: lengths are off by up to a half, of which scaling takes a part.
+
+    >>> import numpy as np
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(12, 12)
+    >>> found = distance_error(V, F, V * [2, 1], rings=4)
+    >>> bool(0.15 < found.mean < 0.35), bool(0.5 < found.scale < 1)
+    (True, True)
+    >>> distance_error(V, F, 3 * V, rings=4).mean < 1e-2
+    True
+    """
+    n = len(np.asarray(V))
+    if np.shape(uv) != (n, 2):
+        raise ValueError(f"uv must have shape ({n}, 2), a position for every vertex, not {np.shape(uv)}")
+    return surface_distances(V, F, rings=rings, sources=sources, crossings=crossings).error(uv)
+
+
+def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArray:
+    """Which of the entries to keep such that at most so many are left of each row; ``row`` is ascending."""
+    order = np.argsort(row + dice.random(row.size))
+    place = np.arange(row.size) - np.searchsorted(row, row)
+    return np.sort(order[place < most])
+
+
+def _best_scale(ratio: FloatArray) -> float:
+    """The factor s for which the mean of ``|s · ratio − 1|`` is least; 1 where all ratios are 0."""
+    # Its slope changes by the ratio where a term vanishes, at 1/ratio: a median of these, weighted by the ratios.
+    falling = np.sort(ratio)[::-1]
+    weight = np.cumsum(falling)
+    return float(1 / falling[np.searchsorted(weight, 0.5 * weight[-1])]) if weight[-1] > 0 else 1.0

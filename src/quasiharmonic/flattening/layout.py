@@ -1,0 +1,62 @@
+"""Where a flat map lies on the sheet: turned to its principal axis, its corner at the origin, several side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.energy.deformation import signed_areas
+
+# The space between two components, as a share of the largest side of all.
+_GAP = 0.05
+
+
+def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
+    """A map turned such that its principal axis is the x axis, its bounding box at the origin.
+
+    The axis is that of the image's moments of inertia. Of its two senses the one is taken in which the image is
+    skewed to the left: of its area, the longer tail points to the right.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    uv : (n, 2) float64
+        A map with positive triangles, of about unit size.
+
+    Returns
+    -------
+    (n, 2) float64
+        The same turned and shifted, and so rounded anew.
+    """
+    w = np.ascontiguousarray(uv).view(np.complex128).ravel()
+    area = signed_areas(F, w)
+    corners = w[F]
+    middle = corners.mean(axis=1)
+    centre = (area * middle).sum() / area.sum()
+    # Second moments of a triangle about a point, by its corners c and its middle m: area/12 (Σ c² + 9 m²).
+    spread = (area * (((corners - centre) ** 2).sum(axis=1) + 9 * (middle - centre) ** 2)).sum()
+    turned = (w - centre) * np.exp(-0.5j * np.angle(spread)) if abs(spread) > 0 else w - centre
+    along = turned[F].mean(axis=1).real
+    if (area * along**3).sum() < 0:
+        turned = -turned
+    laid = turned.view(np.float64).reshape(-1, 2)
+    return laid - laid.min(axis=0)
+
+
+def side_by_side(parts: Sequence[FloatArray]) -> list[FloatArray]:
+    """Shift maps (n, 2) whose bounding boxes begin at the origin such that they stand in a row, with gaps between."""
+    gap = _GAP * max(float(part.max()) for part in parts)
+    shifted, right = [], 0.0
+    for part in parts:
+        shifted.append(part + np.array([right, 0.0]))
+        right = float(shifted[-1][:, 0].max()) + gap
+    return shifted
+
+
+def in_unit_square(uv: FloatArray) -> FloatArray:
+    """A map scaled evenly, and shifted, into the middle of the unit square."""
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    size = float((high - low).max())
+    return 0.5 + (uv - low - 0.5 * (high - low)) / size

@@ -1,0 +1,189 @@
+"""The air around a flat surface: bijective together with it, nothing added on the boundary, triangles of good shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic.exact.certificate import certify, is_injective
+from quasiharmonic.flattening import constrained_delaunay as triangulating
+from quasiharmonic.flattening.air import air_around
+from quasiharmonic.flattening.constrained_delaunay import BlockedError, Triangulation, constrained_delaunay
+from quasiharmonic.flattening.graded_points import Quadtree
+from quasiharmonic.mesh.topology import boundary_loops, edge_keys, edges
+from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+
+
+def fan(radii, angles):
+    """A star-shaped polygon around the origin, as triangles from its middle."""
+    n = len(radii)
+    rim = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+    k = np.arange(n)
+    return np.stack([np.full(n, n), k, (k + 1) % n], axis=1), np.concatenate([rim, [[0.0, 0.0]]])
+
+
+def blocks(gap, seed=0):
+    """Two rectangles face to face across a gap, whose vertices do not face each other."""
+    rng = np.random.default_rng(seed)
+    parts, places, count = [], [], 0
+    for low in (-0.3, gap):
+        x = np.sort(np.concatenate([[0, 1], rng.uniform(0, 1, 60)]))
+        k = np.arange(len(x) - 1) + count
+        up = len(x)
+        places += [np.stack([x, np.full(up, y)], axis=1) for y in (low, low + 0.3)]
+        parts.append(np.concatenate([np.stack([k, k + 1, k + 1 + up], 1), np.stack([k, k + 1 + up, k + up], 1)]))
+        count += 2 * up
+    return np.concatenate(parts), np.concatenate(places)
+
+
+def checked(F, uv, **options):
+    """Air, after every promise of it has been checked by other means; and everything that it makes with the surface."""
+    before = uv.copy()
+    air = air_around(F, uv, boundary_loops(F, len(uv)), **options)
+    assert np.array_equal(uv, before)
+    points, triangles = np.concatenate([uv, air.points]), np.concatenate([F, air.F])
+    verdict = certify(triangles, points)
+    assert verdict.bijective, verdict.summary()
+    # One boundary is left, the frame: so every edge of the surface's boundary is one of the air's.
+    (loop,) = verdict.loops
+    assert set(loop.tolist()) == set(air.frame.tolist())
+    assert set(np.unique(air.F)) >= set(len(uv) + np.arange(len(air.points)))
+    return air, points, triangles
+
+
+@pytest.fixture(params=["Qhull", "one by one"])
+def way(request, monkeypatch):
+    """Both ways to the first triangles."""
+    if request.param == "one by one":
+        monkeypatch.setattr(triangulating, "by_qhull", lambda points: np.empty((0, 3), dtype=np.int64))
+    return request.param
+
+
+@pytest.mark.parametrize("surface", [disk(8), annulus(8), random_delaunay(500), grid(9, 3)])
+def test_is_around_surfaces(surface, way):
+    V, F = surface
+    air, points, _ = checked(F, V[:, :2])
+    corners = points[air.F] @ (1, 1j)
+    sides = np.roll(corners, -1, axis=1) - corners
+    angles = np.angle(np.roll(-sides, 1, axis=1) / sides)
+    assert np.degrees(angles).min() > 15
+    assert len(air.F) < 12 * sum(map(len, boundary_loops(F, len(V)))) + 400
+
+
+def test_frame_is_as_far_as_asked():
+    V, F = disk(6)
+    far = np.array([[5.0, 0.0], [-1.0, 7.0]])
+    for around, low, high in ((None, V.min(0), V.max(0)), (far, (-1, -1), (5, 7))):
+        air, _, _ = checked(F, V[:, :2], margin=1.0, around=around)
+        frame = air.points[air.frame - len(V)]
+        longer = np.max(np.subtract(high, low))
+        assert np.all(frame.min(0) <= np.asarray(low) - 0.99 * longer)
+        assert np.all(frame.max(0) >= np.asarray(high) + 0.99 * longer)
+        assert np.all(frame.max(0) <= np.asarray(high) + 1.5 * longer)
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-6, 1e-9])
+def test_thin_gaps_are_bridged(gap, way):
+    F, uv = blocks(gap)
+    checked(F, uv)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_needles_bays_and_edges_of_all_lengths(seed, way):
+    rng = np.random.default_rng(seed)
+    angles = np.unique(np.concatenate([rng.uniform(0, 2 * np.pi, 40), 1 + np.cumsum(10.0 ** rng.uniform(-11, -2, 30))]))
+    assert np.diff(angles, append=angles[0] + 2 * np.pi).max() < np.pi
+    radii = np.exp(rng.normal(0, (0.1, 0.5, 1.5)[seed % 3], len(angles)))
+    radii[:: 9 + seed] = 1e-6
+    F, uv = fan(radii, angles)
+    assert certify(F, uv).bijective
+    checked(F, uv)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e150, 0.0), (1e-150, 0.0), (1.0, 1e6)])
+def test_any_unit_will_do(scale, offset):
+    F, uv = blocks(1e-2)
+    checked(F, scale * uv + offset)
+
+
+def test_is_deterministic():
+    V, F = annulus(8)
+    first, second = (air_around(F, V, boundary_loops(F, len(V))) for _ in range(2))
+    assert np.array_equal(first.points, second.points)
+    assert np.array_equal(first.F, second.F)
+
+
+def test_a_boundary_that_meets_itself_is_refused():
+    F, uv = blocks(1e-2)
+    uv[len(uv) // 2 :, 1] -= 1e-2
+    with pytest.raises(ValueError, match="meets itself"):
+        air_around(F, uv, boundary_loops(F, len(uv)))
+
+
+def test_a_margin_is_positive():
+    V, F = disk(3)
+    with pytest.raises(ValueError, match="margin"):
+        air_around(F, V, boundary_loops(F, len(V)), margin=0)
+
+
+def in_circles(points, triangles):
+    """Triangles whose circle has a point across an edge inside it, and the keys of those edges."""
+    n = len(points)
+    apex = {(a, b): c for t in triangles.tolist() for a, b, c in (t, t[1:] + t[:1], t[2:] + t[:2])}
+    for (a, b), c in apex.items():
+        d = apex.get((b, a))
+        if d is not None and a < b:
+            rows = [[*(points[k] - points[d]), ((points[k] - points[d]) ** 2).sum()] for k in (a, b, c)]
+            if np.linalg.det(rows) > 1e-12:
+                yield int(edge_keys(np.array([a]), np.array([b]), n)[0])
+
+
+def test_triangles_are_delaunay_but_for_segments(way):
+    rng = np.random.default_rng(3)
+    hull_angles = np.arange(12) * np.pi / 6
+    hull = 3 * np.stack([np.cos(hull_angles), np.sin(hull_angles)], axis=1)
+    points = np.concatenate([hull, rng.uniform(-1, 1, (200, 2))])
+    # Two chords through all of it, which touch no point.
+    points = np.concatenate([points, [[-1.5, 0.013], [1.5, 0.0117], [-1.4, 0.5], [1.4, 0.51]]])
+    segments = np.array([[212, 213], [214, 215]])
+    triangles = constrained_delaunay(points, segments, np.arange(12))
+    assert is_injective(triangles, points)
+    assert len(triangles) == 2 * len(points) - 2 - 12
+    required = set(edge_keys(segments[:, 0], segments[:, 1], len(points)).tolist())
+    found = edges(triangles, len(points))
+    assert required <= set(edge_keys(*found.interior.T, len(points)).tolist())
+    assert set(in_circles(points, triangles)) <= required
+
+
+def test_a_point_on_a_segment_is_named(way):
+    hull = np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])
+    points = np.concatenate([hull, [[-1, 0], [1, 0], [0.5, 0], [0.1, 0.4], [0.1, -0.4]]])
+    with pytest.raises(BlockedError) as caught:
+        constrained_delaunay(points, np.array([[4, 5]]), np.arange(4))
+    assert caught.value.point == 6
+
+
+def test_points_on_edges_and_outside_are_dealt_with():
+    hull = np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])
+    on_diagonal = np.concatenate([hull, [[0, 0], [1, 1], [0.5, 0.5]]])
+    triangles = Triangulation.of_points(on_diagonal, np.arange(4)).triangles()
+    assert is_injective(triangles, on_diagonal)
+    assert len(triangles) == 2 * 7 - 2 - 4
+    for bad, message in (([3.0, 0], "outside"), ([2.0, 0], "outline"), ([-2.0, -2], "coincides")):
+        with pytest.raises(ValueError, match=message):
+            Triangulation.of_points(np.concatenate([hull, [bad]]), np.arange(4))
+
+
+def test_squares_are_small_where_asked_and_grow_by_halves():
+    rng = np.random.default_rng(0)
+    places, sizes = rng.uniform(0, 4, (30, 2)), 10.0 ** rng.uniform(-6, 0, 30)
+    tree = Quadtree.around(places, sizes, np.zeros(2), 1.0, (4, 4))
+    assert np.all(tree.sizes_at(places) <= sizes)
+    level, x, y = tree.leaves()
+    size = 0.5**level
+    assert np.isclose((size**2).sum(), 16, rtol=1e-12)
+    # Just across each side lies a square of at most twice the size.
+    for dx, dy in ((0.51, 0), (-0.51, 0), (0, 0.51), (0, -0.51)):
+        beside = np.stack([(x + 0.5 + dx) * size, (y + 0.5 + dy) * size], axis=1)
+        inside = np.all((beside > 0) & (beside < 4), axis=1)
+        assert np.all(tree.sizes_at(beside[inside]) <= 2 * size[inside])

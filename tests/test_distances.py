@@ -1,0 +1,392 @@
+"""Distances along surfaces against known ones, what a map makes of them, and the descent that keeps them."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from quasiharmonic import distortion, surfaces
+from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.exact.certificate import certify
+from quasiharmonic.flattening.contacts import Rim
+from quasiharmonic.flattening.distance_descent import DistanceDescent, keep_distances
+from quasiharmonic.flattening.distance_energy import DistanceEnergy
+from quasiharmonic.flattening.distances import distance_error, surface_distances
+from quasiharmonic.flattening.geodesics import straight_segments
+from quasiharmonic.flattening.piece import Piece
+from quasiharmonic.result import Status
+
+
+def rolled(V, radius):
+    """A planar mesh rolled up around the y axis: distances along it stay."""
+    angle = V[:, 0] / radius
+    return np.stack([radius * np.sin(angle), V[:, 1], radius * np.cos(angle)], axis=1)
+
+
+def spherical(V, radius):
+    """A planar mesh put onto a sphere such that distances from the origin stay."""
+    r = np.hypot(V[:, 0], V[:, 1])
+    flat = radius * np.sin(r / radius) / np.where(r > 0, r, 1)
+    return np.stack([V[:, 0] * flat, V[:, 1] * flat, radius * np.cos(r / radius)], axis=1)
+
+
+def turned(V, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return V @ np.array([[c, -s], [s, c]]).T
+
+
+@pytest.fixture(scope="module")
+def flat():
+    return surfaces.random_delaunay(400, seed=2)
+
+
+@pytest.fixture(scope="module")
+def dome():
+    V, F = surfaces.disk(14)
+    return spherical(V, 0.8), F
+
+
+# --- along the surface
+
+
+def test_straight_segments_of_a_plane_are_exact(flat):
+    V, F = flat
+    for crossings in range(4):
+        found = straight_segments(V, F, crossings).tocoo()
+        away = np.linalg.norm(V[found.row] - V[found.col], axis=1)
+        assert np.allclose(found.data, away, rtol=1e-13)
+    assert abs(straight_segments(V, F, 3) - straight_segments(V, F, 3).T).max() < 1e-14
+
+
+def test_segments_cross_no_more_edges_than_they_may():
+    V, F = surfaces.grid(3, 3)
+    squares = [set((9 * straight_segments(V, F, k).data ** 2).round(6).tolist()) for k in range(3)]
+    assert squares[0] == {1, 2}
+    # Across one edge: the other diagonal of a square, the long way over two; straight through a vertex, by rounding.
+    assert {1, 2, 5} <= squares[1] <= {1, 2, 4, 5}
+    assert squares[1] <= squares[2] <= {1, 2, 4, 5, 8, 10}
+
+
+@pytest.mark.parametrize("lift", [lambda V: V, lambda V: rolled(V, 0.4)], ids=["plane", "cylinder"])
+def test_distances_on_what_can_be_unrolled(flat, lift):
+    V, F = flat
+    lifted = lift(V)
+    # A fine mesh of a cylinder is no cylinder; how far the mesh is from it shows in its edges.
+    chord = 0.0 if lifted.shape[1] == 2 else 1e-2
+    last = np.inf
+    for crossings, most in ((1, 3e-2), (3, 1e-2), (5, 5e-3)):
+        found = surface_distances(lifted, F, rings=10, sources=60, crossings=crossings)
+        ratio = found.length / np.linalg.norm(V[found.source] - V[found.target], axis=1)
+        assert ratio.min() > 1 - 1e-12 - chord
+        assert ratio.mean() - 1 < most
+        assert ratio.mean() < last
+        last = ratio.mean()
+    if not chord:
+        every = surface_distances(V, F, rings=10, sources=60, crossings=30)
+        assert np.allclose(every.length, np.linalg.norm(V[every.source] - V[every.target], axis=1), rtol=1e-12)
+
+
+def test_distances_on_a_sphere():
+    V, F = surfaces.disk(20)
+    radius = 0.7
+    on_sphere = spherical(V, radius)
+    found = surface_distances(on_sphere, F, rings=8, sources=80, crossings=5)
+    cosine = (on_sphere[found.source] * on_sphere[found.target]).sum(axis=1) / radius**2
+    ratio = found.length / (radius * np.arccos(np.clip(cosine, -1, 1)))
+    assert abs(ratio.mean() - 1) < 3e-3
+    assert ratio.max() < 1.03
+    assert ratio.min() > 0.99
+
+
+def test_no_way_leads_across_a_cut():
+    V, F = surfaces.grid(12, 12)
+    # Slit from the left side to the middle: the upper side of the slit gets vertices of its own.
+    middle = np.flatnonzero((np.abs(V[:, 1] - 0.5) < 1e-9) & (V[:, 0] < 0.5 - 1e-9))
+    above = (V[F].mean(axis=1)[:, 1] > 0.5)[:, None] & np.isin(F, middle)
+    copies = np.full(len(V), -1)
+    copies[middle] = len(V) + np.arange(middle.size)
+    slit, cut = np.concatenate([V, V[middle]]), np.where(above, copies[F], F)
+    found = surface_distances(slit, cut, rings=20, sources=1000, crossings=12)
+    corner, copy = middle[np.argmin(V[middle, 0])], copies[middle[np.argmin(V[middle, 0])]]
+    between = (found.source == corner) & (found.target == copy)
+    assert found.length[between] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_scale_of_coordinates_does_not_matter(dome):
+    V, F = dome
+    wanted = surface_distances(V, F, rings=4, sources=30)
+    for exponent in (-500, 500):
+        found = surface_distances(np.ldexp(V, exponent), F, rings=4, sources=30)
+        assert np.array_equal(found.length, np.ldexp(wanted.length, exponent))
+        assert found.error(np.ldexp(V[:, :2], exponent)).mean == wanted.error(V[:, :2]).mean
+
+
+def test_sample_has_the_pairs_asked_for(dome):
+    V, F = dome
+    F = np.concatenate([F, F[:1] * 0 + len(V) + [[1, 2, 3]]])  # vertex len(V) belongs to nothing
+    V = np.concatenate([V, [[9, 9, 9], [3, 0, 0], [4, 0, 0], [3, 1, 0]]])
+    every = surface_distances(V, F, rings=2, sources=10_000)
+    assert np.array_equal(np.unique(every.source), np.unique(F))
+    both = set(zip(every.source.tolist(), every.target.tolist(), strict=True))
+    assert both == {(j, i) for i, j in both}
+    assert all(i != j for i, j in both)
+    ring = {(int(i), int(j)) for i, j in zip(F.ravel(), np.roll(F, -1, axis=1).ravel(), strict=True)}
+    ring |= {(j, i) for i, j in ring}
+    assert both == ring | {(i, k) for i, j in ring for jj, k in ring if j == jj and i != k}
+    some = surface_distances(V, F, rings=2, sources=50, targets=7)
+    assert np.unique(some.source, return_counts=True)[1].max() == 7
+    assert np.unique(some.source).size == 50
+    assert set(zip(some.source.tolist(), some.target.tolist(), strict=True)) <= both
+    again = surface_distances(V, F, rings=2, sources=50, targets=7)
+    assert np.array_equal(some.target, again.target)
+    other = surface_distances(V, F, rings=2, sources=50, targets=7, seed=1)
+    assert not np.array_equal(some.source, other.source)
+
+
+# --- in the plane
+
+
+def test_scale_is_the_best_there_is(dome):
+    V, F = dome
+    rng = np.random.default_rng(0)
+    uv = V[:, :2] * [3, 1] + rng.normal(0, 0.02, (len(V), 2))
+    sample = surface_distances(V, F, rings=6, sources=100)
+    found = sample.error(uv)
+    plane = np.linalg.norm(uv[sample.source] - uv[sample.target], axis=1)
+
+    def mean(scale):
+        return np.abs(scale * plane / sample.length - 1).mean()
+
+    best = minimize_scalar(mean, bounds=(0, 3), method="bounded", options={"xatol": 1e-10})
+    assert found.mean == pytest.approx(mean(found.scale), rel=1e-12)
+    assert found.mean <= best.fun * (1 + 1e-12)
+    assert found.scale == pytest.approx(best.x, rel=1e-4)
+    assert found.rms == pytest.approx(np.sqrt(np.mean((found.scale * plane / sample.length - 1) ** 2)))
+    assert found.median <= found.mean <= found.rms
+    assert sample.error(7 * turned(uv, 1.0)).mean == pytest.approx(found.mean, rel=1e-12)
+
+
+def test_isometries_have_no_error_and_a_point_has_all(flat):
+    V, F = flat
+    assert distance_error(rolled(V, 50.0), F, turned(V, 0.3), rings=5, crossings=20).mean < 1e-5
+    point = distance_error(V, F, np.zeros_like(V), rings=5)
+    assert (point.mean, point.scale) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
+        ({"sources": 2.5}, "sources must be a whole number"),
+        ({"crossings": -1}, "crossings must be a whole number of at least 0"),
+        ({"uv": np.zeros((3, 2))}, "uv must have shape (4, 2), a position for every vertex, not (3, 2)"),
+        ({"uv": np.full((4, 2), np.nan)}, "uv is not finite at vertices 0, 1, 2, 3"),
+        ({"V": np.zeros((4, 4))}, "V must have shape"),
+        ({"V": [[0, 0], [1, 0], [2, 0], [0, 1]]}, "triangle 0 of zero area"),
+        ({"F": [[0, 1, 9]]}, "F refers to vertex 9"),
+        ({"F": np.zeros((0, 3), dtype=int)}, "at least one triangle"),
+    ],
+)
+def test_bad_input_is_named(options, message):
+    given = {"V": [[0, 0], [1, 0], [1, 1], [0, 1]], "F": [[0, 1, 2], [0, 2, 3]], "uv": np.eye(4)[:, :2], **options}
+    with pytest.raises(ValueError, match=re.escape(message)):
+        distance_error(**given)
+
+
+# --- the energy and its descent
+
+
+@pytest.fixture(scope="module")
+def energy(dome):
+    piece = Piece(*dome)
+    distances = surface_distances(piece.V, piece.F, rings=6, sources=100, targets=40, crossings=3)
+    return DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), len(piece.V)), piece, distances
+
+
+def some_map(piece, amount=0.3):
+    x, y = piece.V[:, :2].T
+    return (x + 1j * y) * (1 + amount * x) * np.exp(1j * amount * y)
+
+
+def test_derivatives_of_the_energy(energy):
+    total, piece, _ = energy
+    w = some_map(piece)
+    rng = np.random.default_rng(1)
+    dw = rng.normal(size=w.size) + 1j * rng.normal(size=w.size)
+    h = 1e-6 * np.abs(w).max()
+    gradient = total.gradient_of(total.deform(w), w.size)
+    rise = total.value_of(total.deform(w + h * dw)) - total.value_of(total.deform(w - h * dw))
+    assert rise / (2 * h) == pytest.approx(float((gradient.conj() * dw).real.sum()), rel=1e-6)
+
+
+def test_value_is_the_softened_mean_error(energy):
+    total, piece, distances = energy
+    w = some_map(piece)
+    off = np.abs(w[distances.source] - w[distances.target]) / distances.length - 1
+    barrier = distortion(piece.V, piece.F, np.stack([w.real, w.imag], axis=1))
+    singular = np.stack([barrier.sigma1, barrier.sigma2])
+    symmetric = (singular**2 + singular**-2).sum(axis=0) - 4
+    wanted = np.sqrt(off**2 + 0.09).mean() - 0.3 + 3e-3 * float(barrier.share @ symmetric)
+    assert total.value_of(total.deform(w)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_pairs_form_is_the_second_derivative_without_its_negative_part(energy):
+    """Where all pairs are too long nothing of it is negative, and it is the second derivative."""
+    total, piece, _ = energy
+    w = 9 * some_map(piece)
+    rng = np.random.default_rng(2)
+    dw = rng.normal(size=w.size) + 1j * rng.normal(size=w.size)
+    h = 1e-5 * np.abs(w).max()
+
+    def pull(places):
+        moment = total.deform(places)
+        barrier = 3e-3 * total.barrier.gradient_of(moment.deformation, w.size)
+        return total.gradient_of(moment, w.size) - barrier
+
+    form = total.pairs_at(w)
+    assert (form.c - np.abs(form.c2) > 0).all()
+    product = form.apply(dw)
+    assert np.allclose(product, (pull(w + h * dw) - pull(w - h * dw)) / (2 * h), atol=1e-5 * np.abs(product).max())
+    # Where they are too short it is not negative all the same.
+    assert float((dw.conj() * total.pairs_at(w / 90).apply(dw)).real.sum()) > 0
+
+
+def test_blocks_on_the_diagonal_are_the_forms(energy):
+    total, piece, _ = energy
+    form = total.pairs_at(some_map(piece))
+    xx, xy, yy = form.diagonal
+    for vertex in (0, 17, 300):
+        for unit, column in ((1, (xx, xy)), (1j, (xy, yy))):
+            e = np.zeros(len(piece.V), dtype=complex)
+            e[vertex] = unit
+            product = form.apply(e)
+            assert product[vertex] == pytest.approx(column[0][vertex] + 1j * column[1][vertex], rel=1e-12)
+            assert np.abs(form.apply_off_diagonal(e)[vertex]) < 1e-14 * np.abs(product).max()
+
+
+def test_direction_solves_newtons_system(energy):
+    """Conjugate gradients against a solution with the whole matrix at hand."""
+    total, piece, _ = energy
+    w = some_map(piece)
+    descent = DistanceDescent(total, np.stack([w.real, w.imag], axis=1), "auto", Rim(piece.loops))
+    descent.assemble(0.0)
+    descent.system.factor(1e-12)
+    free = descent.system.free
+    gradient = descent.energy.gradient_of(descent.energy.deform(w), w.size)[free]
+    found = descent.solve(-gradient)
+
+    matrix = descent.system.matrix().toarray()
+    for k in range(2 * free.size):
+        unit = np.zeros(2 * free.size)
+        unit[k] = 1
+        whole = np.zeros(w.size, dtype=complex)
+        whole[free] = unit.view(complex)
+        matrix[:, k] += descent.pairs.apply_off_diagonal(whole)[free].view(float)
+    exact = np.linalg.solve(matrix, -gradient.view(float))
+    off = found.view(float) - exact
+    assert np.sqrt(off @ matrix @ off) < 0.2 * np.sqrt(exact @ matrix @ exact)
+
+
+def test_distances_are_kept_better_and_the_map_stays_bijective(dome):
+    V, F = dome
+    # All of the dome, seen from above: the rim is pressed together.
+    start = V[:, :2]
+    steps = []
+    result = keep_distances(V, F, start, rings=8, callback=steps.append)
+    before, after = (distance_error(V, F, uv, rings=8) for uv in (start, result.uv))
+    assert result.status is Status.POLISHED
+    assert result.certificate.bijective
+    assert certify(F, result.uv).bijective
+    assert after.mean < 0.5 * before.mean
+    assert after.rms < 0.5 * before.rms
+    # In the surface's own unit.
+    assert after.scale == pytest.approx(1, abs=0.05)
+    energies = [step.energy for step in steps]
+    assert steps == result.history
+    assert energies[-1] < energies[0]
+    assert np.array_equal(keep_distances(V, F, start, rings=8).uv, result.uv)
+
+
+def test_unit_and_place_of_the_start_do_not_matter(dome):
+    V, F = dome
+    wanted = keep_distances(V, F, V[:, :2], rings=6).uv
+    far = keep_distances(np.ldexp(V, 300), F, np.ldexp(V[:, :2], -200), rings=6).uv
+    assert np.allclose(np.ldexp(far, -300), wanted, atol=1e-9)
+
+
+def test_what_can_be_unrolled_is_unrolled(flat):
+    V, F = flat
+    start = np.stack([V[:, 0] * (1 + 0.5 * V[:, 0]), V[:, 1]], axis=1)
+    result = keep_distances(rolled(V, 1.0), F, start, rings=8, tolerance=1e-6)
+    assert distance_error(V, F, result.uv, rings=8).mean < 5e-3
+
+
+def test_no_boundary_runs_into_itself():
+    """A ramp that winds more than once around would lie on itself if its distances had their way."""
+    V, F = surfaces.grid(60, 6)
+    radius, angle = 1.5 - V[:, 1], 8.0 * V[:, 0]
+    ramp = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.01 * angle], axis=1)
+    as_it_would = np.stack([ramp[:, 0], ramp[:, 1]], axis=1)
+    sample = surface_distances(ramp, F, rings=5)
+    assert certify(F, as_it_would).injective
+    assert not certify(F, as_it_would).bijective
+    start = np.stack([radius * np.cos(0.6 * angle), radius * np.sin(0.6 * angle)], axis=1)
+    result = keep_distances(ramp, F, start, rings=5)
+    assert result.certificate.bijective
+    assert sample.error(as_it_would).mean < sample.error(result.uv).mean < 0.5 * sample.error(start).mean
+
+
+@pytest.mark.parametrize("seed", [1, 8, 13])
+def test_a_start_that_rounding_would_invert_is_taken_as_it_is(seed):
+    V, F = surfaces.grid(4, 4)
+    rng = np.random.default_rng(seed)
+    uv = turned(V, rng.uniform(0.2, 1.3))
+    # A vertex so near to the opposite side that few scales keep it there: of these seeds the one wanted does not.
+    a, b, c = (0, 1, 6)
+    foot = 0.3 * uv[a] + 0.7 * uv[b]
+    uv[c] = foot + (uv[c] - foot) * 2.0 ** -rng.uniform(49, 54)
+    assert certify(F, uv).bijective
+    scale = surface_distances(V, F, rings=4, sources=7, targets=120, crossings=3).error(uv).scale
+    assert not certify(F, scale * (uv - uv.mean(axis=0))).bijective
+    result = keep_distances(V, F, uv, rings=4)
+    assert result.certificate.bijective
+    assert result.history[-1].energy < result.history[0].energy
+
+
+def test_ctrl_c_hands_back_the_best_map_so_far(dome):
+    V, F = dome
+
+    def stop(step):
+        if step.iteration == 2:
+            raise KeyboardInterrupt
+
+    result = keep_distances(V, F, V[:, :2], rings=6, callback=stop)
+    assert result.status is Status.INTERRUPTED
+    assert result.certificate.bijective
+    assert len(result.history) == 3
+
+
+def test_few_iterations(dome):
+    V, F = dome
+    result = keep_distances(V, F, V[:, :2], rings=6, max_iterations=1)
+    assert (result.status, result.iterations) == (Status.STILL_FALLING, 1)
+    untouched = keep_distances(V, F, V[:, :2], rings=6, max_iterations=0)
+    assert untouched.certificate.bijective
+    assert untouched.iterations == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda uv: -uv * [1, -1], "uv is not. Not injective"),
+        (lambda uv: uv[:-1], "a position for every vertex"),
+        (lambda uv: np.where(uv > 0.5, np.inf, uv), "uv is not finite"),
+    ],
+)
+def test_starts_that_will_not_do(dome, change, message):
+    V, F = dome
+    with pytest.raises(ValueError, match=re.escape(message)):
+        keep_distances(V, F, change(V[:, :2]))

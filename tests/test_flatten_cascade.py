@@ -1,0 +1,138 @@
+"""Coarse meshes with coarse boundaries, and maps carried back from them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.exact.certificate import certify, is_injective
+from quasiharmonic.flattening.cascade import coarse_start
+from quasiharmonic.flattening.flattened import flatten
+from quasiharmonic.flattening.hierarchy import Hierarchy
+from quasiharmonic.flattening.start import disk_start
+from quasiharmonic.flattening.touching_up import thick_energy, touched_up
+from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.surfaces import annulus, cat, grid, random_delaunay
+
+
+def in_space(V):
+    return np.column_stack([V, np.zeros((len(V), 3 - V.shape[1]))])
+
+
+def spiral():
+    """A strip wound up in the plane, and nearly flat."""
+    square, F = grid(240, 6)
+    angle, r = 14 * square[:, 0], 0.4 + 2 * square[:, 0] + 0.3 * square[:, 1]
+    return np.stack([r * np.cos(angle), r * np.sin(angle), 0.03 * angle], axis=1), F
+
+
+SURFACES = {"cat": cat(25), "annulus": annulus(24), "delaunay": random_delaunay(1500), "spiral": spiral()}
+
+
+@pytest.fixture(params=SURFACES)
+def surface(request):
+    V, F = SURFACES[request.param]
+    return in_space(V), F, boundary_loops(F, len(V))
+
+
+def characteristic(F, n):
+    found = edges(F, n)
+    return n - len(found.interior) - len(found.boundary) + len(F)
+
+
+def test_levels_are_surfaces_of_the_same_kind(surface):
+    V, F, loops = surface
+    hierarchy = Hierarchy(V, F, loops, 60)
+    assert len(hierarchy.stops) > 2
+    sizes = []
+    for stop in hierarchy.stops:
+        level = hierarchy.level(stop)
+        sizes.append(level.vertices.size)
+        found = edges(level.F, level.vertices.size)
+        assert not found.nonmanifold.size
+        assert not found.inconsistent.size
+        assert len(level.loops) == len(loops)
+        assert characteristic(level.F, level.vertices.size) == 2 - len(loops)
+    assert sizes == sorted(sizes, reverse=True)
+    # Of the boundary most has gone.
+    assert sum(map(len, level.loops)) < 0.5 * sum(map(len, loops))
+
+
+def test_stations_are_some_stops_and_well_apart(surface):
+    V, F, loops = surface
+    hierarchy = Hierarchy(V, F, loops, 60)
+    stations = hierarchy.stations(3.0)
+    assert stations[-1] == 0
+    assert set(stations) <= set(hierarchy.stops)
+    sizes = [hierarchy.level(stop).vertices.size for stop in stations]
+    assert all(large >= 3 * small for small, large in pairwise(sizes))
+
+
+def test_a_wary_way_back_stays_bijective(surface):
+    V, F, loops = surface
+    hierarchy = Hierarchy(V, F, loops, 60)
+    stop = hierarchy.stops[-1]
+    level = hierarchy.level(stop)
+    w = np.zeros(len(V), dtype=np.complex128)
+    w[level.vertices] = in_units(disk_start(V[level.vertices], level.F, level.loops), 0)
+    fine = hierarchy.prolong(w, stop, 0, np.ones(len(V), dtype=bool), 1e-9)
+    assert certify(F, fine.view(np.float64).reshape(-1, 2)).bijective
+
+
+def test_what_is_affine_is_carried_back_as_it_is():
+    V, F = random_delaunay(800)
+    loops = boundary_loops(F, len(V))
+    hierarchy = Hierarchy(in_space(V), F, loops, 60)
+    stop = hierarchy.stops[-1]
+    image = V @ [[1.1, 0.2], [-0.1, 0.9]] + (3, 4)
+    w = np.zeros(len(V), dtype=np.complex128)
+    coarse = hierarchy.level(stop).vertices
+    w[coarse] = in_units(image[coarse], 0)
+    fine = hierarchy.prolong(w, stop, 0, np.zeros(len(V), dtype=bool), 0.1)
+    error = np.abs(fine - in_units(image, 0))
+    # Similarity is preferred a little to what else an affine map may do.
+    assert np.median(error) < 5e-3
+
+
+def test_coarse_starts_are_bijective_and_nearer_than_a_disk(surface):
+    V, F, loops = surface
+    uv = coarse_start(V, F, loops)
+    assert certify(F, uv).bijective
+    energy = thick_energy(V, F)
+    energy.energy = SymmetricDirichlet()
+    here, disk = energy.value(in_units(uv, 0)), energy.value(in_units(disk_start(V, F, loops), 0))
+    least = flatten(V, F).history[-1].energy
+    assert here - least < 0.5 * (disk - least)
+
+
+def test_a_guarded_coarse_start_of_what_would_overlap():
+    square, F = grid(200, 6)
+    angle, r = 7.2 * square[:, 0], 1 + 0.5 * square[:, 1]
+    V = np.stack([r * np.cos(angle), r * np.sin(angle), 0.02 * angle], axis=1)
+    for guarded in (False, True):
+        uv = coarse_start(V, F, boundary_loops(F, len(V)), guarded=guarded)
+        assert certify(F, uv).bijective
+
+
+def test_touching_up_opens_what_is_nearly_closed():
+    V, F = cat(20)
+    loops = boundary_loops(F, len(V))
+    uv = disk_start(V, F, loops)
+    rng = np.random.default_rng(0)
+    inner = np.setdiff1d(np.arange(len(V)), loops[0])
+    # Vertices drawn almost onto a neighbour.
+    for v in rng.choice(inner, 20, replace=False):
+        triangle = F[np.flatnonzero((v == F).any(axis=1))[0]]
+        moved = uv.copy()
+        moved[v] = uv[triangle].mean(axis=0) * 1e-4 + uv[triangle[triangle != v][0]] * (1 - 1e-4)
+        if is_injective(F, moved):
+            uv = moved
+    energy = thick_energy(V, F)
+    before = energy.value(in_units(uv, 0))
+    after = touched_up(V, F, loops, uv)
+    assert certify(F, after).bijective
+    assert energy.value(in_units(after, 0)) < before / 100

@@ -1,0 +1,155 @@
+"""What keeps a free boundary apart: contacts against differences and brute force, guarded steps, exact overlap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.exact.certificate import certify
+from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.flattening.descent import GuardedDescent, descend
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import annulus, grid
+
+
+def horseshoe(gap):
+    """A strip bent until its ends are a gap apart, in the plane."""
+    square, F = grid(40, 4)
+    r = 1 + 0.4 * (1 - square[:, 1])
+    angle = (2 * np.pi - gap) * square[:, 0]
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1), F
+
+
+@pytest.fixture
+def pairs():
+    V, F = horseshoe(0.03)
+    w = in_units(V, 0)
+    return Rim(boundary_loops(F, len(V))).contacts(w), w
+
+
+def test_horseshoe_is_what_it_is_meant_to_be():
+    V, F = horseshoe(0.03)
+    assert certify(F, V).bijective
+
+
+def test_contacts_are_found_across_the_gap_only(pairs):
+    found, w = pairs
+    found = found.within(w, 1.0)
+    assert found.reach.size
+    # A vertex at one end of the strip and an edge at the other.
+    vertex, tail, head = found.corners % 41
+    assert np.isin(vertex, (0, 1, 39, 40)).all()
+    assert (((vertex < 20) & (tail > 20) & (head > 20)) | ((vertex > 20) & (tail < 20) & (head < 20))).all()
+
+
+def test_contacts_are_those_of_all_pairs():
+    V, F = horseshoe(0.1)
+    rng = np.random.default_rng(0)
+    V = V + 0.004 * rng.normal(size=V.shape)
+    (loop,) = boundary_loops(F, len(V))
+    found = Rim([loop]).contacts(in_units(V, 0))
+    # Brute force: near pairs whose connecting segment leaves the vertex and reaches the edge outside.
+    shapely = pytest.importorskip("shapely")
+    polygon = shapely.Polygon(V[loop])
+    for v, a, b in found.corners.T.tolist():
+        edge = shapely.LineString([V[a], V[b]])
+        near = edge.interpolate(edge.project(shapely.Point(V[v])))
+        middle = shapely.Point((np.array(near.coords[0]) + V[v]) / 2)
+        assert not polygon.contains(middle)
+
+
+def test_gradient_and_curvature(pairs):
+    found, w = pairs
+    near = found.within(w, 1.0)
+    assert near.value(w) > 0
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=w.size) + 1j * rng.normal(size=w.size)
+    h = 1e-7
+    difference = (near.value(w + h * direction) - near.value(w - h * direction)) / (2 * h)
+    gradient = near.gradient(w)
+    assert float((gradient.conj() * direction).real.sum()) == pytest.approx(difference, rel=1e-5)
+    v, a, _ = near.corners
+    form = near.curvature(w)
+    dp = sum(HATS[i].conj() * direction[c] for i, c in enumerate(near.corners))
+    dq = sum(HATS[i] * direction[c] for i, c in enumerate(near.corners))
+    np.testing.assert_allclose(dp + dq, direction[v] - direction[a], atol=1e-12)
+    along_p, along_q = form.apply(dp, dq)
+    quadratic = (along_p.conj() * dp + along_q.conj() * dq).real
+    assert (quadratic >= -1e-9).all()
+
+
+def test_curvature_of_one_contact():
+    # A vertex straight above the middle of an edge: only its height counts.
+    w = np.array([0.5 + 0.2j, 0, 1])
+    one = Contacts(np.array([[0], [1], [2]]), np.array([0.5]))
+    height, reach = 0.2, 0.5
+    assert one.value(w) == pytest.approx((reach / height - 1) ** 2)
+    form = one.curvature(w)
+    move = np.array([1j, 0, 0])
+    dp, dq = (HATS.conj() * move).sum(keepdims=True), (HATS * move).sum(keepdims=True)
+    along_p, along_q = form.apply(dp, dq)
+    second = 2 * reach**2 / height**4 + 4 * (reach / height - 1) * reach / height**3
+    assert float((along_p.conj() * dp + along_q.conj() * dq).real.sum()) == pytest.approx(second)
+
+
+def test_split_keeps_reaches_and_loses_none(pairs):
+    found, w = pairs
+    known, strangers = found.split(found.corners[:, ::-1], w.size)
+    np.testing.assert_array_equal(known.reach, found.reach[::-1])
+    assert not strangers.reach.size
+    known, strangers = found.split(found.corners[:, 2:], w.size)
+    np.testing.assert_array_equal(strangers.corners, found.corners[:, :2])
+    assert known.value(w) + strangers.value(w) == pytest.approx(found.value(w))
+    assert Contacts.none().split(found.corners, w.size)[0].reach.max() == 0
+    assert found.split(Contacts.none().corners, w.size)[1].reach.size == found.reach.size
+
+
+def test_blocks_bound_the_curvature(pairs):
+    found, w = pairs
+    form, (xx, xy, yy) = found.curvature(w), found.blocks(w)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        move = rng.normal(size=w.size) + 1j * rng.normal(size=w.size)
+        dp, dq = (HATS.conj() @ move[found.corners]), (HATS @ move[found.corners])
+        along_p, along_q = form.apply(dp, dq)
+        coupled = float((along_p.conj() * dp + along_q.conj() * dq).real.sum())
+        apart = float((xx * move.real**2 + 2 * xy * move.real * move.imag + yy * move.imag**2).sum())
+        assert 0 <= coupled <= apart
+
+
+@pytest.mark.parametrize("gap", [0.03, -0.03])
+def test_overlap_is_decided_as_the_certificate_does(gap):
+    V, F = horseshoe(gap)
+    rim = Rim(boundary_loops(F, len(V)))
+    assert rim.meets_itself(V) is (not certify(F, V).bijective)
+    assert bool(rim.meetings(V).size) is (gap < 0)
+
+
+def test_touching_in_one_point_is_overlap():
+    V, F = horseshoe(0.2)
+    loop = boundary_loops(F, len(V))
+    rim = Rim(loop)
+    assert not rim.meets_itself(V)
+    V[2 * 41] = V[2 * 41 + 40]
+    assert rim.meets_itself(V)
+
+
+@pytest.mark.parametrize("surface", [horseshoe(0.02), annulus(8)], ids=["disk", "annulus"])
+def test_guarded_steps_stay_bijective(surface):
+    # A rest shape that is bent further than a full turn wants to overlap.
+    V, F = surface
+    rest = np.column_stack([V, 0 * V[:, 0]])
+    if len(boundary_loops(F, len(V))) == 1:
+        square, _ = grid(40, 4)
+        r, angle = 1 + 0.4 * (1 - square[:, 1]), 7.0 * square[:, 0]
+        rest = np.stack([r * np.cos(angle), r * np.sin(angle), 0.02 * angle], axis=1)
+    energy = DeformationEnergy(rest, F, SymmetricDirichlet())
+    descent = GuardedDescent(energy, V, "auto", Rim(boundary_loops(F, len(V))))
+    values = [descent.distortion]
+    for _ in descend(descent, SymmetricDirichlet(), 1e-4):
+        values.append(descent.distortion)
+        assert certify(F, descent.uv).bijective
+    assert values[-1] <= values[0]

@@ -1,0 +1,267 @@
+"""Vertices held, the boundary free: bijective with every pin in place, or a reason why not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quasiharmonic.exact.certificate import certify
+from quasiharmonic.exact.diagnosis import Forbids, Kind
+from quasiharmonic.flattening.flattened import flatten
+from quasiharmonic.flattening.pin_obstructions import pin_obstructions
+from quasiharmonic.flattening.pins import moved_onto
+from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.result import Status
+from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+DONE = {Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING}
+
+
+def swirled(uv, angle):
+    """Turned around the middle, the more the nearer to it."""
+    z = (uv - uv.mean(axis=0)) @ (1, 1j)
+    z = z * np.exp(1j * angle * np.clip(1 - abs(z) / abs(z).max(), 0, 1))
+    return np.stack([z.real, z.imag], axis=1)
+
+
+def solved(V, F, fixed, target, **options):
+    """The result, its promises checked by other means."""
+    given = V.copy(), F.copy(), np.copy(fixed), np.copy(target)
+    result = flatten(V, F, fixed=fixed, target=target, **options)
+    assert all(np.array_equal(a, b) for a, b in zip(given, (V, F, fixed, target), strict=True))
+    assert np.array_equal(result.uv[fixed], np.asarray(target, dtype=np.float64))
+    verdict = certify(F, result.uv)
+    assert verdict.bijective, verdict.summary()
+    assert result.certificate.bijective
+    assert result.status in DONE
+    return result
+
+
+def energy_by_hand(V, F, uv):
+    """Mean symmetric Dirichlet energy, 0 for an isometry, from singular values."""
+    V = np.column_stack([V, np.zeros(len(V))])[:, :3]
+    total = area = 0.0
+    for t in F:
+        a, b = V[t[1]] - V[t[0]], V[t[2]] - V[t[0]]
+        x = a / np.linalg.norm(a)
+        y = b - (b @ x) * x
+        rest = np.array([[np.linalg.norm(a), b @ x], [0, np.linalg.norm(y)]])
+        image = np.stack([uv[t[1]] - uv[t[0]], uv[t[2]] - uv[t[0]]], axis=1)
+        s = np.linalg.svd(image @ np.linalg.inv(rest), compute_uv=False)
+        m = 0.5 * rest[0, 0] * rest[1, 1]
+        total, area = total + m * (s @ s + (s**-2).sum() - 4), area + m
+    return total / area
+
+
+@pytest.mark.parametrize("angle", [1.0, -4.0])
+@pytest.mark.parametrize("surface", [cat(12), random_delaunay(700, 1), disk(14), grid(25, 25)])
+def test_pins_of_a_swirl_are_met(surface, angle):
+    V, F = surface
+    flat = flatten(V, F).uv
+    hidden = swirled(flat, angle)
+    fixed = np.random.default_rng(0).choice(len(V), 40, replace=False)
+    result = solved(V, F, fixed, hidden[fixed])
+    found = energy_by_hand(V, F, result.uv)
+    assert np.isclose(result.history[-1].energy, found, rtol=1e-9)
+    # The plain swirl is one way to meet them, and not the best.
+    assert not certify(F, hidden).injective or found < energy_by_hand(V, F, hidden)
+
+
+def test_a_hole_is_turned_and_the_outside_follows():
+    V, F = annulus(8)
+    inner = min(boundary_loops(F, len(V)), key=len)
+    turned = V[inner] @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + 3
+    result = solved(V, F, inner, turned)
+    # All of it turns as a rigid body: nothing else is held.
+    assert result.history[-1].energy < 1e-9
+    assert np.allclose(result.uv, V @ [[0, 1], [-1, 0]] + 3, atol=1e-4)
+
+
+def test_vertices_that_must_pass_each_other():
+    V, F = disk(6)
+    fixed = np.array([3, 23, 43, 63, 83])
+    solved(V, F, fixed, np.random.default_rng(0).permutation(V[fixed]))
+
+
+def test_any_number_from_one_to_all():
+    V, F = disk(5)
+    solved(V, F, [7], [[3.0, -1.0]])
+    solved(V, F, [7, 60], [[0.0, 0.0], [0.0, 2.0]])
+    everything = np.arange(len(V))
+    result = solved(V, F, everything, 2 * V)
+    assert np.array_equal(result.uv, 2 * V)
+
+
+def test_a_boundary_that_is_held_is_met_inside_out():
+    V, F = disk(6)
+    loop = boundary_loops(F, len(V))[0][:18]
+    solved(V, F, loop, V[loop] * [1, -1])
+
+
+@pytest.mark.parametrize("scale", [1e150, 1e-150])
+def test_any_unit_will_do(scale):
+    V, F = disk(5)
+    fixed, target = np.array([1, 50, 60]), np.array([[0.0, 0], [1, 0], [2, 0.3]])
+    ordinary = solved(V, F, fixed, target)
+    other = solved(scale * V, F, fixed, scale * target)
+    assert np.allclose(other.uv / scale, ordinary.uv, rtol=0, atol=1e-6)
+    # What no energy can measure is bijective all the same.
+    solved(V, F, fixed, scale * target)
+
+
+def test_is_deterministic():
+    V, F = cat(8)
+    fixed = np.arange(0, len(V), 9)
+    target = swirled(flatten(V, F).uv, 2.5)[fixed]
+    first, second = (flatten(V, F, fixed=fixed, target=target) for _ in range(2))
+    assert np.array_equal(first.uv, second.uv)
+
+
+def test_distortion_is_that_asked_for():
+    V, F = cat(8)
+    fixed, target = np.array([5, 100, 150]), np.array([[0.0, 0], [1, 0], [0.5, 1.5]])
+    plain = solved(V, F, fixed, target)
+    angles = solved(V, F, fixed, target, energy="mips")
+    weighted = solved(V, F, fixed, target, weights=np.where(np.arange(len(F)) < 50, 100.0, 1.0))
+    assert not np.allclose(angles.uv, plain.uv, atol=1e-3)
+    assert not np.allclose(weighted.uv, plain.uv, atol=1e-3)
+    for result in (plain, angles, weighted):
+        energies = [step.energy for step in result.history[-result.stages[-1].iterations - 1 :]]
+        assert energies[-1] <= energies[0]
+
+
+def impossible(V, F, fixed, target):
+    result = flatten(V, F, fixed=fixed, target=target)
+    assert result.status is Status.IMPOSSIBLE
+    assert not result.certificate.bijective
+    assert not certify(F, result.uv).bijective
+    assert np.array_equal(result.uv[fixed], np.asarray(target, dtype=np.float64))
+    return result.diagnosis.obstructions
+
+
+def test_what_is_impossible_is_named():
+    V, F = disk(6)
+    (shared,) = impossible(V, F, [3, 40], [[0.0, 0], [0, 0]])
+    assert shared.kind is Kind.PIN
+    assert shared.vertices.tolist() == [3, 40]
+    assert shared.forbids is Forbids.BIJECTIVE
+    (wrong,) = impossible(V, F, F[5], [[0.0, 0], [0, 1], [1, 0]])
+    assert wrong.kind is Kind.INVERTED_TRIANGLE
+    assert wrong.triangles.tolist() == [5]
+    assert wrong.forbids is Forbids.INJECTIVE
+    solved(V, F, F[5], [[0.0, 0], [1, 0], [0, 1]])
+    first, second = F[50, :2], F[100, :2]
+    (crossing,) = impossible(V, F, [*first, *second], [[0.0, 0], [1, 1], [1, 0], [0, 1]])
+    assert {frozenset(e) for e in crossing.edges.tolist()} == {frozenset(first.tolist()), frozenset(second.tolist())}
+    (on,) = impossible(V, F, [*F[5, :2], 80], [[0.0, 0], [1, 0], [0.5, 0]])
+    assert 80 in on.vertices
+    (within,) = impossible(V, F, [*F[5], 80], [[0.0, 0], [1, 0], [0, 1], [0.2, 0.2]])
+    assert within.vertices.tolist() == [80, *F[5]]
+
+
+def test_a_boundary_held_the_wrong_way_round_is_named():
+    V, F = disk(6)
+    loop = boundary_loops(F, len(V))[0]
+    (patch,) = impossible(V, F, loop, V[loop] * [1, -1])
+    assert patch.kind is Kind.INVERTED_PATCH
+
+
+@pytest.mark.parametrize(("twist", "possible"), [(0.3, True), (1.0, True), (1.3, False)])
+def test_a_vertex_that_finds_no_place_among_the_pins_around_it_is_named(twist, possible):
+    # The ring around the middle becomes a star whose three arms bend, up to where no point sees all of it.
+    V, F = disk(3)
+    ring = np.arange(1, 7)
+    ring = ring[np.argsort(np.arctan2(V[ring, 1], V[ring, 0]))]
+    star = np.array([1.0, 0.1] * 3) * np.exp(1j * np.arange(6) * np.pi / 3)
+    star[1::2] *= np.exp(1j * twist)
+    place = np.stack([star.real, star.imag], axis=1)
+    if possible:
+        solved(V, F, ring, place)
+    else:
+        (blind,) = impossible(V, F, ring, place)
+        assert blind.kind is Kind.HALF_PLANES
+        assert blind.vertices[0] == 0
+
+
+def test_pins_of_a_map_are_never_called_impossible():
+    rng = np.random.default_rng(5)
+    for seed in range(10):
+        V, F = random_delaunay(120, seed)
+        fixed = rng.choice(len(V), 60, replace=False)
+        assert not pin_obstructions(F, len(V), edges(F, len(V)), fixed, V[fixed]).obstructions
+
+
+def test_malformed_input_is_refused():
+    V, F = disk(3)
+    for fixed, target, message in (
+        ([], np.zeros((0, 2)), "k > 0"),
+        ([1, 1], np.zeros((2, 2)), "vertex 1 fixed more than once"),
+        ([1, 99], np.zeros((2, 2)), "refers to vertex 99"),
+        ([1], [[np.nan, 0.0]], "not finite at row 0"),
+        ([1], [[0.0, 0.0, 0.0]], r"shape \(1, 2\)"),
+        ([0.5], [[0.0, 0.0]], "integer"),
+        ([1], None, "belong together"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            flatten(V, F, fixed=fixed, target=target)
+    with pytest.raises(ValueError, match="unit_square"):
+        flatten(V, F, fixed=[1], target=[[0.0, 0.0]], unit_square=True)
+
+
+@pytest.mark.parametrize("at", [1, 5, 40])
+def test_ctrl_c_gives_the_best_map_so_far(at):
+    V, F = cat(12)
+    fixed = np.arange(0, len(V), 5)
+    target = swirled(flatten(V, F).uv, 3.0)[fixed]
+    seen = []
+
+    def callback(step):
+        seen.append(step)
+        if len(seen) == at:
+            raise KeyboardInterrupt
+
+    result = flatten(V, F, fixed=fixed, target=target, callback=callback)
+    assert result.status is Status.INTERRUPTED
+    assert len(seen) == at
+    assert np.array_equal(result.uv[fixed], target)
+
+
+def test_least_squares_of_a_similarity():
+    rng = np.random.default_rng(2)
+    uv = rng.normal(size=(20, 2))
+    turn = 3 * np.array([[np.cos(1), np.sin(1)], [-np.sin(1), np.cos(1)]])
+    fixed = np.array([3, 5, 11])
+    assert np.allclose(moved_onto(uv, fixed, (uv @ turn + 7)[fixed]), uv @ turn + 7)
+    # Of one vertex, a translation; of vertices that are to meet in a point, no scaling to nothing.
+    assert np.allclose(moved_onto(uv, fixed[:1], np.array([[1.0, 2.0]])), uv - uv[3] + (1, 2))
+    assert np.allclose(moved_onto(uv, fixed, np.ones((3, 2))), uv - uv[fixed].mean(0) + 1)
+
+
+def test_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import pin_problems
+    import pins
+
+    monkeypatch.setattr(pin_problems, "SMALLEST", 100)
+    monkeypatch.setattr(pin_problems, "LARGEST", 400)
+    monkeypatch.setitem(pin_problems.WEAKEST, "overwound", 2.0)
+    names = pins.names(7, list(pin_problems.FAMILIES))
+    assert [name.partition(":")[0] for name in names] == list(pin_problems.FAMILIES)
+    for name in names:
+        case, again = pin_problems.make(name), pin_problems.make(name)
+        assert certify(case.F, case.hidden).bijective
+        assert np.array_equal(case.hidden[case.fixed], case.target)
+        assert 1 <= len(case.fixed) <= 200
+        assert np.array_equal(case.hidden, again.hidden)
+    results = tmp_path / "pins.jsonl"
+    assert pins.main(["-n", "3", "-o", str(results)]) == 0
+    lines = results.read_text().splitlines()
+    assert len(lines) == 3
+    # What is there is not done again, and a torn line is.
+    results.write_text("\n".join(lines[:2]) + "\n" + lines[2][:30])
+    assert pins.main(["-n", "3", "-o", str(results)]) == 0
+    assert len(pins.read(results)) == 3
+    assert "3/3" in capsys.readouterr().out
