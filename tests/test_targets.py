@@ -367,7 +367,7 @@ def test_input_types_and_inputs_untouched():
     [
         (np.zeros((5, 4)), targets.star(3), {}, r"loop must be \(k, 2\) or \(k, 3\) .* not \(5, 4\)"),
         (targets.disk(), np.zeros((2, 2)), {}, r"outline must be \(k, 2\) .* not \(2, 2\)"),
-        (np.array([(0, 0), (1, 0), (1, np.nan)]), targets.rectangle(1, 1), {}, "point 2 of loop is not finite"),
+        (np.array([(0, 0), (1, 0), (1, np.nan)]), targets.rectangle(1, 1), {}, "loop is not finite at point 2"),
         (np.zeros((5, 3)), targets.rectangle(1, 1), {}, "all points of a closed curve coincide"),
         (targets.disk(1.0, 20), targets.star(3), {"start": 20}, "start = 20, but the loop has vertices 0 to 19"),
         (targets.disk(1.0, 20), targets.star(3), {"start": -1}, "start = -1"),
