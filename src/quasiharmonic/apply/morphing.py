@@ -124,8 +124,9 @@ def morph(
     """
     points = map_array("points", points, finite=False)
     F = triangle_array(F, len(points))
-    used = np.isin(np.arange(len(points)), F)
-    check_finite("points", "vertex", "vertices", np.where(used[:, None], points, 0))
+    # Vertices in no triangle may be anywhere.
+    met = np.isin(np.arange(len(points)), F)
+    check_finite("points", "vertex", "vertices", np.where(met[:, None], points, 0))
     before = mean_ratio(points, F)
     flat = np.flatnonzero(before == 0)
     if flat.size:
@@ -134,8 +135,8 @@ def morph(
     F[turned] = F[turned][:, [0, 2, 1]]
 
     fixed, target = _placed(points, F, moved, positions)
-    own = np.cumsum(used) - 1
-    problem = Problem(points[used], own[F], own[fixed], target)
+    used = np.unique(F)
+    problem = Problem(points[used], np.searchsorted(used, F), np.searchsorted(used, fixed), target)
     result = solve(
         problem,
         # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
