@@ -186,7 +186,7 @@ class TestRun:
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0
         assert batch.run(stars / "a", tmp_path / "out").resumed == 1
         package = tmp_path / "package"
-        (package / "batch" / "report").mkdir(parents=True)
+        (package / "report").mkdir(parents=True)
         monkeypatch.setattr(quasiharmonic, "__file__", str(package / "__init__.py"))
         states = []
         for file, text in (
