@@ -227,6 +227,21 @@ def test_the_laplacian_is_the_same_in_any_order(monkeypatch, solver):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
+def test_a_solver_that_cannot_be_told_an_order_keeps_the_numbers_of_the_mesh(monkeypatch):
+    pytest.importorskip("qdldl")
+    monkeypatch.setattr(laplacian, "DISSECT_FROM", 0)
+    V, F = surfaces.random_delaunay(1000, 1)
+    (loop,) = boundary_loops(F, len(V))
+    assert np.all(np.diff(Laplacian(F, len(V), loop, "qdldl", V).free) > 0)
+    assert not np.all(np.diff(Laplacian(F, len(V), loop, "superlu", V).free) > 0)
+    # Whatever "auto" stands for.
+    monkeypatch.setattr("quasiharmonic.linsolve.mkl.find_mkl", lambda: None)
+    monkeypatch.setattr("quasiharmonic.linsolve.cholmod.Cholmod.present", classmethod(lambda cls: False))
+    unaware = Laplacian(F, len(V), loop, "auto", V)
+    assert unaware.solver.name == "qdldl"
+    assert np.all(np.diff(unaware.free) > 0)
+
+
 def test_one_fixed_vertex_and_a_free_boundary(monkeypatch):
     V, F = surfaces.random_delaunay(1000, 1)
     stiffness = np.full((3, len(F)), -1.0)

@@ -456,18 +456,27 @@ def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: MeshData(np.zeros((3, 4)), [[0, 1, 2]]), r"V has the shape \(3, 4\)"),
-        (lambda: MeshData(np.full((3, 3), np.nan), [[0, 1, 2]]), "V is not finite at rows 0, 1, 2"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 3]]), "F has the index 3; only 3"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, -1]]), "F has the index -1"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2, 0]]), r"F has the shape \(1, 4\)"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "F has the type float64"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0]], FT=[[0, 0, 1]]), "FT has the index 1"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0, 0]]), r"vt has the shape \(1, 3\)"),
-        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]]).with_map(np.zeros((2, 2))), r"\(3, 2\) is needed"),
+        (lambda: MeshData(np.zeros((3, 4)), [[0, 1, 2]]), r"V must have shape \(n, 2\) or \(n, 3\), not \(3, 4\)"),
+        (lambda: MeshData(np.full((3, 3), np.nan), [[0, 1, 2]]), "V is not finite at vertices 0, 1, 2"),
+        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 3]]), "F refers to vertex 3, but there are only vertices 0 … 2"),
+        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, -1]]), "F refers to vertex -1, but"),
+        (
+            lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2, 0]]),
+            r"F must have shape \(f, 3\), triangles only, not \(1, 4\)",
+        ),
+        (lambda: MeshData(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "F must hold integer indices, not float64"),
+        (
+            lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0]], FT=[[0, 0, 1]]),
+            "FT refers to row 1, but there are only rows 0 … 0",
+        ),
+        (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0, 0]]), r"vt must have shape \(n, 2\), not \(1, 3\)"),
+        (
+            lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]]).with_map(np.zeros((2, 2))),
+            r"uv must have shape \(3, 2\), a position for every vertex, not \(2, 2\)",
+        ),
         (
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]]).with_map([[0, 0], [np.inf, 0], [0, 0]]),
-            "uv is not finite at row 1",
+            "uv is not finite at vertex 1",
         ),
     ],
 )

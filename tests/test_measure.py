@@ -97,9 +97,9 @@ def test_values_that_cannot_be_written(stretched, tmp_path):
         io.write_per_triangle(tmp_path / "faces.txt", V, F, uv, {"one": one})
     with pytest.raises(ValueError, match="not a word"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv, {"one, two": one})
-    with pytest.raises(ValueError, match=r"one has the shape \(59,\); \(60,\) is needed"):
+    with pytest.raises(ValueError, match=r"one must have shape \(60,\), one for every triangle, not \(59,\)"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv, {"one": one[1:]})
-    with pytest.raises(ValueError, match="uv has the shape"):
+    with pytest.raises(ValueError, match="uv must have shape"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv[1:], {"one": one})
 
 

@@ -92,10 +92,15 @@ def test_a_boundary_that_crosses_itself_is_told():
         (lambda p, F: (p, F, [-1], [[0, 0]]), "vertex -1"),
         (lambda p, F: (p, F, [10**6], [[0, 0]]), "vertex 1000000"),
         (lambda p, F: (p, F, [0], [[0, 0, 0]]), r"shape \(1, 2\)"),
-        (lambda p, F: (p, F, [0.5], [[0, 0]]), "vertex indices"),
+        (lambda p, F: (p, F, [0.5], [[0, 0]]), "moved must hold integer indices, not float64"),
         (lambda p, F: (p[:, :1], F, [0], [[0, 0]]), r"shape \(n, 2\)"),
-        (lambda p, F: (p, F[:0], [0], [[0, 0]]), "f > 0"),
-        (lambda p, F: (p, F + 1, [0], [[0, 0]]), "beyond"),
+        (lambda p, F: (p, F[:0], [0], [[0, 0]]), "the mesh has no triangles"),
+        (lambda p, F: (p, F + 1, [0], [[0, 0]]), "F refers to vertex 16, but there are only vertices 0 … 15"),
+        (lambda p, F: (p, F, [0, 1], [[0, 0], [0, np.nan]]), "positions is not finite at row 1"),
+        (
+            lambda p, F: (np.where(np.arange(16)[:, None] == 5, np.nan, p), F, [0], [[0, 0]]),
+            "points is not finite at vertex 5",
+        ),
         (lambda p, F: (p * (1, 0), F, [0], [[0, 0]]), "triangles 0, 1, .* without area"),
         (lambda p, F: (np.concatenate([p, [[9, 9]]]), F, [len(p)], [[0, 0]]), "vertex 16 .*in no triangle"),
     ],
@@ -246,6 +251,8 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
         meshlane.write(tmp_path / f"{name}.vtu", meshlane.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 1], [0, 1, 0.0]], cells))
         with pytest.raises(MeshFileError, match=message):
             read_fem(tmp_path / f"{name}.vtu")
-    with pytest.raises(ValueError, match="finite numbers"):
+    with pytest.raises(
+        ValueError, match=r"points must have shape \(81, 2\), a position for every vertex, not \(3, 2\)"
+    ):
         write_fem(out, read_fem(path), np.zeros((3, 2)))
     assert not out.exists()

@@ -116,7 +116,7 @@ def test_nothing_to_split():
         ([[0, 7]], r"\(0, 7\): not an edge"),
         ([[-1, 2]], r"\(-1, 2\): not an edge"),
         ([[2, 2]], r"\(2, 2\): not an edge"),
-        ([[0.0, 2.0]], "edges must hold integer vertex indices, not float64"),
+        ([[0.0, 2.0]], "edges must hold integer indices, not float64"),
         ([0, 2], r"edges must have shape \(k, 2\), not \(2,\)"),
         ([[0, 2, 3]], r"edges must have shape \(k, 2\), not \(1, 3\)"),
         (np.array([[0, 2**64 - 1]], dtype=np.uint64), "edges refers to vertex 18446744073709551615, which no mesh"),

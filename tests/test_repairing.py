@@ -126,10 +126,16 @@ class TestIslands:
 
     def test_bad_input_is_named(self):
         V, F = grid(2, 2)
-        with pytest.raises(ValueError, match=r"FT must have shape \(f, 3\)"):
+        with pytest.raises(ValueError, match="FT must have as many rows as F, 8, not 7"):
             islands(F, V, F[:-1])
-        with pytest.raises(ValueError, match="triangle 2 refer to vertices below 0 or to rows outside 0 … 8"):
+        with pytest.raises(ValueError, match="F refers to vertex 9, but there are only vertices 0 … 8"):
+            islands(np.where(np.arange(8)[:, None] == 2, 9, F), V)
+        with pytest.raises(ValueError, match="F refers to vertex -1, but"):
+            islands(F - 1, V, F)
+        with pytest.raises(ValueError, match="FT refers to row 9, but there are only rows 0 … 8"):
             islands(F, V, np.where(np.arange(8)[:, None] == 2, 9, F))
+        with pytest.raises(ValueError, match="FT refers to row -2, but there are only rows 0 … 8"):
+            islands(F, V, F - 2)
         with pytest.raises(ValueError, match="must hold integer"):
             islands(F, V, F.astype(float))
         with pytest.raises(ValueError, match="uv must have shape"):
@@ -300,9 +306,9 @@ class TestRepair:
 
     def test_bad_input_is_named(self):
         V, F = grid(3, 3)
-        with pytest.raises(ValueError, match="V must be a finite array"):
+        with pytest.raises(ValueError, match=r"V must have shape \(n, 2\) or \(n, 3\), not"):
             repair(V[:, :1], F, V)
-        with pytest.raises(ValueError, match=r"triangles .* refer to vertices outside 0 … 14"):
+        with pytest.raises(ValueError, match="F refers to vertex 15, but there are only vertices 0 … 14"):
             repair(V[:-1], F, V)
         with pytest.raises(ValueError, match="max_iterations"):
             repair(V, F, V, max_iterations=0)

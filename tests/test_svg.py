@@ -398,7 +398,7 @@ def test_outline_files(tmp_path):
         ("rect:2xa", "'a' is not a number"),
         ("rect:0x1", "width must be positive"),
         ("ellipse:1xinf", "b must be positive and finite"),
-        ("polygon:2", "at least 3 points"),
+        ("polygon:2", "points must be a whole number of at least 3, not 2"),
         ("polygon:six", "'six' is not a whole number"),
         ("polygon:-3", "'-3' is not a whole number"),
         ("star:9999999", "9999999 is far too many"),

@@ -137,9 +137,9 @@ def test_a_warp_that_cannot_be_says_what_to_do():
     [
         ((np.zeros(5), [[1, 1]], [[1, 1]]), "image must have shape"),
         ((np.zeros((9, 9), complex), [[1, 1]], [[1, 1]]), "real numbers"),
-        ((np.zeros((9, 9)), [[1, 1, 1]], [[1, 1]]), r"landmarks must have shape \(k, 2\)"),
+        ((np.zeros((9, 9)), [[1, 1, 1]], [[1, 1]]), r"landmarks must have shape \(n, 2\)"),
         ((np.zeros((9, 9)), [[1, 1]], [[1, 8]]), "moved: point 0 not inside"),
-        ((np.zeros((9, 9)), [[1, np.nan]], [[1, 1]]), "landmarks: point 0 not finite"),
+        ((np.zeros((9, 9)), [[1, np.nan]], [[1, 1]]), "landmarks is not finite at point 0"),
         (
             (np.zeros((9, 9)), [[1, 1], [1, 1]], [[1, 1], [2, 2]]),
             r"landmarks: points 0, 1 are at the same place, \(1.0, 1.0\)",

@@ -5,6 +5,7 @@ One wording for each error: whoever takes ``V``, ``F`` or rows of coordinates ta
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from numbers import Integral, Real
 from typing import Any
 
@@ -32,8 +33,8 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
         return np.array(array, dtype=np.float64, order="C")
 
 
-def index_array(name: str, values: ArrayLike) -> IntArray:
-    """Integers of any type as int64, always a copy; nothing at all is an array of none.
+def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
+    """Integers of any type as int64, a copy unless that is not asked for; nothing at all is an array of none.
 
     Raises
     ------
@@ -44,14 +45,15 @@ def index_array(name: str, values: ArrayLike) -> IntArray:
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
     if array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must hold integer vertex indices, not {array.dtype}")
+        raise ValueError(f"{name} must hold integer indices, not {array.dtype}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
-    return np.array(array, dtype=np.int64, order="C")
+    made = np.array if copy else np.asarray
+    return made(array, dtype=np.int64, order="C")
 
 
-def vertex_array(V: ArrayLike, name: str = "V") -> FloatArray:
-    """Positions in the plane or in space, (n, 2) or (n, 3), finite, as float64; a copy.
+def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:
+    """Positions in the plane or in space, (n, 2) or (n, 3), finite unless that is not asked for, as float64; a copy.
 
     Raises
     ------
@@ -61,7 +63,8 @@ def vertex_array(V: ArrayLike, name: str = "V") -> FloatArray:
     array = real_array(name, V)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise ValueError(f"{name} must have shape (n, 2) or (n, 3), not {array.shape}")
-    check_finite(name, "vertex", "vertices", array)
+    if finite:
+        check_finite(name, "vertex", "vertices", array)
     return array
 
 
@@ -73,17 +76,40 @@ def triangle_array(F: ArrayLike, n: int) -> IntArray:
     ValueError
         When there are none, they are no triangles, or refer to vertices that there are not.
     """
-    array = index_array("F", F)
+    array = triangle_rows(F)
     if array.size == 0:
         raise ValueError("the mesh has no triangles")
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"F must have shape (f, 3), triangles only, not {array.shape}")
     check_range("F", array, n)
     return array
 
 
-def map_array(name: str, uv: ArrayLike, n: int) -> FloatArray:
-    """Places in the plane, one for each of ``n`` vertices, finite, as (n, 2) float64; a copy.
+def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArray:
+    """Any number of triangles (f, 3), and be it none, as int64; what they refer to is not looked at.
+
+    Raises
+    ------
+    ValueError
+        When they are no triangles.
+    """
+    array = index_array(name, F, copy=copy)
+    if array.size == 0:
+        return np.empty((0, 3), dtype=np.int64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"{name} must have shape (f, 3), triangles only, not {array.shape}")
+    return array
+
+
+def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = True) -> FloatArray:
+    """Places in the plane, finite unless that is not asked for, as (n, 2) float64; a copy.
+
+    Parameters
+    ----------
+    name : str
+    uv : (n, 2) array
+    n : int, optional
+        How many there must be, one for each vertex; any number by default.
+    finite : bool
+        Whether they must be finite.
 
     Raises
     ------
@@ -91,9 +117,11 @@ def map_array(name: str, uv: ArrayLike, n: int) -> FloatArray:
         When they are not; names the first vertices that are not finite.
     """
     array = real_array(name, uv)
-    if array.shape != (n, 2):
-        raise ValueError(f"{name} must have shape ({n}, 2), a position for every vertex, not {array.shape}")
-    check_finite(name, "vertex", "vertices", array)
+    if array.ndim != 2 or array.shape[1] != 2 or n not in (None, len(array)):
+        wanted = "(n, 2)" if n is None else f"({n}, 2), a position for every vertex"
+        raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
+    if finite:
+        check_finite(name, "vertex", "vertices", array)
     return array
 
 
@@ -104,12 +132,23 @@ def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
         raise ValueError(f"{name} is not finite at {named(one, many, bad)}")
 
 
-def check_range(name: str, indices: IntArray, n: int) -> None:
-    """Raise a ValueError that names the first indices that are no vertex of ``n``."""
-    bad = np.unique(indices[(indices < 0) | (indices >= n)])
-    if bad.size:
-        there = f"only vertices 0 … {n - 1}" if n else "no vertices"
-        raise ValueError(f"{name} refers to {named('vertex', 'vertices', bad)}, but there are {there}")
+def check_range(
+    name: str, indices: IntArray, n: int, one: str = "vertex", many: str = "vertices", *, least: int = 0
+) -> None:
+    """Raise a ValueError that names the first indices that are no vertex of ``n``, or whatever they stand for.
+
+    ``least`` is -1 where that stands for none.
+    """
+    if indices.size and (indices.min() < least or indices.max() >= n):
+        bad = np.unique(indices[(indices < least) | (indices >= n)])
+        there = f"only {many} 0 … {n - 1}" if n else f"no {many}"
+        raise ValueError(f"{name} refers to {named(one, many, bad)}, but there are {there}")
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raise a ValueError that lists the choices, unless the value is one of them."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
 
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array, named, real_array
+from quasiharmonic.arrays import FloatArray, IntArray, check_finite, map_array, named, triangle_array
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import ARAP, AreaBarrier, Combination
 from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
@@ -102,12 +102,8 @@ class AirMesh:
         gap: float | None = None,
         air_weight: float = 1e-3,
     ) -> None:
-        self._rest, self._F = real_array("points", points), index_array("F", F)
-        if self._rest.ndim != 2 or self._rest.shape[1] != 2 or not np.isfinite(self._rest).all():
-            raise ValueError(f"points must be finite, of shape (n, 2), not {self._rest.shape}")
-        if self._F.ndim != 2 or self._F.shape[1] != 3 or not self._F.size:
-            raise ValueError(f"F must have shape (f, 3) with f > 0, not {self._F.shape}")
-        check_range("F", self._F, len(self._rest))
+        self._rest = map_array("points", points)
+        self._F = triangle_array(F, len(self._rest))
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
         if idle.size:
             raise ValueError(f"{named('vertex', 'vertices', idle)} in no triangle")
@@ -235,10 +231,9 @@ class AirMesh:
         if [loop.shape for loop in loops] != [(size, 2) for size in self._sizes] or not loops:
             shapes = [loop.shape for loop in loops]
             raise ValueError(f"the frame must have loops of {self._sizes} points, not of shapes {shapes}")
-        stacked = np.concatenate(loops)
-        if not np.isfinite(stacked).all():
-            raise ValueError("a point of the frame is not finite")
-        return stacked
+        for k, loop in enumerate(loops):
+            check_finite(f"loop {k} of the frame", "point", "points", loop)
+        return np.concatenate(loops)
 
     def _triangulated(self, points: FloatArray) -> IntArray:
         """Triangulate what neither shapes nor obstacles cover, without new points."""

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, check_choice, check_range, vertex_array
 from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.exact.point_location import PointLocator
 
@@ -113,13 +113,11 @@ class InverseMap:
         certificate = certify(F, uv)
         _check(certificate, overlapping)
         self.certificate: Certificate = certificate
-        self.V = np.array(V, dtype=np.float64)
+        self.V = vertex_array(V, finite=False)
         self.F = np.array(F, dtype=np.int64)
         self.uv = np.array(uv, dtype=np.float64)
-        if self.V.ndim != 2 or self.V.shape[1] not in (2, 3) or len(self.V) != len(self.uv):
-            raise ValueError(
-                f"V must have shape ({len(self.uv)}, 2) or ({len(self.uv)}, 3), as many rows as uv, not {self.V.shape}"
-            )
+        if len(self.V) != len(self.uv):
+            raise ValueError(f"V must have as many rows as uv, {len(self.uv)}, not {len(self.V)}")
         for array in (self.V, self.F, self.uv):
             array.flags.writeable = False
         self._locator = PointLocator(self.uv[self.F])
@@ -250,16 +248,13 @@ class InverseMap:
         ValueError
             When the shape does not fit, or ``at`` names a triangle that is not there.
         """
-        if per not in get_args(Per):
-            raise ValueError(f"per must be one of {', '.join(get_args(Per))}, not {per!r}")
+        check_choice("per", per, get_args(Per))
         given = np.asarray(values, dtype=np.float64)
         expected = {"vertex": (len(self.V),), "corner": (len(self.F), 3), "triangle": (len(self.F),)}[per]
         if given.shape[: len(expected)] != expected:
             raise ValueError(f"values per {per} must have a shape that begins with {expected}, not {given.shape}")
         triangle = np.asarray(at.triangle)
-        wrong = triangle[(triangle < -1) | (triangle >= len(self.F))]
-        if wrong.size:
-            raise ValueError(f"there is no triangle {wrong[0]}: they are 0 … {len(self.F) - 1}")
+        check_range("at", triangle, len(self.F), "triangle", "triangles", least=-1)
         tail = given.shape[len(expected) :]
         found = np.flatnonzero(triangle.ravel() >= 0)
         t = triangle.ravel()[found]

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_finite,
+    check_range,
+    index_array,
+    map_array,
+    named,
+    triangle_array,
+)
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.measures import mean_ratio
@@ -119,14 +128,11 @@ def morph(
     >>> morphed.valid, bool(morphed.quality_after.min() > 0.25)
     (True, True)
     """
-    points, F = np.array(points, dtype=np.float64), np.asarray(F)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"points must have shape (n, 2), not {points.shape}")
-    if F.ndim != 2 or F.shape[1] != 3 or F.dtype.kind not in "iu" or not F.size:
-        raise ValueError(f"F must be an integer array of shape (f, 3) with f > 0, not {F.dtype} of shape {F.shape}")
-    if F.min() < 0 or F.max() >= len(points):
-        raise ValueError(f"F refers to vertices beyond the {len(points)} that there are")
-    F = F.astype(np.int64)
+    points = map_array("points", points, finite=False)
+    F = triangle_array(F, len(points))
+    # Vertices in no triangle may be anywhere.
+    met = np.isin(np.arange(len(points)), F)
+    check_finite("points", "vertex", "vertices", np.where(met[:, None], points, 0))
     before = mean_ratio(points, F)
     flat = np.flatnonzero(before == 0)
     if flat.size:
@@ -155,15 +161,12 @@ def morph(
 
 def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Return the vertices that are given, those moved and the rest of the boundary, and where they go."""
-    given, target = np.asarray(moved), np.asarray(positions, dtype=np.float64)
-    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
-        raise ValueError(f"moved must be a list of vertex indices, not {given.dtype} of shape {given.shape}")
-    given = given.astype(np.int64)
-    if target.shape != (len(given), 2):
-        raise ValueError(f"positions must have shape ({len(given)}, 2), not {target.shape}")
-    wrong = np.flatnonzero((given < 0) | (given >= len(points)))
-    if wrong.size:
-        raise ValueError(f"moved refers to vertex {given[wrong[0]]}, but there are {len(points)}")
+    given = index_array("moved", moved)
+    if given.ndim != 1:
+        raise ValueError(f"moved must have shape (k,), not {given.shape}")
+    check_range("moved", given, len(points))
+    target = map_array("positions", positions, len(given), finite=False)
+    check_finite("positions", "row", "rows", target)
     idle = given[~np.isin(given, F)]
     if idle.size:
         raise ValueError(f"{named('vertex', 'vertices', idle)} to be moved in no triangle")

@@ -13,7 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apply.island_repair import IslandRepair
-from quasiharmonic.arrays import FloatArray, IntArray, counted, named, whole_number
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    counted,
+    map_array,
+    named,
+    triangle_rows,
+    vertex_array,
+    whole_number,
+)
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Diagnosis
 from quasiharmonic.mesh.seams import Island, islands
@@ -192,14 +202,9 @@ def repair(
     (2, True, [0])
     """
     whole_number("max_iterations", max_iterations, least=1)
-    surface = np.asarray(V, dtype=np.float64)
-    if surface.ndim != 2 or surface.shape[1] not in (2, 3) or not np.isfinite(surface).all():
-        raise ValueError(f"V must be a finite array of shape (n, 2) or (n, 3), not one of {surface.shape}")
-    triangles = np.asarray(F)
-    if triangles.size and triangles.max() >= len(surface):
-        bad = np.flatnonzero((triangles >= len(surface)).any(axis=1))
-        raise ValueError(f"{named('triangle', 'triangles', bad)} refer to vertices outside 0 … {len(surface) - 1}")
-    places = np.array(uv, dtype=np.float64)
+    surface, triangles = vertex_array(V), triangle_rows(F)
+    check_range("F", triangles, len(surface))
+    places = map_array("uv", uv, finite=False)
     parts = islands(triangles, places, FT)
     done = []
     for island in parts:
@@ -224,7 +229,7 @@ def repair(
                 ),
             )
         )
-    rows = np.array(triangles if FT is None else FT, dtype=np.int64)
+    rows = triangles if FT is None else triangle_rows(FT, "FT")
     places, rows = _written(places, rows, parts, [new for new, _ in done])
     return Repaired(places, rows, tuple(report for _, report in done))
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apply.inverse import InverseMap
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import FloatArray, IntArray, check_finite, map_array, named
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.result import MapResult
@@ -156,13 +156,9 @@ def warp_along(
     height, width = picture.shape[:2] if shape is None else shape
     if height < 1 or width < 1:
         raise ValueError(f"shape must be positive, not {shape}")
-    for name, rows in (("points", points), ("moved", moved)):
-        lost = np.flatnonzero(
-            ~np.isfinite(np.asarray(rows, dtype=np.float64)).reshape(len(np.asarray(rows)), -1).all(1)
-        )
-        if lost.size:
-            raise ValueError(f"{name} is not finite at {named('vertex', 'vertices', lost)}")
-    inverse = InverseMap(points, F, moved)
+    rest = map_array("points", points)
+    map_array("moved", moved, len(rest))
+    inverse = InverseMap(rest, F, moved)
     source = _sources(inverse, height, width)
     channels = picture.reshape(*picture.shape[:2], -1)
     layers = [np.ascontiguousarray(channels[..., k], dtype=_drawable(picture.dtype)) for k in range(channels.shape[2])]
@@ -235,14 +231,8 @@ def _drawable(kind: np.dtype[Any]) -> np.dtype[Any]:
 
 def _landmarks(points: ArrayLike, name: str) -> FloatArray:
     """Landmarks, checked to be points apart."""
-    array = np.asarray(points, dtype=np.float64)
-    if array.shape == (0,):
-        array = array.reshape(0, 2)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name} must have shape (k, 2), a row (x, y) for each, not {array.shape}")
-    lost = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if lost.size:
-        raise ValueError(f"{name}: {named('point', 'points', lost)} not finite")
+    array = map_array(name, points if np.size(points) else np.empty((0, 2)), finite=False)
+    check_finite(name, "point", "points", array)
     _, first, count = np.unique(array, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
         place = array[first[count > 1][0]]

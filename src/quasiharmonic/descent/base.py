@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_type_hints
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, whole_number
+from quasiharmonic.arrays import ComplexArray, check_choice, whole_number
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
@@ -65,9 +65,7 @@ class Descent(ABC):
 
     def __post_init__(self) -> None:
         for name, words in _choices(type(self)):
-            given = getattr(self, name)
-            if given not in words:
-                raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
+            check_choice(name, getattr(self, name), words)
 
     @property
     def name(self) -> str:

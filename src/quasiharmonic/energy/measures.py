@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite, check_range, index_array, real_array
+from quasiharmonic.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_choice,
+    map_array,
+    triangle_array,
+    vertex_array,
+)
 from quasiharmonic.energy.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.shapes import rest_shapes
@@ -133,8 +141,7 @@ class Distortion:
         ValueError
             When there is no such measure, or no triangle on which it is defined.
         """
-        if measure not in MEASURES:
-            raise ValueError(f"measure must be one of {', '.join(MEASURES)}, not {measure!r}")
+        check_choice("measure", measure, MEASURES)
         values = self.per_triangle()[measure]
         defined = np.flatnonzero(~np.isnan(values))
         if not defined.size:
@@ -207,18 +214,8 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     >>> round(found.summary("isometric").maximum, 6)
     1.414214
     """
-    F, V, uv = index_array("F", F), real_array("V", V), real_array("uv", uv)
-    if F.ndim != 2 or F.shape[1] != 3:
-        raise ValueError(f"F must have shape (f, 3), not {F.shape}")
-    if not F.size:
-        raise ValueError("the mesh has no triangles")
-    if V.ndim != 2 or V.shape[1] not in (2, 3):
-        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
-    if uv.shape != (len(V), 2):
-        raise ValueError(f"uv must have shape ({len(V)}, 2), a position for every vertex, not {uv.shape}")
-    check_range("F", F, len(V))
-    for name, array in (("V", V), ("uv", uv)):
-        check_finite(name, "vertex", "vertices", array)
+    V = vertex_array(V)
+    F, uv = triangle_array(F, len(V)), map_array("uv", uv, len(V))
     # What leaves the numbers' range in extreme maps becomes inf, 0 or NaN as the formulas have it.
     with np.errstate(all="ignore"):
         return _measured(V, F, uv)

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import FloatArray, IntArray, check_range, map_array, named, triangle_rows
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.mesh.topology import edges, trace_loops
@@ -253,31 +253,19 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
 
 def _checked(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
-    triangles, places = np.asarray(F), np.asarray(uv)
-    if triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ValueError(f"F has shape {triangles.shape}, expected (f, 3)")
-    if triangles.dtype.kind not in "iu":
-        raise ValueError(f"F has dtype {triangles.dtype}, expected integers")
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise ValueError(f"uv has shape {places.shape}, expected (n, 2)")
-    if places.dtype.kind not in "fiu":
-        raise ValueError(f"uv has dtype {places.dtype}, expected floating-point numbers")
-    n = len(places)
-    if triangles.size and (triangles.min() < 0 or triangles.max() >= n):
-        bad = np.flatnonzero(((triangles < 0) | (triangles >= n)).any(axis=1))
-        raise ValueError(f"F refers to vertices outside 0 … {n - 1} in {named('triangle', 'triangles', bad)}")
-    with np.errstate(over="ignore"):
-        doubles = places.astype(np.float64)
+    triangles, places = triangle_rows(F, copy=False), map_array("uv", uv, finite=False)
+    check_range("F", triangles, len(places))
     # Of the numeric types, wide integers and extended precision have values that double has not.
+    given = np.asarray(uv)
     rounded = np.zeros(places.shape, dtype=bool)
-    if places.dtype.kind != "f":
-        rounded = np.abs(doubles) >= 2.0**53
-    elif places.dtype.itemsize > 8:
-        rounded = (doubles != places) & ~np.isnan(doubles)
+    if given.dtype.kind != "f":
+        rounded = np.abs(places) >= 2.0**53
+    elif given.dtype.itemsize > 8:
+        rounded = (places != given) & ~np.isnan(places)
     rows = np.flatnonzero(rounded.any(axis=1))
     if rows.size:
         raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rows)}")
-    return triangles.astype(np.int64, copy=False), doubles
+    return triangles, places
 
 
 def _signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import FloatArray, IntArray, map_array, named
 from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.gmsh import read_gmsh
@@ -145,9 +145,7 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
     MeshFileError, OutputError
         As for `check_fem_output`; or when positions are too large for the file's precision.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.shape != mesh.points.shape or not np.isfinite(points).all():
-        raise ValueError(f"points must be {mesh.points.shape} finite numbers")
+    points = map_array("points", points, len(mesh.points))
     check_fem_output(path, mesh.source)
     with np.errstate(over="ignore"):
         expected = points.astype(mesh.parts.precision).astype(np.float64)

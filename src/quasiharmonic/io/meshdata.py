@@ -7,7 +7,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_finite,
+    check_range,
+    map_array,
+    named,
+    triangle_rows,
+    vertex_array,
+)
 from quasiharmonic.io.errors import MeshFileError
 
 
@@ -54,27 +63,21 @@ class MeshData:
 
     def __post_init__(self) -> None:
         """Bring the arrays into the types and shapes above; `ValueError` for what cannot be."""
-        V = np.asarray(self.V, dtype=np.float64)
-        if V.ndim != 2 or V.shape[1] not in (2, 3):
-            raise ValueError(f"V has the shape {V.shape}; (n, 3) is needed")
+        V = vertex_array(self.V)
         if V.shape[1] == 2:
             V = np.column_stack([V, np.zeros(len(V))])
-        _check_finite("V", V)
         object.__setattr__(self, "V", V)
-        object.__setattr__(self, "F", _indices("F", self.F, None, len(V)))
-        faces = len(self.F)
+        F = triangle_rows(self.F, copy=False)
+        check_range("F", F, len(V))
+        object.__setattr__(self, "F", F)
         if self.vt is not None:
-            vt = np.asarray(self.vt, dtype=np.float64)
-            if vt.ndim != 2 or vt.shape[1] != 2:
-                raise ValueError(f"vt has the shape {vt.shape}; (m, 2) is needed")
-            _check_finite("vt", vt)
+            vt = map_array("vt", self.vt, finite=False)
+            check_finite("vt", "row", "rows", vt)
             object.__setattr__(self, "vt", vt)
         if self.FT is not None:
-            places = 0 if self.vt is None else len(self.vt)
-            object.__setattr__(self, "FT", _indices("FT", self.FT, faces, places, least=-1))
+            object.__setattr__(self, "FT", self._corners("FT", self.FT, 0 if self.vt is None else len(self.vt)))
         if self.FN is not None:
-            count = self.normals.count(b"\n")
-            object.__setattr__(self, "FN", _indices("FN", self.FN, faces, count, least=-1))
+            object.__setattr__(self, "FN", self._corners("FN", self.FN, self.normals.count(b"\n")))
 
     def with_map(self, uv: ArrayLike) -> MeshData:
         """Return the same mesh with one texture coordinate for each vertex.
@@ -93,7 +96,7 @@ class MeshData:
         ValueError
             When the shape is another, or a place is not finite.
         """
-        return replace(self, vt=self._one_each(uv), FT=self.F)
+        return replace(self, vt=map_array("uv", uv, len(self.V)), FT=self.F)
 
     def as_plane(self, uv: ArrayLike) -> MeshData:
         """Return the map alone: a mesh in the plane z = 0 with the same faces.
@@ -113,14 +116,15 @@ class MeshData:
         ValueError
             When the shape is another, or a place is not finite.
         """
-        return MeshData(self._one_each(uv), self.F, source=self.source)
+        return MeshData(map_array("uv", uv, len(self.V)), self.F, source=self.source)
 
-    def _one_each(self, uv: ArrayLike) -> FloatArray:
-        uv = np.asarray(uv, dtype=np.float64)
-        if uv.shape != (len(self.V), 2):
-            raise ValueError(f"uv has the shape {uv.shape}; {(len(self.V), 2)} is needed")
-        _check_finite("uv", uv)
-        return uv
+    def _corners(self, name: str, values: ArrayLike, rows: int) -> IntArray:
+        """For every corner one of some rows, or -1; (f, 3) int64."""
+        table = triangle_rows(values, name, copy=False)
+        if len(table) != len(self.F):
+            raise ValueError(f"{name} must have as many rows as F, {len(self.F)}, not {len(table)}")
+        check_range(name, table, rows, "row", "rows", least=-1)
+        return table
 
 
 def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -207,22 +211,3 @@ def check_mapped(mesh: MeshData) -> None:
             f"{named('face', 'faces', bare)} (0-based) without texture coordinates, which others have",
             remedy="map the whole mesh, or remove these faces",
         )
-
-
-def _check_finite(name: str, rows: FloatArray) -> None:
-    lost = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if lost.size:
-        raise ValueError(f"{name} is not finite at {named('row', 'rows', lost)}")
-
-
-def _indices(name: str, values: ArrayLike, rows: int | None, count: int, least: int = 0) -> IntArray:
-    """Check an (f, 3) array of indices ``least … count - 1`` and return it as int64."""
-    table = np.asarray(values)
-    if table.ndim != 2 or table.shape[1] != 3 or (rows is not None and len(table) != rows):
-        raise ValueError(f"{name} has the shape {table.shape}; ({rows or 'f'}, 3) is needed")
-    if table.size and not np.issubdtype(table.dtype, np.integer):
-        raise ValueError(f"{name} has the type {table.dtype}; integers are needed")
-    if table.size and (table.min() < least or table.max() >= count):
-        wrong = table[(table < least) | (table >= count)][0]
-        raise ValueError(f"{name} has the index {wrong}; only {count} are there to refer to")
-    return table.astype(np.int64, copy=False)

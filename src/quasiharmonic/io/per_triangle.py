@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import FloatArray, map_array, triangle_rows, vertex_array
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import OutputError
 
@@ -54,7 +54,8 @@ def write_per_triangle(
     OutputError
         When the suffix is another, or the file cannot be written.
     """
-    V, F, uv = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64), np.asarray(uv, dtype=np.float64)
+    V, F = vertex_array(V, finite=False), triangle_rows(F)
+    uv = map_array("uv", uv, len(V), finite=False)
     columns = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
     for name, column in columns.items():
         if not (name.isascii() and name.isidentifier()):
@@ -62,9 +63,7 @@ def write_per_triangle(
         if name in _TAKEN:
             raise ValueError(f"{name!r} means something else in such files: choose another name")
         if column.shape != (len(F),):
-            raise ValueError(f"{name} has the shape {column.shape}; ({len(F)},) is needed, one for each triangle")
-    if uv.shape != (len(V), 2):
-        raise ValueError(f"uv has the shape {uv.shape}; {(len(V), 2)} is needed")
+            raise ValueError(f"{name} must have shape ({len(F)},), one for every triangle, not {column.shape}")
     suffix = Path(path).suffix.lower()
     if suffix == ".csv":
         data = _csv(columns, len(F))

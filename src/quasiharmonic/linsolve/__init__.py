@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
-__all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver"]
+__all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "takes_order"]
 
 # Fastest first: the order in which "auto" tries them. Each entry is the module and the class in it.
 BACKENDS = {
@@ -38,6 +38,12 @@ def _backend(name: str) -> type[LinearSolver]:
 def available() -> tuple[str, ...]:
     """Names of the backends whose libraries are installed, best first; none of them is loaded."""
     return tuple(name for name in BACKENDS if _backend(name).present())
+
+
+def takes_order(name: str = "auto") -> bool:
+    """Whether the backend that `make_solver` takes by this name has a use for unknowns in a good order."""
+    chosen = available()[0] if name == "auto" else name
+    return chosen in BACKENDS and _backend(chosen).takes_order
 
 
 def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", ordered: bool = False) -> LinearSolver:

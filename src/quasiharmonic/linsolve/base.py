@@ -35,7 +35,7 @@ class LinearSolver(ABC):
         Column indices, ascending within each row. Every row starts with its diagonal entry.
     ordered : bool
         The unknowns are numbered such that eliminating them in turn leaves a sparse factor, and no other order need be
-        looked for.
+        looked for. No matter to a backend whose `takes_order` is False.
 
     Raises
     ------
@@ -51,6 +51,8 @@ class LinearSolver(ABC):
 
     name: ClassVar[str]
     requirement: ClassVar[str]
+    #: Whether it can be told that the unknowns are numbered well, and then looks for no order of its own.
+    takes_order: ClassVar[bool] = True
 
     def __init__(self, indptr: ArrayLike, indices: ArrayLike, *, ordered: bool = False) -> None:
         self._ordered = ordered

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.linsolve import make_solver
+from quasiharmonic.linsolve import make_solver, takes_order
 from quasiharmonic.mesh.dissection import nested_dissection
 from quasiharmonic.mesh.topology import edge_keys
 
@@ -60,7 +60,7 @@ class Laplacian:
         # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
         tail, head = (corner.ravel() for corner in self._unknowns(F))
         order = None
-        if points is not None and self.free.size >= DISSECT_FROM:
+        if points is not None and self.free.size >= DISSECT_FROM and takes_order(linear_solver):
             once = np.flatnonzero((tail >= 0) & (tail < head))
             order = nested_dissection(points[self.free], tail[once], head[once])
         if order is not None:

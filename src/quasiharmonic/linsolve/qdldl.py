@@ -17,6 +17,9 @@ class Qdldl(LinearSolver):
 
     name = "qdldl"
     requirement = "pip install qdldl"
+    # It always orders by minimum degree, which breaks ties by number: numbered by dissection, a regular mesh's unknowns
+    # take 1.5 to 2.5 times as long to factor as numbered row by row.
+    takes_order = False
 
     @classmethod
     def present(cls) -> bool:

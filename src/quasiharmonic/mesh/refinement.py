@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, real_array
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    named_edges,
+    triangle_rows,
+    vertex_array,
+)
 from quasiharmonic.mesh.topology import edge_keys
 from quasiharmonic.mesh.topology import edges as sort_edges
 
@@ -128,13 +136,10 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     >>> refined.F.tolist(), refined.parent.tolist()
     ([[4, 1, 2], [4, 3, 0], [4, 0, 1], [4, 2, 3]], [0, 1, 0, 1])
     """
-    V = real_array("V", V)
-    if V.ndim != 2 or V.shape[1] not in (2, 3):
-        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
-    check_finite("V", "vertex", "vertices", V)
-    F, n = _rows("F", F, 3), len(V)
+    V, F = vertex_array(V), triangle_rows(F)
+    n = len(V)
     check_range("F", F, n)
-    wanted = np.unique(np.sort(_rows("edges", edges, 2), axis=1), axis=0)
+    wanted = np.unique(np.sort(_pairs(edges), axis=1), axis=0)
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
     _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
@@ -196,20 +201,18 @@ def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
     return lengths
 
 
-def _rows(name: str, values: ArrayLike, width: int) -> IntArray:
-    array = index_array(name, values)
-    if array.size and (array.ndim != 2 or array.shape[1] != width):
-        raise ValueError(f"{name} must have shape (k, {width}), not {array.shape}")
-    return array.reshape(-1, width)
+def _pairs(edges: ArrayLike) -> IntArray:
+    array = index_array("edges", edges)
+    if array.size and (array.ndim != 2 or array.shape[1] != 2):
+        raise ValueError(f"edges must have shape (k, 2), not {array.shape}")
+    return array.reshape(-1, 2)
 
 
 def _refuse(wanted: IntArray, known: IntArray, n: int, why: str) -> None:
     inside = ((wanted >= 0) & (wanted < n)).all(axis=1)
     bad = wanted[~(inside & np.isin(_keys(wanted, n), known))]
     if len(bad):
-        listed = ", ".join(f"({i}, {j})" for i, j in bad[:5].tolist())
-        rest = f", … ({len(bad)} in all)" if len(bad) > 5 else ""
-        raise ValueError(f"cannot split {listed}{rest}: {why}")
+        raise ValueError(f"cannot split {named_edges(bad)}: {why}")
 
 
 def _keys(pairs: IntArray, n: int) -> IntArray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import FloatArray, IntArray, check_range, map_array, triangle_rows
 from quasiharmonic.mesh.topology import edge_keys
 
 
@@ -62,7 +62,7 @@ def islands(F: ArrayLike, uv: ArrayLike, FT: ArrayLike | None = None) -> list[Is
     Raises
     ------
     ValueError
-        When the shapes do not fit, or there is no such row of ``uv``; the message names the triangles.
+        When the shapes do not fit, or there is no such row of ``uv``; the message names the rows.
     """
     F, places, FT = _checked(F, uv, FT)
     mapped = np.flatnonzero((FT >= 0).all(axis=1))
@@ -151,19 +151,14 @@ def _by_appearance(label: NDArray[np.integer]) -> IntArray:
 
 
 def _checked(F: ArrayLike, uv: ArrayLike, FT: ArrayLike | None) -> tuple[IntArray, FloatArray, IntArray]:
-    triangles, places = np.asarray(F), np.asarray(uv, dtype=np.float64)
-    rows = triangles if FT is None else np.asarray(FT)
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise ValueError(f"uv must have shape (m, 2), not {places.shape}")
-    for name, table in (("F", triangles), ("FT", rows)):
-        if table.ndim != 2 or table.shape[1] != 3 or len(table) != len(triangles):
-            raise ValueError(f"{name} must have shape (f, 3), a row for each triangle, not {table.shape}")
-        if table.dtype.kind not in "iu":
-            raise ValueError(f"{name} must hold integer indices, not {table.dtype}")
-    triangles, rows = triangles.astype(np.int64), rows.astype(np.int64)
-    bad = np.flatnonzero((triangles < 0).any(axis=1) | (rows < -1).any(axis=1) | (rows >= len(places)).any(axis=1))
-    if bad.size:
-        raise ValueError(
-            f"{named('triangle', 'triangles', bad)} refer to vertices below 0 or to rows outside 0 … {len(places) - 1}"
-        )
+    triangles, places = triangle_rows(F), map_array("uv", uv, finite=False)
+    if FT is None:
+        check_range("F", triangles, len(places))
+        return triangles, places, triangles
+    # How many vertices there are is not known here, only that none is below 0.
+    check_range("F", triangles, int(triangles.max(initial=-1)) + 1)
+    rows = triangle_rows(FT, "FT")
+    if len(rows) != len(triangles):
+        raise ValueError(f"FT must have as many rows as F, {len(triangles)}, not {len(rows)}")
+    check_range("FT", rows, len(places), "row", "rows", least=-1)
     return triangles, places, rows

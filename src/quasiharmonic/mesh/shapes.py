@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, vertex_array
 from quasiharmonic.mesh.reference import rest_frames
 
 
@@ -67,9 +67,7 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer]) -> RestShapes:
     ValueError
         When ``V`` has another shape.
     """
-    positions = np.asarray(V, dtype=np.float64)
-    if positions.ndim != 2 or positions.shape[1] not in (2, 3):
-        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {positions.shape}")
+    positions = vertex_array(V, finite=False)
     exponent = int(np.frexp(np.abs(positions).max(initial=0))[1]) - 1
     surface = np.zeros((len(positions), 3))
     surface[:, : positions.shape[1]] = np.ldexp(positions, -exponent)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.plot.canvas import as_map, as_mesh, new_figure, not_positive, paint_map, verdict
+from quasiharmonic.arrays import map_array
+from quasiharmonic.plot.canvas import as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.plot.shading import view
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def _figures(
     color = view(rest, F).color
     window: tuple[tuple[float, float], tuple[float, float]] | None = None
     for name, uv in frames:
-        place = as_map(uv, rest, name)
+        place = map_array(name, uv, len(rest))
         figure = new_figure((6, 6))
         ax = figure.add_axes((0.02, 0.02, 0.96, 0.88))
         inverted = not_positive(F, place)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array
+from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array, triangle_rows, vertex_array
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.plot.shading import View, drawable, edge_style, least_heights
 
@@ -142,32 +142,10 @@ def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
 
 
 def as_mesh(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
-    """Positions, checked to be finite, and triangles, checked to refer to them, as arrays."""
-    rest, triangles = finite(V, "V"), np.asarray(F, dtype=np.int64)
-    if triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ValueError(f"F must have shape (f, 3), not {triangles.shape}")
-    if triangles.size and (triangles.min() < 0 or triangles.max() >= len(rest)):
-        raise ValueError(f"F refers to vertices outside 0 … {len(rest) - 1}")
+    """Positions, checked to be finite, and triangles, be it none, checked to refer to them, as arrays."""
+    rest, triangles = vertex_array(V), triangle_rows(F)
+    check_range("F", triangles, len(rest))
     return rest, triangles
-
-
-def as_map(uv: ArrayLike, rest: FloatArray, name: str = "uv") -> FloatArray:
-    """A map of a surface's vertices, checked to be one and finite, as an array."""
-    array = np.asarray(uv, dtype=np.float64)
-    if array.shape != (len(rest), 2):
-        raise ValueError(f"{name} must have shape ({len(rest)}, 2), a row for each vertex, not {array.shape}")
-    return finite(array, name)
-
-
-def finite(points: ArrayLike, name: str) -> FloatArray:
-    """Points as an array, or `ValueError` naming the first that has no finite place."""
-    array = np.asarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] not in (2, 3):
-        raise ValueError(f"{name} must have shape (n, 2) or (n, 3), not {array.shape}")
-    good = np.isfinite(array).all(axis=1)
-    if not good.all():
-        raise ValueError(f"{name} has no finite place for vertex {int(np.argmin(good))}")
-    return array
 
 
 def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, width: FloatArray) -> None:

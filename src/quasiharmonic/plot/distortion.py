@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import FloatArray, check_choice, map_array
 from quasiharmonic.energy.measures import Distortion, distortion
-from quasiharmonic.plot.canvas import INK, RED, as_map, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
+from quasiharmonic.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
 from quasiharmonic.plot.shading import lit, view
 
 if TYPE_CHECKING:
@@ -101,10 +101,9 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     ValueError
         When there is no such measure, what `quasiharmonic.distortion` raises, or no triangle has a finite value.
     """
-    if measure not in LABELS:
-        raise ValueError(f"measure must be one of {', '.join(LABELS)}, not {measure!r}")
+    check_choice("measure", measure, LABELS)
     rest, F = as_mesh(V, F)
-    uv = as_map(uv, rest)
+    uv = map_array("uv", uv, len(rest))
     found = distortion(rest, F, uv)
     values: FloatArray = found.per_triangle()[measure]
     scale = _scale(measure, values, found.share)

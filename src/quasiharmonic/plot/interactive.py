@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import FloatArray, map_array
 from quasiharmonic.energy.measures import distortion
-from quasiharmonic.plot.canvas import RED, as_map, as_mesh
+from quasiharmonic.plot.canvas import RED, as_mesh
 
 #: Measures of distortion that the window offers as colours.
 SHOWN = ("isometric", "conformal", "area_ratio", "mips")
@@ -82,7 +82,7 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
     """
     polyscope = _polyscope()
     rest, F = as_mesh(V, F)
-    plane = as_map(uv, rest)
+    plane = map_array("uv", uv, len(rest))
     found = distortion(rest, F, plane)
     solid = rest if rest.shape[1] == 3 else np.column_stack([rest, np.zeros(len(rest))])
     middle, size = (solid.min(axis=0) + solid.max(axis=0)) / 2, float(np.ptp(solid, axis=0).max()) or 1.0

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, map_array
 from quasiharmonic.plot.canvas import (
-    as_map,
     as_mesh,
     caption,
     new_figure,
@@ -86,7 +85,7 @@ def plot_map(
     rest, F = as_mesh(V, F)
     if ax is None:
         ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9))
-    _draw_map(ax, view(rest, F), F, as_map(uv, rest), flipped, fixed)
+    _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), flipped, fixed)
     return ax
 
 
@@ -120,7 +119,7 @@ def plot_before_after(
     rest, F = as_mesh(V, F)
     figure, seen = new_figure((9, 4.8)), view(rest, F)
     for ax, uv, name in zip(panels(figure, 2), (before, after), ("before", "after"), strict=True):
-        verdict(ax, name, _draw_map(ax, seen, F, as_map(uv, rest, name), None, fixed))
+        verdict(ax, name, _draw_map(ax, seen, F, map_array(name, uv, len(rest)), None, fixed))
     return figure
 
 
@@ -163,8 +162,9 @@ def save_map_figure(
     plot_surface(rest, F, axes[0])
     caption(axes[0], f"surface: {len(F):,} triangles")
     if before is not None:
-        verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, as_map(before, rest, "before"), None, fixed))
-    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, as_map(uv, rest), flipped, fixed))
+        guess = map_array("before", before, len(rest))
+        verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, guess, None, fixed))
+    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, map_array("uv", uv, len(rest)), flipped, fixed))
     save_png(path, figure)
 
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, map_array
 from quasiharmonic.plot.canvas import (
     RED,
-    as_map,
     as_mesh,
     caption,
     new_figure,
@@ -61,7 +60,7 @@ def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
         When there are no triangles, a vertex is not finite, or ``squares`` is less than 1.
     """
     rest, F = as_mesh(V, F)
-    uv = drawable(as_map(uv, rest))
+    uv = drawable(map_array("uv", uv, len(rest)))
     if not F.size:
         raise ValueError("the mesh has no triangles")
     if squares < 1:

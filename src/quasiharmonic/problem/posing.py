@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_choice, check_finite, real_array
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.frame import Frame
@@ -68,8 +68,8 @@ class Problem:
     ) -> None:
         domain = Domain(V, F, fixed)
         domain.check_boundary_fixed()
-        if reference is not None and reference not in get_args(Reference):
-            raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
+        if reference is not None:
+            check_choice("reference", reference, get_args(Reference))
         if reference is None or reference == "rest":
             domain.check_areas()
         self._pose(domain, target, reference)

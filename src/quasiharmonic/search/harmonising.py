@@ -10,7 +10,16 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, map_array, named, not_negative, real_array, whole_number
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_choice,
+    map_array,
+    named,
+    not_negative,
+    real_array,
+    whole_number,
+)
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet
 from quasiharmonic.energy.springs import MassSpring
@@ -175,8 +184,7 @@ def harmonise_map(
         raise ValueError("conformal must be positive where there is no energy, not 0")
     if weights is not None and chosen is None:
         raise ValueError("weights are the energy's, and there is none")
-    if reference not in get_args(Reference):
-        raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
+    check_choice("reference", reference, get_args(Reference))
     whole_number("max_iterations", max_iterations, least=1)
     not_negative("tolerance", tolerance)
     start = map_array("uv", uv, domain.n)

@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, map_array, named, whole_number
+from quasiharmonic.arrays import ComplexArray, FloatArray, check_choice, map_array, named, whole_number
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
@@ -222,8 +222,7 @@ def quasi_harmonic_map(
     quasiharmonic.linsolve.NotPositiveDefinite
         When rounding leaves no positive definite Laplacian.
     """
-    if reference not in get_args(Reference):
-        raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, not {reference!r}")
+    check_choice("reference", reference, get_args(Reference))
     coefficients = np.zeros(len(problem.F)) if mu is None else np.asarray(mu)
     if coefficients.shape != (len(problem.F),) or coefficients.dtype.kind not in "iufc":
         raise ValueError(f"mu must hold {len(problem.F)} numbers, one a triangle, not an array of {coefficients.shape}")

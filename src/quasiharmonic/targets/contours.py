@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite
 
 # A path of lines and Bézier curves: the control points (degree + 1, 2) of each piece, joined end to start.
 Pieces = list[FloatArray]
@@ -62,8 +62,7 @@ def checked(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> Floa
     if points.ndim != 2 or points.shape[1] not in widths or len(points) < 3:
         wanted = " or ".join(f"(k, {w})" for w in widths)
         raise ValueError(f"{name} must be {wanted} with k at least 3, not {points.shape}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"point {int(np.argmin(np.isfinite(points).all(axis=1)))} of {name} is not finite")
+    check_finite(name, "point", "points", points)
     return points
 
 

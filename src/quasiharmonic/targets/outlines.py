@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import FloatArray, whole_number
 
 
 def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
@@ -119,9 +119,7 @@ def star(tips: int, inner: float = 0.5) -> FloatArray:
     """
     if not 0 < inner < 1:
         raise ValueError(f"the inner radius of a star is between 0 and 1, not {inner}")
-    _whole("tips", tips)
-    if tips < 3:
-        raise ValueError(f"a star needs at least 3 tips, not {tips}")
+    whole_number("tips", tips, least=3)
     outline = _polar(2 * tips, start=np.pi / 2)
     outline[1::2] *= inner
     return outline
@@ -155,16 +153,9 @@ def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
 
 def _polar(points: int, start: float = 0.0) -> FloatArray:
     """Points evenly spaced on the unit circle, counterclockwise from the angle ``start``."""
-    _whole("points", points)
-    if points < 3:
-        raise ValueError(f"an outline needs at least 3 points, not {points}")
+    whole_number("points", points, least=3)
     angle = start + np.arange(points) * (2 * np.pi / points)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _whole(name: str, count: int) -> None:
-    if not isinstance(count, int | np.integer):
-        raise ValueError(f"the number of {name} must be a whole number, not {count!r}")
 
 
 def _positive(**lengths: float) -> None:
