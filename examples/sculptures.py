@@ -3,7 +3,7 @@
 Each is a *field*, negative inside: rounded cones and ellipsoids that flow into each other. It is meshed by surface
 nets (a vertex in every cell of a grid that the surface passes, a square across every edge it passes), the vertices are
 relaxed along the surface, and what lies below a plane is cut off: the rim is the boundary. They stand upright along y,
-face +z and are between one and three units high.
+face +z and are between one and three units high. Two creatures, an octopus and an armadillo, are closed all around.
 """
 
 from __future__ import annotations
@@ -236,6 +236,72 @@ def angel(x: FloatArray) -> FloatArray:
     return join(0.06, join(0.07, figure, wing), torch, base)
 
 
+def arm(x: FloatArray, points: FloatArray, thick: float, thin: float) -> FloatArray:
+    """A limb along a chain of points, ever thinner."""
+    radii = np.linspace(thick, thin, len(points))
+    found = np.full(x.shape[:-1], np.inf)
+    for k in range(len(points) - 1):
+        found = np.minimum(found, cone(x, points[k], points[k + 1], radii[k], radii[k + 1]))
+    return found
+
+
+def octopus(x: FloatArray) -> FloatArray:
+    """An octopus that walks, each of its eight arms curled in its own way."""
+    s = mirrored(x)
+    head = join(0.25, ball(x, (0, 1.02, -0.24), (0.44, 0.56, 0.46), 0.35, 0), ball(x, (0, 0.46, 0), (0.36, 0.26, 0.36)))
+    head = join(0.05, head, ball(s, (0.20, 0.76, 0.29), (0.12, 0.13, 0.12)))
+    arms = []
+    for k in range(8):
+        # Out from below the head, down to the ground and along it; the end curls up.
+        along = np.linspace(0, 1, 14)
+        curl = (-1) ** (k // 2 + k % 2) * (6.5 + 1.5 * np.sin(5 * k)) * np.maximum(along - 0.45, 0) ** 1.5
+        heading = np.pi * (2 * k + 1) / 8 + curl - 0.25 * np.sign(curl[-1]) * np.sin(4 * along)
+        ground = 0.16 * np.exp(1j * heading[0]) + np.cumsum(2.15 / 14 * np.exp(1j * heading))
+        rise = 0.50 * np.exp(-((along / 0.34) ** 2)) + (0.3 + 0.25 * np.sin(3 * k)) * np.maximum(along - 0.5, 0) ** 1.2
+        arms.append(arm(x, np.stack([ground.real, 0.06 + rise, ground.imag], axis=1), 0.175, 0.045))
+    return join(0.12, head, join(0.05, *arms))
+
+
+def armadillo(x: FloatArray) -> FloatArray:
+    """An armadillo that stands on its hind legs, arms raised."""
+    s = mirrored(x)
+    trunk = join(0.2, ball(x, (0, 0.98, -0.05), (0.44, 0.58, 0.42)), ball(x, (0, 1.42, 0.02), (0.34, 0.32, 0.32)))
+    # The shell, in bands.
+    shell = ball(x, (0, 1.08, -0.16), (0.50, 0.72, 0.46)) + 0.022 * np.cos(26 * (x[..., 1] + 0.25 * x[..., 2]))
+    shell = np.maximum(shell, x[..., 2] - 0.02 - 0.1 * x[..., 1])
+    head = join(
+        0.12, ball(x, (0, 1.92, 0.12), (0.25, 0.26, 0.27)), cone(x, (0, 1.88, 0.25), (0, 1.74, 0.66), 0.17, 0.075)
+    )
+    head = join(
+        0.03, head, ball(x, (0, 1.745, 0.72), (0.06, 0.05, 0.05)), ball(s, (0.15, 1.97, 0.31), (0.055, 0.06, 0.05))
+    )
+    ear = carve(
+        0.05,
+        ball(s, (0.26, 2.30, 0.0), (0.115, 0.28, 0.075), -0.35),
+        ball(s, (0.265, 2.30, 0.085), (0.06, 0.20, 0.06), -0.35),
+    )
+    arms = join(
+        0.08,
+        cone(s, (0.30, 1.48, 0.05), (0.72, 1.36, 0.16), 0.16, 0.125),
+        cone(s, (0.72, 1.36, 0.16), (0.90, 1.74, 0.34), 0.12, 0.095),
+        ball(s, (0.92, 1.83, 0.37), (0.12, 0.12, 0.085)),
+    )
+    fingers = [
+        cone(s, (0.92, 1.84, 0.38), (0.92 + a, 1.84 + b, 0.38 + c), 0.058, 0.042)
+        for a, b, c in ((-0.20, 0.13, 0.11), (-0.05, 0.26, 0.06), (0.14, 0.22, 0.03))
+    ]
+    legs = join(
+        0.1,
+        cone(s, (0.24, 0.70, -0.02), (0.42, 0.42, 0.16), 0.26, 0.18),
+        cone(s, (0.42, 0.42, 0.16), (0.38, 0.08, 0.02), 0.16, 0.12),
+        ball(s, (0.40, 0.07, 0.14), (0.15, 0.085, 0.22)),
+    )
+    toes = [cone(s, (0.40 + a, 0.06, 0.30), (0.40 + 1.7 * a, 0.045, 0.46), 0.062, 0.045) for a in (-0.09, 0.0, 0.09)]
+    tail = arm(x, np.array([(0, 0.55, -0.35), (0, 0.30, -0.66), (0.08, 0.14, -0.95), (0.3, 0.1, -1.2)]), 0.2, 0.05)
+    body = join(0.1, join(0.03, trunk, shell), join(0.03, arms, *fingers), join(0.03, legs, *toes), tail)
+    return join(0.05, join(0.1, body, head), ear)
+
+
 # The field and the corners of its box, at whose lower end it is cut open.
 SCULPTURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, float, float]]] = {
     "angel": (angel, (-1.4, -0.55, -0.9), (1.4, 3.1, 0.9)),
@@ -244,6 +310,28 @@ SCULPTURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, floa
     "bust": (bust, (-1.05, -0.6, -0.75), (1.05, 2.0, 0.75)),
     "hand": (hand, (-0.85, -0.45, -0.4), (0.95, 2.05, 0.75)),
 }
+# The field and the corners of its box, which has room around it.
+CREATURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, float, float]]] = {
+    "octopus": (octopus, (-2.0, -0.3, -2.0), (2.0, 1.75, 2.0)),
+    "armadillo": (armadillo, (-1.2, -0.15, -1.5), (1.2, 2.75, 0.95)),
+}
+
+
+@lru_cache
+def creature(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
+    """A closed surface without handles, its grid ``size`` cells high.
+
+    Returns
+    -------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        Counterclockwise seen from outside.
+    """
+    field, low, high = CREATURES[name]
+    V, F = largest_piece(*surface_net(field, low, high, (high[1] - low[1]) / size))
+    for _ in range(12):
+        V = onto_surface(field, centroids(V, F), None)
+    return V, F
 
 
 @lru_cache
@@ -346,6 +434,11 @@ def cut_off(V: FloatArray, F: IntArray, floor: float) -> tuple[FloatArray, IntAr
         if not ears.any():
             break
         F = F[~ears]
+    return largest_piece(V, F)
+
+
+def largest_piece(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
+    """Of a surface the connected piece with the most triangles, vertices that are in none left out."""
     joined = csr_array((np.ones(F.size), (F.ravel(), np.roll(F, 1, axis=1).ravel())), shape=(len(V), len(V)))
     piece = connected_components(joined, directed=False)[1]
     F = F[piece[F[:, 0]] == np.bincount(piece[F.ravel()]).argmax()]

@@ -137,6 +137,28 @@ def test_cortex(example):
     assert maps[2]["distance error, rms"] < 0.95 * min(row["distance error, rms"] for row in maps[:2])
 
 
+def test_creatures(example):
+    pytest.importorskip("igl")
+    numbers = example("creatures", size=36)
+    for name, most in (("octopus", 0.45), ("armadillo", 0.8)):
+        one, every = (numbers[name][cut] for cut in ("one cut", "a cut to every limb"))
+        assert one["bijective"]
+        assert every["bijective"]
+        assert every["symmetric Dirichlet"] < most < 3 < one["symmetric Dirichlet"]
+        assert every["median stretch"] < 1.25
+
+
+def test_creatures_are_spheres(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    sculptures = importlib.import_module("sculptures")
+    for name in sculptures.CREATURES:
+        V, F = sculptures.creature(name, 36)
+        sides = edges(F, len(V))
+        assert not len(sides.boundary), name
+        assert len(V) - len(sides.interior) + len(F) == 2, name
+        assert np.linalg.det(V[F] - V.mean(axis=0)).sum() > 0, name
+
+
 def test_pattern(example, tmp_path):
     pytest.importorskip("shapely")
     panels = list(example("pattern", size=10).values())
