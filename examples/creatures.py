@@ -3,10 +3,10 @@
 
 Two closed surfaces made of formulas. Middle: ``flatten`` after the one cut that ``cut_open`` makes, between two points
 far from each other. A limb that no cut reaches lies there as a disk, its rim stretched and its end pressed together.
-Right: ``flatten`` after cuts that go from the octopus's mouth to the end of each arm, from the armadillo's belly to
-ten such ends of hands, feet, ears and others; at the left they are drawn on the creatures. That is worth a factor of 30 in the one
-energy and of 12 in the other. Colours are how far lengths change at most, max(σ₁, 1/σ₂); the creatures have those of
-the map at the right. All four maps are bijective, and took 0.2 to 2.3 s on one core.
+Right: ``flatten`` after cuts that go from the octopus's mouth to the end of each arm, and from the armadillo's belly to
+ten ends: hands, feet, ears and others. They are drawn at the left, and worth a factor of 30 in the one energy and of
+12 in the other. Colours are how far lengths change at most, max(σ₁, 1/σ₂); the creatures have those of the map at the
+right. All four maps are bijective, and took 0.2 to 2.3 s on one core.
 """
 
 from __future__ import annotations
