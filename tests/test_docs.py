@@ -12,6 +12,7 @@ PAGES = (
     FOLDER / "README.md",
     FOLDER / "docs" / "index.md",
     FOLDER / "docs" / "existence.md",
+    FOLDER / "docs" / "flatten.md",
     FOLDER / "docs" / "howto.md",
     FOLDER / "docs" / "method.md",
     FOLDER / "docs" / "tutorial.md",
