@@ -9,13 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from quasiharmonic.field.regularisers import Conformal
 
 from quasiharmonic import Problem, solve
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import MIPS
 from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.regularisers import Conformal
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.search.harmonised import Harmonised
 from shared.meshes import bend, lift, random_annulus, random_xi
