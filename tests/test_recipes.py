@@ -19,6 +19,7 @@ PAGES = "CONTRIBUTING.md", "docs/architecture.md"
 
 def test_there_is_one_for_each():
     assert set(RECIPES) == {
+        "A functional",
         "An energy",
         "A linear solver",
         "A way to descend",

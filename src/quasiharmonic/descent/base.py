@@ -7,15 +7,16 @@ whoever runs it (`quasiharmonic.search`) looks at each and stops when it has see
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_type_hints
+from typing import ClassVar, TypeAlias, get_args
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, whole_number
+from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 
@@ -62,12 +63,6 @@ class Descent(ABC):
     word: ClassVar[str]
     #: Whether positions are what moves, and tensors only follow.
     moves_vertices: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        for name, words in _choices(type(self)):
-            given = getattr(self, name)
-            if given not in words:
-                raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
 
     @property
     def name(self) -> str:
@@ -144,8 +139,9 @@ class TensorDescent(Descent):
 
     Attributes
     ----------
-    parameterisation : {"tanh", "si-log"}
-        How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
+    parameterisation : str
+        A name of `quasiharmonic.field.tensor.PARAMETERISATIONS`: how ξ becomes a tensor (§8.2); ``"tanh"`` is fast,
+        ``"si-log"`` keeps angles.
     reference : {"equilateral", "rest", "corrected"}
         Shape of the triangles, unless the problem itself names one.
     iterations : int
@@ -155,12 +151,13 @@ class TensorDescent(Descent):
         inverted triangles, which may have been passed by early on, far from any solution.)
     """
 
-    parameterisation: Literal["tanh", "si-log"] = "tanh"
+    parameterisation: str = "tanh"
     reference: Reference = "equilateral"
     iterations: int = 1000
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        _one_of("parameterisation", self.parameterisation, PARAMETERISATIONS)
+        _one_of("reference", self.reference, get_args(Reference))
         whole_number("iterations", self.iterations, least=1)
 
     @property
@@ -197,11 +194,15 @@ class FunctionalDescent(TensorDescent):
 
     Attributes
     ----------
-    functional : {"dirichlet", "neumann", "sobolev", "poisson"}
-        What is descended (§7.3).
+    functional : str
+        A name of `quasiharmonic.field.functionals.FUNCTIONALS`: what is descended (§7.3).
     """
 
-    functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
+    functional: str = "dirichlet"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _one_of("functional", self.functional, FUNCTIONALS)
 
     @property
     def name(self) -> str:
@@ -238,8 +239,8 @@ class VertexDescent(Descent):
         return best_map
 
 
-@cache
-def _choices(kind: type[Any]) -> list[tuple[str, tuple[str, ...]]]:
-    """The settings of a method that are one of several words, and those words."""
-    hints = [(name, get_args(hint)) for name, hint in get_type_hints(kind).items()]
-    return [(name, words) for name, words in hints if words and all(isinstance(word, str) for word in words)]
+def _one_of(name: str, given: object, words: Iterable[str]) -> None:
+    """Raise a ValueError unless a setting is one of some words."""
+    words = tuple(words)
+    if given not in words:
+        raise ValueError(f"{name} must be one of {', '.join(words)}, not {given!r}")
