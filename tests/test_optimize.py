@@ -367,7 +367,7 @@ class TestStrategy:
         ("arguments", "words"),
         [
             ({"parameterisation": "log"}, "parameterisation must be one of tanh, si-log"),
-            ({"functional": "v3"}, "functional must be one of dirichlet"),
+            ({"functional": "v3"}, "functional must be one of neumann, sobolev, dirichlet, poisson"),
             ({"reference": "square"}, "reference must be one of"),
             ({"iterations": 0}, "iterations must be a whole number of at least 1"),
             ({"iterations": 2.5}, "iterations must be a whole number"),

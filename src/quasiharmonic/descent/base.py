@@ -9,13 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_type_hints
+from typing import ClassVar, TypeAlias, get_args
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, check_choice, whole_number
+from quasiharmonic.arrays import ComplexArray, whole_number
+from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 
@@ -62,10 +63,6 @@ class Descent(ABC):
     word: ClassVar[str]
     #: Whether positions are what moves, and tensors only follow.
     moves_vertices: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        for name, words in _choices(type(self)):
-            check_choice(name, getattr(self, name), words)
 
     @property
     def name(self) -> str:
@@ -142,8 +139,9 @@ class TensorDescent(Descent):
 
     Attributes
     ----------
-    parameterisation : {"tanh", "si-log"}
-        How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
+    parameterisation : str
+        A name of `quasiharmonic.field.tensor.PARAMETERISATIONS`: how ξ becomes a tensor (§8.2); ``"tanh"`` is fast,
+        ``"si-log"`` keeps angles.
     reference : {"equilateral", "rest", "corrected"}
         Shape of the triangles, unless the problem itself names one.
     iterations : int
@@ -153,12 +151,13 @@ class TensorDescent(Descent):
         inverted triangles, which may have been passed by early on, far from any solution.)
     """
 
-    parameterisation: Literal["tanh", "si-log"] = "tanh"
+    parameterisation: str = "tanh"
     reference: Reference = "equilateral"
     iterations: int = 1000
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_choice("parameterisation", self.parameterisation, PARAMETERISATIONS)
+        check_choice("reference", self.reference, get_args(Reference))
         whole_number("iterations", self.iterations, least=1)
 
     @property
@@ -195,11 +194,15 @@ class FunctionalDescent(TensorDescent):
 
     Attributes
     ----------
-    functional : {"dirichlet", "neumann", "sobolev", "poisson"}
-        What is descended (§7.3).
+    functional : str
+        A name of `quasiharmonic.field.functionals.FUNCTIONALS`: what is descended (§7.3).
     """
 
-    functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
+    functional: str = "dirichlet"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("functional", self.functional, FUNCTIONALS)
 
     @property
     def name(self) -> str:
@@ -234,10 +237,3 @@ class VertexDescent(Descent):
     def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:
         """Which of two maps to go on from."""
         return best_map
-
-
-@cache
-def _choices(kind: type[Any]) -> list[tuple[str, tuple[str, ...]]]:
-    """The settings of a method that are one of several words, and those words."""
-    hints = [(name, get_args(hint)) for name, hint in get_type_hints(kind).items()]
-    return [(name, words) for name, words in hints if words and all(isinstance(word, str) for word in words)]

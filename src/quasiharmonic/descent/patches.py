@@ -61,7 +61,6 @@ class Patches(VertexDescent):
     word: ClassVar[str] = "patches"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         whole_number("tries", self.tries, least=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
