@@ -13,7 +13,7 @@ from typing import ClassVar, TypeAlias, get_args
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, whole_number
+from quasiharmonic.arrays import ComplexArray, check_choice, whole_number
 from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.field.tensor import PARAMETERISATIONS
