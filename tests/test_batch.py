@@ -191,8 +191,8 @@ class TestRun:
         states = []
         for file, text in (
             ("__init__.py", ""),
-            ("inject.py", "a = 1"),
-            ("inject.py", "a = 2"),
+            ("solving.py", "a = 1"),
+            ("solving.py", "a = 2"),
             ("report/page.py", "only shows"),
         ):
             (package / file).write_text(text)
