@@ -266,7 +266,7 @@ class TestReportFails:
         def fail(*arguments, **more):
             raise NotPositiveDefinite("as asked")
 
-        monkeypatch.setattr("quasiharmonic.search.inject.quasi_harmonic_map", fail)
+        monkeypatch.setattr("quasiharmonic.search.solving.quasi_harmonic_map", fail)
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 0
         assert (tmp_path / "p.png").exists()
 

@@ -23,7 +23,7 @@ from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.exact.certificate import is_injective
 from quasiharmonic.result import Status
 
-# Of the step at which the first triangle would collapse.
+# Fraction of the step at which the first triangle would collapse; no longer step is tried.
 FRACTION = 0.9
 # The step is halved, and then doubled, this often before the direction is given up.
 HALVINGS = 30

@@ -123,16 +123,17 @@ class Search:
     def _run(self, stages: Stages) -> Status:
         """Stage after stage, as long as there is hope."""
         status = Status.OUT_OF_ITERATIONS
-        here = [stage for stage in stages if isinstance(stage, Descent)]
-        plain = here[0] if here else next(stage.first for stage in stages if isinstance(stage, CoarseToFine))
+        on_the_mesh = [stage for stage in stages if isinstance(stage, Descent)]
+        coarse = [stage.first for stage in stages if isinstance(stage, CoarseToFine)]
+        fallback = (on_the_mesh or coarse)[0]
         if not self.problem.encloses_area:
             self._descend(VectorAdam(iterations=1))
             self._examine()
             return Status.IMPOSSIBLE
         if self._first is not None:
             # From a map at hand the first stage is tried before all, and no coarse mesh.
-            status = self._attempt(plain, status)
-            stages = here or [plain]
+            status = self._attempt(fallback, status)
+            stages = on_the_mesh or [fallback]
         for stage in stages:
             if status is Status.INJECTIVE or self._left <= 0:
                 break
@@ -141,16 +142,16 @@ class Search:
                     return Status.INJECTIVE
                 continue
             status = self._attempt(stage, status)
-            # What is tried after the first stage takes long, and is pointless where there is a reason.
+            # Later stages take long, and are in vain where no injective map exists.
             if status is not Status.INJECTIVE and self._examine().forbids_injective:
                 break
         if self.best_field is None and self._left > 0:
-            # Stages for a coarse mesh alone, and none was to be had or it led to nothing.
-            status = self._attempt(plain, status)
+            # Every stage was for a coarse mesh, and there was none or its search came to nothing.
+            status = self._attempt(fallback, status)
         if status is Status.INJECTIVE:
             return status
         if self._examine().forbids_injective:
-            self._sink()
+            self._towards_least_area()
             return Status.IMPOSSIBLE
         return Status.ROUNDED if self._rounded else status
 
@@ -167,7 +168,7 @@ class Search:
 
     def _from_coarse(self, stage: CoarseToFine) -> Status:
         """Search on a coarse mesh, if there is one to be had, and carry its map to this one."""
-        # What is recorded are maps of this mesh.
+        # A recording shows maps of this mesh only, so no coarse one is searched.
         coarse = None if self.record else coarse_mesh(self.problem)
         if coarse is None:
             return Status.OUT_OF_ITERATIONS
@@ -213,7 +214,7 @@ class Search:
             self.diagnosis = diagnose(self.problem)
         return self.diagnosis
 
-    def _sink(self) -> None:
+    def _towards_least_area(self) -> None:
         """Where no map is injective, go to the one of least area: the target's area and V₃ make it up (eq. 42)."""
         if self._left > 0:
             self._descend(Newton(iterations=_TO_LEAST_AREA, resume=True))

@@ -8,7 +8,8 @@ from quasiharmonic.descent import Descent, Newton, Patches, RandomRestarts, Unta
 from quasiharmonic.problem import Problem
 from quasiharmonic.search.stages import CoarseToFine, Stages
 
-# Vertices from which on a coarse mesh, made, solved and refined again, is quicker than ten iterations on the mesh.
+# Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
+# than ten iterations on the mesh.
 _LARGE = 6000
 
 

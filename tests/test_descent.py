@@ -1,4 +1,4 @@
-"""The optimisers: what each of them must do, against brute force and differences."""
+"""The descents: what each of them must do, against brute force and differences."""
 
 from __future__ import annotations
 
