@@ -1,5 +1,7 @@
 """Projected Newton steps down a deformation energy, each of which ends in an injective map (§10, §11).
 
+::
+
     assemble ──▶ factor ──▶ direction ──▶ t = min(1, 0.9 × first collapse) ──▶ less energy? ──▶ injective, exactly?
        ▲                                          │ ▲            no: t/2 ◀──────────┴────────────────┘ yes
        └──────────────────────────────────────────┼─┴── t = 1 went well: 2t, 4t, … as long as the energy falls
