@@ -128,8 +128,11 @@ def moved_onto(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArra
 
 
 def _stages(problem: Problem) -> list[Descent]:
-    """What is tried, in which order: air gives way, so that vertices can be moved soon."""
-    stages = speed(problem)
+    """What is tried, in which order: air gives way, so that vertices can be moved soon.
+
+    Random restarts are left out: other air is a better chance than a hundred tries with this one.
+    """
+    stages = [stage for stage in speed(problem) if stage.optimizer != "shaking"]
     if stages[0].optimizer == "coarse-to-fine":
         return stages
     return [
