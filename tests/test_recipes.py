@@ -13,7 +13,12 @@ from shared.formats import try_format
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-RECIPES = dict(re.findall(r"^### ([^\n]*)\n\n```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL))
+# Every block of a section is part of its recipe.
+RECIPES = {
+    title: "\n".join(blocks)
+    for title, *text in (section.split("\n", 1) for section in re.split(r"^##+ ", TEXT, flags=re.MULTILINE))
+    if (blocks := re.findall(r"^```python\n(.*?)^```", *text, re.MULTILINE | re.DOTALL))
+}
 PAGES = "CONTRIBUTING.md", "docs/architecture.md"
 
 

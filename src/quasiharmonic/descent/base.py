@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias, get_args
+from typing import ClassVar, Protocol, TypeAlias, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.field.tensor import PARAMETERISATIONS
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
+from quasiharmonic.result import Status
 
 Iterates: TypeAlias = Generator[Iterate, None, bool]
 
@@ -42,8 +43,39 @@ class SoFar:
     deepest: Iterate | None
 
 
+class Runner(Protocol):
+    """What a stage asks of the search that runs it. Either call says how the search stands after the stage."""
+
+    def attempt(self, stage: Descent, before: Status) -> Status:
+        """Descend on the mesh itself; ``before`` is how the search stood."""
+
+    def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
+        """Search on a coarse mesh, beginning with what the stage ``begins_with``, and carry the map to the mesh."""
+
+
+class SearchStage(ABC):
+    """What a strategy is a list of."""
+
+    #: Whether it searches on a coarse mesh, and not on the mesh itself.
+    coarse: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """How reports call this stage."""
+
+    @property
+    @abstractmethod
+    def begins_with(self) -> Descent:
+        """The first descent, on whichever mesh."""
+
+    @abstractmethod
+    def run(self, search: Runner, before: Status) -> Status:
+        """Have a search run this stage; how the search stands afterwards."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class Descent(ABC):
+class Descent(SearchStage):
     """One stage of a search, on the mesh itself.
 
     Attributes
@@ -68,6 +100,15 @@ class Descent(ABC):
     def name(self) -> str:
         """How reports call this stage."""
         return self.word
+
+    @property
+    def begins_with(self) -> Descent:
+        """Itself."""
+        return self
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.attempt(self, before)
 
     @property
     def patience(self) -> tuple[int, float] | None:
