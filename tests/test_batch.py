@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import quasiharmonic
 from quasiharmonic import batch, certify, io
 from quasiharmonic.batch import driver, records, supervisor
 from quasiharmonic.batch import settings as settings_module
@@ -187,12 +186,12 @@ class TestRun:
         assert batch.run(stars / "a", tmp_path / "out").resumed == 1
         package = tmp_path / "package"
         (package / "report").mkdir(parents=True)
-        monkeypatch.setattr(quasiharmonic, "__file__", str(package / "__init__.py"))
+        monkeypatch.setattr(settings_module, "__file__", str(package / "batch" / "settings.py"))
         states = []
         for file, text in (
             ("__init__.py", ""),
-            ("inject.py", "a = 1"),
-            ("inject.py", "a = 2"),
+            ("solving.py", "a = 1"),
+            ("solving.py", "a = 2"),
             ("report/page.py", "only shows"),
         ):
             (package / file).write_text(text)

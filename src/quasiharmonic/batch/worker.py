@@ -36,7 +36,7 @@ from quasiharmonic.exact.certificate import certify
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status
-from quasiharmonic.search.inject import solve
+from quasiharmonic.search.solving import solve
 
 #: What a process says when it has imported what it needs.
 READY = "ready"
