@@ -57,7 +57,7 @@ def cut_to_ends(V: FloatArray, F: IntArray, near: tuple[float, float, float], co
     for v in ranked[np.argsort(-away[ranked])].tolist():
         if len(ends) < count and (not ends or dijkstra(graph, directed=False, indices=v)[ends].min() > APART):
             ends.append(v)
-    ways = []
+    ways: list[tuple[int, int]] = []
     for end in ends:
         way = [end]
         while way[-1] != root:
