@@ -123,7 +123,8 @@ def run(options: argparse.Namespace) -> int:
             "triangles": len(mesh.F),
             "copied_vertices": copies,
             "energy": options.energy,
-            "mean_energy": result.history[-1].energy if result.history else None,
+            # Each piece begins anew; of several, none is the energy of all.
+            "mean_energy": result.history[-1].energy if sum(not s.iteration for s in result.history) == 1 else None,
             "distortion": measured.to_dict(),
             "input": str(options.input),
             "output": str(options.output),

@@ -160,7 +160,7 @@ def flatten(
 
         return replace(pinned(V, F, fixed, target, settings, weights, given), seconds=time.perf_counter() - began)
     parts = _parts(V, F)
-    pieces = [Piece(V, F)] if len(parts) == 1 else [_piece(V, F, *part) for part in parts]
+    pieces = _pieces(V, F, parts)
     results: list[MapResult] = []
     for piece, (vertices, triangles) in zip(pieces, parts, strict=True):
         if results and results[-1].status is Status.INTERRUPTED:
@@ -189,6 +189,31 @@ def flatten(
         linear_solver=results[0].linear_solver,
         seconds=time.perf_counter() - began,
     )
+
+
+def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
+    """The connected pieces of a mesh, largest first, if it is one that `flatten` takes; raises what that would.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+    F : (f, 3) array of int
+
+    Returns
+    -------
+    list of Piece
+
+    Raises
+    ------
+    ValueError
+        As `flatten` says of surfaces.
+    """
+    V, F = real_array("V", V), index_array("F", F)
+    pieces = _pieces(V, F, _parts(V, F))
+    for piece in pieces:
+        # Says which rest triangles have no area.
+        piece.energy(SymmetricDirichlet(), None)
+    return pieces
 
 
 def _with_distances(piece: Piece, found: MapResult, rings: int, settings: Settings) -> MapResult:
@@ -221,6 +246,10 @@ def _parts(V: FloatArray, F: IntArray) -> list[tuple[IntArray, IntArray]]:
         (np.flatnonzero(label == own), np.flatnonzero(of_triangle == own))
         for own in labels[np.argsort(-count, kind="stable")].tolist()
     ]
+
+
+def _pieces(V: FloatArray, F: IntArray, parts: list[tuple[IntArray, IntArray]]) -> list[Piece]:
+    return [Piece(V, F)] if len(parts) == 1 else [_piece(V, F, *part) for part in parts]
 
 
 def _piece(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -> Piece:
