@@ -1,4 +1,4 @@
-"""What each choice costs and brings: functional, parameterisation, optimiser, strategy, energy, linear solver.
+"""What each choice costs and brings: functional, parameterisation, method of descent, strategy, energy, linear solver.
 
     OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose
 

@@ -1,4 +1,4 @@
-"""Every functional, parameterisation and first-order optimiser on every problem folder (§7.3, §8, §9).
+"""Every functional, parameterisation and first-order method on every problem folder (§7.3, §8, §9).
 
     python benchmarks/combinations.py FOLDER [FOLDER …] [-n ITERATIONS] [--newton STEPS] [-o TABLE.csv]
 
@@ -20,9 +20,9 @@ import numpy as np
 from quasiharmonic import Problem, io, solve
 from quasiharmonic.descent import LBFGS, Descent, Newton, VectorAdam
 from quasiharmonic.energy.measures import distortion
+from quasiharmonic.field.functionals import FUNCTIONALS
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 
-FUNCTIONALS = "neumann", "sobolev", "dirichlet", "poisson"
-PARAMETERISATIONS = "tanh", "si-log"
 METHODS = {"vector-adam": VectorAdam, "l-bfgs": LBFGS}
 
 

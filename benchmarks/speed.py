@@ -37,7 +37,7 @@ from quasiharmonic import Problem, io, is_injective, solve, surfaces
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.descent import Descent, VectorAdam
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search import inject
+from quasiharmonic.search import solving
 from quasiharmonic.search.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 
@@ -110,7 +110,7 @@ def measure(name: str, arrays: Arrays, tools: list[str], runs: int, strategy: St
                 with clock.clocking():
                     began = time.perf_counter()
                     if record.tool == OURS:
-                        result = inject.injective_map(*arrays, strategy=strategy)
+                        result = solving.injective_map(*arrays, strategy=strategy)
                         uv, record.iterations = result.uv, result.iterations
                     else:
                         uv = PEERS[record.tool](*arrays)
@@ -149,7 +149,7 @@ def print_peak(tool: str, path: Path) -> None:
     """The child's part of `peak_megabytes`."""
     with np.load(path) as stored:
         arrays = tuple(stored[name] for name in stored.files)
-    run: Callable[..., object] = inject.injective_map if tool == OURS else PEERS[tool]
+    run: Callable[..., object] = solving.injective_map if tool == OURS else PEERS[tool]
     # A small problem first, for what is loaded once and for all.
     run(*cat(100, "C"))
     before = _peak()
@@ -186,7 +186,7 @@ def animation(triangles: int) -> list[Record]:
         for record in (afresh, onwards):
             began = time.perf_counter()
             if record is afresh:
-                result = inject.injective_map(V, F, loop, bent(angle))
+                result = solving.injective_map(V, F, loop, bent(angle))
             else:
                 problem = problem.moved(bent(angle))
                 result = solve(problem, start=last)

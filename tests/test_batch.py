@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import quasiharmonic
-from quasiharmonic import batch, certify, io
+from quasiharmonic import batch, certify, flatten, io
 from quasiharmonic.batch import driver, records, supervisor
 from quasiharmonic.batch import settings as settings_module
 from quasiharmonic.batch.supervisor import Finished
@@ -187,12 +186,12 @@ class TestRun:
         assert batch.run(stars / "a", tmp_path / "out").resumed == 1
         package = tmp_path / "package"
         (package / "report").mkdir(parents=True)
-        monkeypatch.setattr(quasiharmonic, "__file__", str(package / "__init__.py"))
+        monkeypatch.setattr(settings_module, "__file__", str(package / "batch" / "settings.py"))
         states = []
         for file, text in (
             ("__init__.py", ""),
-            ("inject.py", "a = 1"),
-            ("inject.py", "a = 2"),
+            ("solving.py", "a = 1"),
+            ("solving.py", "a = 2"),
             ("report/page.py", "only shows"),
         ):
             (package / file).write_text(text)
@@ -270,7 +269,7 @@ class TestRun:
         assert record["status"] == "polished"
         # The mean of that measure is this energy.
         assert record["energy"] == pytest.approx(record["mips"], rel=1e-9)
-        np.testing.assert_array_equal(io.map_of(written), quasiharmonic.flatten(V, F, energy="mips").uv)
+        np.testing.assert_array_equal(io.map_of(written), flatten(V, F, energy="mips").uv)
         assert record_of(tmp_path / "out", "rings/ring.off")["loops"] == 2
         assert "closed" in record_of(tmp_path / "out", "closed.obj")["error"]
         assert "zero area" in record_of(tmp_path / "out", "flat.obj")["error"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import io
+from quasiharmonic import cli, io
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.surfaces import random_delaunay
 from shared.commands import run
@@ -266,7 +267,7 @@ class TestReportFails:
         def fail(*arguments, **more):
             raise NotPositiveDefinite("as asked")
 
-        monkeypatch.setattr("quasiharmonic.search.inject.quasi_harmonic_map", fail)
+        monkeypatch.setattr("quasiharmonic.search.solving.quasi_harmonic_map", fail)
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 0
         assert (tmp_path / "p.png").exists()
 
@@ -441,6 +442,18 @@ def test_help_imports_no_numerics():
         "import quasiharmonic; assert not {'numpy', 'scipy', 'matplotlib'} & set(sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.__name__.split(".")[-1])
+def test_every_subcommand_explains_itself(command):
+    """Its page in the documentation is made from this and nothing else."""
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    command.add_parser(commands)
+    ((name, subparser),) = commands.choices.items()
+    assert re.search(rf"^ +{name} +\w+", parser.format_help(), re.MULTILINE)
+    # An option without a help text stands alone on its line, and so does nothing else.
+    assert not re.findall(r"^  -[^ ]+(?:, --[\w-]+)?(?: [A-Z]+)?$(?!\n {10})", subparser.format_help(), re.MULTILINE)
 
 
 def test_module_runs_as_the_command():

@@ -10,7 +10,7 @@ import pytest
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.inject import injective_map
+from quasiharmonic.search.solving import injective_map
 from quasiharmonic.surfaces import disk
 from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto
 from shared.polygons import circle

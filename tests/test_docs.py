@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+import quasiharmonic
 
 FOLDER = Path(__file__).parent.parent
 PAGES = (
@@ -36,3 +39,24 @@ CASES = [
 def test_block_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "block", "exec"), {"__name__": "block"})
+
+
+REFERENCE = re.findall(r"^   ([\w.]+)$", (FOLDER / "docs" / "reference.md").read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def found(name):
+    """What a name of the reference stands for: a module, or an attribute of one."""
+    try:
+        return import_module(f"quasiharmonic.{name}")
+    except ModuleNotFoundError:
+        module, _, attribute = f"quasiharmonic.{name}".rpartition(".")
+        return getattr(import_module(module), attribute)
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_what_the_reference_names_is_there(name):
+    assert found(name).__doc__
+
+
+def test_the_reference_has_every_public_name():
+    assert set(quasiharmonic.__all__) <= set(REFERENCE)

@@ -18,6 +18,14 @@ from shared.meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]
 NAMES = list(FUNCTIONALS)
+SIGHTED = [name for name in NAMES if FUNCTIONALS[name].sees_positions]
+# V₁ … V₄ in the paper's dense matrices: of the map w, its residual, L, its pseudo-inverse, D and the Neumann data g.
+PAPER = {
+    "neumann": lambda w, residual, L, pinv, D, g: np.vdot(residual, residual).real / 2,
+    "sobolev": lambda w, residual, L, pinv, D, g: (residual.conj() @ pinv @ residual).real / 2,
+    "dirichlet": lambda w, residual, L, pinv, D, g: (w.conj() @ L @ w).real / 2 - w.real @ D @ w.imag,
+    "poisson": lambda w, residual, L, pinv, D, g: (g.conj() @ pinv @ g).real / 2 - w.real @ D @ w.imag,
+}
 
 
 def posed(V, F, pins=0, noise=0.0, seed=0):
@@ -47,7 +55,7 @@ def inverse_field(mesh, w):
 class TestValues:
     def test_are_the_papers(self, name, V, F):
         problem = posed(V, F, noise=0.05)
-        for functional in NAMES:
+        for functional, formula in PAPER.items():
             iterate = Objective(problem, functional).evaluate(random_xi(F))
             L, D, pinv = matrices(problem, iterate)
             w = iterate.w
@@ -56,13 +64,7 @@ class TestValues:
             residual = L @ w - g
             on_boundary = np.zeros(len(V), dtype=complex)
             on_boundary[problem.fixed] = residual[problem.fixed]
-            expected = {
-                "neumann": np.vdot(residual, residual).real / 2,
-                "sobolev": (residual.conj() @ pinv @ residual).real / 2,
-                "dirichlet": (w.conj() @ L @ w).real / 2 - w.real @ D @ w.imag,
-                "poisson": (g.conj() @ pinv @ g).real / 2 - w.real @ D @ w.imag,
-            }[functional]
-            assert iterate.value == pytest.approx(expected, rel=1e-8)
+            assert iterate.value == pytest.approx(formula(w, residual, L, pinv, D, g), rel=1e-8)
             if functional != "poisson":
                 assert iterate.value > 0
 
@@ -152,7 +154,7 @@ class TestTheorems:
             lowest = np.linalg.eigvalsh(H).min()
             assert (lowest > -1e-12) if holds else (lowest < -1e-3)
 
-    @pytest.mark.parametrize("functional", ["neumann", "sobolev", "dirichlet"])
+    @pytest.mark.parametrize("functional", SIGHTED)
     def test_a_vanishing_functional_means_an_injective_map(self, name, V, F, functional):
         """Theorem 6.4 the other way, by descent: as V → 0 the last triangle is righted, from any of them.
 
@@ -216,8 +218,32 @@ class TestPoissonIsBlind:
         xi = np.zeros(len(F), dtype=complex)
         assert Objective(pinned, "poisson").evaluate(xi).value == pytest.approx(0, abs=1e-12)
         assert Objective(free, "dirichlet").evaluate(xi).value == pytest.approx(0, abs=1e-12)
-        for sighted in ("neumann", "sobolev", "dirichlet"):
+        for sighted in SIGHTED:
             assert Objective(pinned, sighted).evaluate(xi).value > 1e-2
 
     def test_is_declared(self):
-        assert [n for n in NAMES if not FUNCTIONALS[n].sees_positions] == ["poisson"]
+        assert [name for name in PAPER if name not in SIGHTED] == ["poisson"]
+
+
+class TestSettings:
+    def test_a_functional_in_the_table_is_one_to_descend(self, monkeypatch):
+        class Logarithm(FUNCTIONALS["dirichlet"]):
+            def value(self, at):
+                return float(np.log1p(at.dirichlet))
+
+            def gradient(self, at):
+                return at.dirichlet_gradient / (1 + at.dirichlet)
+
+        with pytest.raises(ValueError, match="functional must be one of neumann, sobolev, dirichlet, poisson, not"):
+            LBFGS(functional="logarithm")
+        monkeypatch.setitem(FUNCTIONALS, "logarithm", Logarithm)
+        _, V, F = MESHES[0]
+        result = solve(posed(V, F), strategy=[LBFGS(functional="logarithm", iterations=300)])
+        assert result.injective
+        assert result.stages[0].name == "l-bfgs, tanh, logarithm"
+
+    @pytest.mark.parametrize("setting", ["functional", "parameterisation", "reference"])
+    @pytest.mark.parametrize("word", ["v3", None, ["tanh"]])
+    def test_others_are_refused(self, setting, word):
+        with pytest.raises(ValueError, match=f"{setting} must be one of "):
+            LBFGS(**{setting: word})

@@ -18,7 +18,7 @@ from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.inject import quasi_harmonic_map
+from quasiharmonic.search.solving import quasi_harmonic_map
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 

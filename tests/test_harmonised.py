@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quasiharmonic.field.regularisers import Conformal
 
 from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
 from quasiharmonic.descent import LBFGS
@@ -14,6 +13,7 @@ from quasiharmonic.energy.derivatives import check_energy, derivative_error
 from quasiharmonic.energy.energies import MIPS, AreaPreserving, Combination, Energy
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.regularisers import Conformal
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.search.harmonised import Harmonised
 from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map

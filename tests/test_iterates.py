@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
-from quasiharmonic.field.regularisers import Conformal
 
-from quasiharmonic import Problem
+from quasiharmonic import Problem, solve
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import MIPS
 from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.regularisers import Conformal
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.search.harmonised import Harmonised
 from shared.meshes import bend, lift, random_annulus, random_xi
@@ -70,6 +75,76 @@ def test_operators_in_turn():
     np.testing.assert_array_equal(answers[0], answers[2])
     np.testing.assert_array_equal(answers[1], answers[3])
     assert np.abs(answers[0] - answers[1]).max() > 1e-3
+
+
+@pytest.fixture
+def hasty():
+    """Threads take turns as often as they can."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(interval)
+
+
+SHARED = {
+    "one objective": lambda make, problem, one: one,
+    "two objectives of one problem": lambda make, problem, one: make(problem),
+    "a moved problem": lambda make, problem, one: make(problem.moved(problem.target)),
+}
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.parametrize("shared", SHARED)
+@pytest.mark.parametrize("name", MAKERS)
+def test_threads_share_a_domain(name, shared):
+    """Whatever other threads evaluate on the same domain meanwhile, each gets what it would get alone."""
+    make = MAKERS[name]
+    xis = [random_xi(posed().F, 0.1, seed) for seed in range(4)]
+    expected = [asked(make(posed()).evaluate(xi)) for xi in xis]
+    problem = posed()
+    one = make(problem)
+
+    def wrong(thread):
+        mine, bad = SHARED[shared](make, problem, one), 0
+        for turn in range(15):
+            value, gradient = expected[(thread + turn) % 4]
+            at = mine.evaluate(xis[(thread + turn) % 4])
+            bad += not np.isclose(at.value, value, rtol=1e-9, atol=0)
+            bad += not np.allclose(at.gradient, gradient, rtol=0, atol=1e-9 * np.abs(gradient).max())
+        return bad
+
+    with ThreadPoolExecutor(4) as threads:
+        assert sum(threads.map(wrong, range(4))) == 0
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_solve_beside_another_thread():
+    """A search is not disturbed by an objective of the same problem that somebody else evaluates."""
+    alone, problem = solve(posed()), posed()
+    objective, xi, done = Objective(problem), random_xi(problem.F, 0.3), []
+
+    def spin():
+        while not done:
+            objective.evaluate(xi)
+
+    with ThreadPoolExecutor(1) as threads:
+        spinning = threads.submit(spin)
+        try:
+            for _ in range(4):
+                beside = solve(problem)
+                np.testing.assert_array_equal(beside.uv, alone.uv)
+                assert beside.iterations == alone.iterations
+        finally:
+            done.append(True)
+        spinning.result()
+
+
+def test_a_domain_with_factors_is_pickled_and_copied():
+    problem = posed()
+    xi = random_xi(problem.F, 0.3)
+    value = Objective(problem).evaluate(xi).value
+    for other in (pickle.loads(pickle.dumps(problem)), copy.deepcopy(problem)):
+        assert Objective(other).evaluate(xi).value == value
 
 
 def test_a_map_at_its_own_tensors_is_what_they_give_back():

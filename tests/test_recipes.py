@@ -9,14 +9,22 @@ from pathlib import Path
 
 import pytest
 
+from shared.formats import try_format
+
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-RECIPES = dict(re.findall(r"^### ([^\n]*)\n\n```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL))
+# Every block of a section is part of its recipe.
+RECIPES = {
+    title: "\n".join(blocks)
+    for title, *text in (section.split("\n", 1) for section in re.split(r"^##+ ", TEXT, flags=re.MULTILINE))
+    if (blocks := re.findall(r"^```python\n(.*?)^```", *text, re.MULTILINE | re.DOTALL))
+}
 PAGES = "CONTRIBUTING.md", "docs/architecture.md"
 
 
 def test_there_is_one_for_each():
     assert set(RECIPES) == {
+        "A functional",
         "An energy",
         "A linear solver",
         "A way to descend",
@@ -31,6 +39,13 @@ def test_recipe_runs(name, tmp_path):
     assert "assert" in RECIPES[name]
     done = subprocess.run([sys.executable, "-c", RECIPES[name]], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_format_stands_its_trials(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(RECIPES["A file format"], names)
+    try_format(names["read_npz"], names["write_npz"], tmp_path / "mesh.npz")
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -61,11 +61,11 @@ def test_rules(path):
 @pytest.mark.parametrize(
     "code",
     [
-        "from quasiharmonic.search.inject import _hidden",
+        "from quasiharmonic.search.solving import _hidden",
         "import quasiharmonic._hidden",
         "result._hidden()",
-        "monkeypatch.setattr('quasiharmonic.search.inject._hidden', 1)",
-        "patch.setattr(inject, '_hidden', 1)",
+        "monkeypatch.setattr('quasiharmonic.search.solving._hidden', 1)",
+        "patch.setattr(solving, '_hidden', 1)",
     ],
 )
 def test_private_names_are_found(code):

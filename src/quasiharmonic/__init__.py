@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
     from quasiharmonic.search.harmonising import harmonise
-    from quasiharmonic.search.inject import injective_map, quasi_harmonic_map, solve
+    from quasiharmonic.search.solving import injective_map, quasi_harmonic_map, solve
 
 __version__ = "0.1.0"
 
@@ -69,16 +69,16 @@ _HOME = {
     "flatten": "flattening.flattened",
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
-    "injective_map": "search.inject",
+    "injective_map": "search.solving",
     "is_injective": "exact.certificate",
     "keep_distances": "flattening.distance_descent",
     "morph": "apply.morphing",
     "polish": "energy.polishing",
-    "quasi_harmonic_map": "search.inject",
+    "quasi_harmonic_map": "search.solving",
     "refine": "mesh.refinement",
     "refine_problem": "apply.refining",
     "repair": "apply.repairing",
-    "solve": "search.inject",
+    "solve": "search.solving",
     "warp_along": "apply.warping",
     "warp_by_landmarks": "apply.warping",
     "write_pattern": "flattening.patterns",

@@ -147,7 +147,7 @@ def check_range(
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Raise a ValueError that lists the choices, unless the value is one of them."""
-    if value not in choices:
+    if value not in tuple(choices):
         raise ValueError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
 
 

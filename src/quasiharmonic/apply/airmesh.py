@@ -24,7 +24,7 @@ from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
 from quasiharmonic.exact.certificate import Certificate, certify, is_injective
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.inject import injective_map
+from quasiharmonic.search.solving import injective_map
 from quasiharmonic.targets.contours import signed_area
 
 #: ARAP, and what keeps triangles from collapsing.

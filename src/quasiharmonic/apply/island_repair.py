@@ -27,7 +27,7 @@ from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import boundary_edges, components
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status, Step
-from quasiharmonic.search.inject import solve
+from quasiharmonic.search.solving import solve
 
 # Rings of vertices around inverted triangles that may move, tried in turn ...
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32

@@ -25,7 +25,7 @@ from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Step
-from quasiharmonic.search.inject import solve
+from quasiharmonic.search.solving import solve
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from quasiharmonic.arrays import FloatArray, IntArray, check_finite, map_array, 
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.result import MapResult
-from quasiharmonic.search.inject import injective_map
+from quasiharmonic.search.solving import injective_map
 
 # Cells along the longer side of a picture, and at least along the shorter, so that there is a way past landmarks.
 _ALONG, _ACROSS = 48, 6

@@ -8,13 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from quasiharmonic.io import problem_files
+from quasiharmonic.io import READERS, problem_files
 
 #: A file that marks a folder as the output of a run; nothing in there is a problem.
 MARKER = "qhm-batch.json"
 
-# Files that are a mesh by their names; whatever else is named as a source is a list.
-_MESH = re.compile(r"\.(obj|off)", re.IGNORECASE)
 # In a list; a name may have the sign inside.
 _COMMENT = re.compile(r"(?:^|\s)#")
 
@@ -67,7 +65,7 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
         yield from _below(path, "", plain, frozenset())
     elif not path.exists():
         raise ValueError(f"there is no folder, list or mesh {source}")
-    elif _MESH.fullmatch(path.suffix):
+    elif path.suffix.lower() in READERS:
         yield ProblemFiles(path.name, path, None)
     else:
         yield from _listed(path, plain)
@@ -95,7 +93,7 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
         inner = f"{name}/{entry}" if name else entry
         if is_folder:
             yield from _below(folder / entry, inner, plain, above | {here})
-        elif plain and _MESH.fullmatch(os.path.splitext(entry)[1]):
+        elif plain and os.path.splitext(entry)[1].lower() in READERS:
             yield ProblemFiles(inner, folder / entry, None)
 
 
@@ -107,7 +105,7 @@ def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
             if not text:
                 continue
             place = Path(os.path.abspath(path.parent / text))
-            if not (place.is_dir() or (_MESH.fullmatch(place.suffix) and place.is_file())):
+            if not (place.is_dir() or (place.suffix.lower() in READERS and place.is_file())):
                 raise ValueError(
                     f"{path}: line {number}: there is no folder and no OBJ or OFF file {text[:100]!r}; "
                     "a list names one in every line"

@@ -11,7 +11,6 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-import quasiharmonic
 from quasiharmonic import __version__
 from quasiharmonic.batch.problems import ProblemFiles
 
@@ -101,7 +100,7 @@ def _contents(path: Path) -> bytes:
 @cache
 def sources_digest() -> str:
     """Digest of the package's sources, as they were when first asked, but for those that only show what came out."""
-    package = Path(quasiharmonic.__file__).parent
+    package = Path(__file__).parent.parent
     digest = blake2b(digest_size=16)
     for path in sorted(package.rglob("*.py")):
         place = path.relative_to(package).as_posix()

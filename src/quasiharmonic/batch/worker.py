@@ -37,7 +37,7 @@ from quasiharmonic.flattening.flattened import flatten, flattenable
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Stage, Status
-from quasiharmonic.search.inject import solve
+from quasiharmonic.search.solving import solve
 
 #: What a process says when it has imported what it needs.
 READY = "ready"

@@ -126,7 +126,7 @@ def search(
 ) -> MapResult:
     """Solve with progress on the terminal."""
     from quasiharmonic.cli import progress
-    from quasiharmonic.search.inject import solve
+    from quasiharmonic.search.solving import solve
 
     with progress.line() as show:
         return solve(
@@ -174,7 +174,7 @@ def draw(path: Path, problem: Problem, result: MapResult, certificate: Certifica
 
     from quasiharmonic.linsolve import NotPositiveDefinite
     from quasiharmonic.plot import save_distortion_figure, save_map_figure
-    from quasiharmonic.search.inject import quasi_harmonic_map
+    from quasiharmonic.search.solving import quasi_harmonic_map
 
     def framed(uv: NDArray[np.float64]) -> NDArray[np.float64]:
         # Of unit size, so that a picture of coordinates of 1e300 does not overflow.

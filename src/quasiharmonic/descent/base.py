@@ -9,15 +9,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_type_hints
+from typing import ClassVar, Protocol, TypeAlias, get_args
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, check_choice, whole_number
+from quasiharmonic.field.functionals import FUNCTIONALS
 from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
+from quasiharmonic.result import Status
 
 Iterates: TypeAlias = Generator[Iterate, None, bool]
 
@@ -41,8 +43,39 @@ class SoFar:
     deepest: Iterate | None
 
 
+class Runner(Protocol):
+    """What a stage asks of the search that runs it. Either call says how the search stands after the stage."""
+
+    def attempt(self, stage: Descent, before: Status) -> Status:
+        """Descend on the mesh itself; ``before`` is how the search stood."""
+
+    def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
+        """Search on a coarse mesh, beginning with what the stage ``begins_with``, and carry the map to the mesh."""
+
+
+class SearchStage(ABC):
+    """What a strategy is a list of."""
+
+    #: Whether it searches on a coarse mesh, and not on the mesh itself.
+    coarse: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """How reports call this stage."""
+
+    @property
+    @abstractmethod
+    def begins_with(self) -> Descent:
+        """The first descent, on whichever mesh."""
+
+    @abstractmethod
+    def run(self, search: Runner, before: Status) -> Status:
+        """Have a search run this stage; how the search stands afterwards."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class Descent(ABC):
+class Descent(SearchStage):
     """One stage of a search, on the mesh itself.
 
     Attributes
@@ -63,14 +96,19 @@ class Descent(ABC):
     #: Whether positions are what moves, and tensors only follow.
     moves_vertices: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        for name, words in _choices(type(self)):
-            check_choice(name, getattr(self, name), words)
-
     @property
     def name(self) -> str:
         """How reports call this stage."""
         return self.word
+
+    @property
+    def begins_with(self) -> Descent:
+        """Itself."""
+        return self
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.attempt(self, before)
 
     @property
     def patience(self) -> tuple[int, float] | None:
@@ -142,8 +180,9 @@ class TensorDescent(Descent):
 
     Attributes
     ----------
-    parameterisation : {"tanh", "si-log"}
-        How ξ becomes a tensor (§8.2): tanh is fast, si-log keeps angles.
+    parameterisation : str
+        A name of `quasiharmonic.field.tensor.PARAMETERISATIONS`: how ξ becomes a tensor (§8.2); ``"tanh"`` is fast,
+        ``"si-log"`` keeps angles.
     reference : {"equilateral", "rest", "corrected"}
         Shape of the triangles, unless the problem itself names one.
     iterations : int
@@ -153,12 +192,13 @@ class TensorDescent(Descent):
         inverted triangles, which may have been passed by early on, far from any solution.)
     """
 
-    parameterisation: Literal["tanh", "si-log"] = "tanh"
+    parameterisation: str = "tanh"
     reference: Reference = "equilateral"
     iterations: int = 1000
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_choice("parameterisation", self.parameterisation, PARAMETERISATIONS)
+        check_choice("reference", self.reference, get_args(Reference))
         whole_number("iterations", self.iterations, least=1)
 
     @property
@@ -195,11 +235,15 @@ class FunctionalDescent(TensorDescent):
 
     Attributes
     ----------
-    functional : {"dirichlet", "neumann", "sobolev", "poisson"}
-        What is descended (§7.3).
+    functional : str
+        A name of `quasiharmonic.field.functionals.FUNCTIONALS`: what is descended (§7.3).
     """
 
-    functional: Literal["dirichlet", "neumann", "sobolev", "poisson"] = "dirichlet"
+    functional: str = "dirichlet"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("functional", self.functional, FUNCTIONALS)
 
     @property
     def name(self) -> str:
@@ -234,10 +278,3 @@ class VertexDescent(Descent):
     def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:
         """Which of two maps to go on from."""
         return best_map
-
-
-@cache
-def _choices(kind: type[Any]) -> list[tuple[str, tuple[str, ...]]]:
-    """The settings of a method that are one of several words, and those words."""
-    hints = [(name, get_args(hint)) for name, hint in get_type_hints(kind).items()]
-    return [(name, words) for name, words in hints if words and all(isinstance(word, str) for word in words)]

@@ -30,7 +30,8 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 
 _FIRST_DAMPING = 1e-2
 _MOST_DAMPING = 1e12
-# Of the stiffest triangle: what a triangle that has shrunk to a point resists a change of its ξ with.
+# Least eigenvalue of a triangle's block K, as a fraction of the largest of all: the block of a triangle that has
+# shrunk to a point is zero and could not be inverted.
 _LEAST = 1e-100
 
 

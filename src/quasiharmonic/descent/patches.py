@@ -20,9 +20,11 @@ from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 
-# More flips than this are no matter for local repair, and larger patches are no patches.
-MOST_FLIPS, MOST_TRIANGLES = 50, 1000
-# Nor are those of more than this part of the mesh: all of it is untangled as soon.
+# Inverted triangles at most for local repair to begin at all.
+MOST_FLIPS = 50
+# Triangles of a patch at most,
+MOST_TRIANGLES = 1000
+# and at most as a fraction of the mesh's: above it untangling the whole mesh takes no longer.
 _MOST_SHARE = 0.25
 # Rings of triangles around an inverted one, tried in turn.
 _RINGS = 2, 4, 8, 16
@@ -61,7 +63,6 @@ class Patches(VertexDescent):
     word: ClassVar[str] = "patches"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         whole_number("tries", self.tries, least=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:

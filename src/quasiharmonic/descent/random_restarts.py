@@ -63,7 +63,6 @@ class RandomRestarts(VertexDescent):
     word: ClassVar[str] = "random restarts"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         whole_number("in_vain", self.in_vain, least=1)
 
     @property

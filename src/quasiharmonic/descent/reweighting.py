@@ -17,9 +17,12 @@ from quasiharmonic.energy.deformation import signed_areas
 
 Generator = np.random.Generator
 
-# What weights are multiplied by, one of them drawn; rounds; and how many more inverted triangles than at first end it:
-# what has gone wild stays so.
-_FACTORS, _ROUNDS, _WILD = (3.0, 10.0), 15, 15
+# Factors that an inverted triangle's weight may be multiplied by after each round; one is drawn for all rounds.
+_FACTORS = 3.0, 10.0
+# Rounds at most.
+_ROUNDS = 15
+# A map with this many more inverted triangles than the first does not recover: the rounds end.
+_WILD = 15
 
 
 def reweighted(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str) -> ComplexArray:

@@ -105,7 +105,6 @@ class Untangling(VertexDescent):
     word: ClassVar[str] = "untangling"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         whole_number("iterations", self.iterations, least=1)
 
     def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:

@@ -19,7 +19,7 @@ energy                in singular values   φ, with D = det J = a − b     pape
 `ARAP`                Σ (σᵢ − 1)²          2 (√a − 1)² + 2b              E₁, §11.1.1
 `AreaPreserving`      (σ₁σ₂ − 1)²          (D − 1)²                      E₂, §11.1.2
 `AreaBarrier`         σ₁σ₂ + 1/(σ₁σ₂) − 2  (D − 1)²/D                    E_a, §10.2
-`MassSpring`          lengths of sides     in `quasiharmonic.energy.springs`    E₃, §11.1.3
+`MassSpring`          lengths of sides     in `springs`                  E₃, §11.1.3
 ====================  ===================  ============================  ===========
 
 All are zero at isometries (MIPS at similarities) and nowhere negative. All but MIPS compare lengths, so

@@ -7,7 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 S = TypeVar("S")
 
-# Of the decrease that the gradient promises (Armijo's condition).
+# Fraction of the decrease that the gradient promises which a step must achieve (Armijo's condition).
 _SUFFICIENT = 1e-4
 
 

@@ -256,7 +256,7 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     d1, d2 = w[F[:, 1]] - w0, w[F[:, 2]] - w0
     left, right = d1.real * d2.imag, d1.imag * d2.real
     area, noise = 0.5 * (left - right), 2.0**-52 * (np.abs(left) + np.abs(right))
-    # An area that rounding may have turned over gets the sign that it has.
+    # Where rounding may have changed the area's sign, the sign is decided exactly.
     sign = orientation(*(uv[F[:, k]] for k in range(3)))
     area = np.where(np.abs(area) <= noise, sign * noise, area)
 

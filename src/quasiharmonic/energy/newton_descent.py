@@ -1,5 +1,7 @@
 """Projected Newton steps down a deformation energy, each of which ends in an injective map (§10, §11).
 
+::
+
     assemble ──▶ factor ──▶ direction ──▶ t = min(1, 0.9 × first collapse) ──▶ less energy? ──▶ injective, exactly?
        ▲                                          │ ▲            no: t/2 ◀──────────┴────────────────┘ yes
        └──────────────────────────────────────────┼─┴── t = 1 went well: 2t, 4t, … as long as the energy falls
@@ -23,7 +25,7 @@ from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.exact.certificate import is_injective
 from quasiharmonic.result import Status
 
-# Of the step at which the first triangle would collapse.
+# Fraction of the step at which the first triangle would collapse; no longer step is tried.
 FRACTION = 0.9
 # The step is halved, and then doubled, this often before the direction is given up.
 HALVINGS = 30

@@ -164,7 +164,7 @@ def polish_map(
         bad = np.flatnonzero(~(weights > 0))
         if bad.size:
             raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
-    # What leaves the numbers' range is met by comparisons: it is never below anything.
+    # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never accepted.
     with np.errstate(all="ignore"):
         # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
         exponent = int(np.frexp(np.abs(start).max())[1])

@@ -23,12 +23,20 @@ from quasiharmonic.arrays import FloatArray, IntArray
 # The finest cells have integer coordinates below 2 to this power; a cell ``s`` levels of halving up has them
 # shifted by ``s`` bits.
 _BITS = 40
-# A cell with a longer list is divided, if its parts' lists are no more than so often as long in all, or those that are
-# not empty a fraction of it in the mean; and as long as all lists have no more entries than so many a triangle, those
-# of the first grid alone no more than some.
-_LONG, _MORE, _GAIN, _ENTRIES, _AT_FIRST = 12, 1.5, 0.75, 64, 16
-# What is this far outside of an edge, in the unit box, is so whatever was rounded; nor does underflow matter.
-_MARGIN, _TINY = 2.0**-48, 2.0**-1000
+# Triangles in a cell's list from which on dividing the cell is considered. It is divided if one of two things holds:
+_LONG = 12
+# the lists of its parts have together no more than this many times its own triangles;
+_MORE = 1.5
+# or the parts that are not empty have on average no more than this fraction of its own.
+_GAIN = 0.75
+# Triangles in all lists together, for each triangle of the mesh, at most: the limit on memory.
+_ENTRIES = 64
+# The same for the cells of the first grid.
+_AT_FIRST = 16
+# A cell farther than this outside of an edge's line, in the unit box, is so whatever was rounded.
+_MARGIN = 2.0**-48
+# Added to it, so that this holds too where products underflow.
+_TINY = 2.0**-1000
 # Entries spread over cells at a time: what is in work stays in the cache.
 _ROWS = 1 << 14
 

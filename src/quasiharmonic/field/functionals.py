@@ -165,13 +165,15 @@ class Poisson(Functional):
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
         """``L† g`` up to a constant: the map that the target's Neumann data alone would bring about."""
-        if self._known is None or self._known[0] is not at.field:
+        # Another thread may overwrite what is kept between any two lines: what is returned is a local.
+        known = self._known
+        if known is None or known[0] is not at.field:
             if self._one_held is None:
                 first, solver = self.problem.fixed[:1], at.operator.pattern.solver.name
                 self._one_held = Laplacian(self.problem.F, self.problem.n, first, solver)
             held = self._one_held.factor(self.mesh.edge_stiffness(at.field.entries()))
-            self._known = at.field, held.respond(neumann_target(self.problem, at.w))
-        return self._known[1]
+            known = self._known = at.field, held.respond(neumann_target(self.problem, at.w))
+        return known[1]
 
     def value(self, at: QuasiHarmonicMap) -> float:
         return 0.5 * work(neumann_target(self.problem, at.w), self.response(at) - at.w)

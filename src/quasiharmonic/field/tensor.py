@@ -16,7 +16,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 
-# In place of a divisor that vanishes together with what it divides.
+# Stands in for a divisor of zero, where the dividend vanishes too, so that the quotient is not NaN.
 _TINY = 1e-300
 
 

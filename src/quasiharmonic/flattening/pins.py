@@ -40,7 +40,7 @@ from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.mesh.topology import edge_keys, edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
-from quasiharmonic.search.inject import solve
+from quasiharmonic.search.solving import solve
 from quasiharmonic.search.stages import CoarseToFine, Stages
 from quasiharmonic.search.strategy import speed
 

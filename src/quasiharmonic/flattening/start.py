@@ -12,7 +12,7 @@ import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.inject import solve
+from quasiharmonic.search.solving import solve
 
 
 def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto") -> FloatArray | None:

@@ -20,7 +20,9 @@ from quasiharmonic.io.refined import refined_mesh
 from quasiharmonic.io.seamed import cut_at_seams, without_idle
 
 __all__ = [
+    "MAP_WRITERS",
     "PER_TRIANGLE_FORMATS",
+    "READERS",
     "MeshData",
     "MeshFileError",
     "OutputError",
@@ -48,11 +50,11 @@ __all__ = [
 
 
 _Path = str | os.PathLike[str]
-# What a suffix means: the one place to extend for another format. OFF has room for one set
-# of coordinates only.
-_READERS: dict[str, Callable[[_Path], MeshData]] = {".obj": read_obj, ".off": read_off}
-_MAP_WRITERS: dict[str, Callable[[_Path, MeshData, ArrayLike], None]] = {
+#: What a suffix means, in small letters: how to read a mesh and how to write its map. A new format goes into both.
+READERS: dict[str, Callable[[_Path], MeshData]] = {".obj": read_obj, ".off": read_off}
+MAP_WRITERS: dict[str, Callable[[_Path, MeshData, ArrayLike], None]] = {
     ".obj": lambda path, mesh, uv: write_obj(path, mesh.with_map(uv)),
+    # OFF has room for one set of coordinates only.
     ".off": lambda path, mesh, uv: write_off(path, mesh.as_plane(uv)),
 }
 
@@ -75,7 +77,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
     MeshFileError
         When the format is not supported, or the file cannot be read as what it should be.
     """
-    return _READERS[_suffix(path, "read")](path)
+    return READERS[_suffix(path, "read")](path)
 
 
 def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> None:
@@ -103,7 +105,7 @@ def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> No
     ValueError
         When ``uv`` has another shape or is not finite.
     """
-    _MAP_WRITERS[_suffix(path, "written")](path, mesh, uv)
+    MAP_WRITERS[_suffix(path, "written")](path, mesh, uv)
 
 
 def check_output(path: str | os.PathLike[str]) -> None:
@@ -122,7 +124,7 @@ def check_output(path: str | os.PathLike[str]) -> None:
 
 def _suffix(path: str | os.PathLike[str], done: str) -> str:
     suffix = Path(path).suffix.lower()
-    known = _READERS if done == "read" else _MAP_WRITERS
+    known = READERS if done == "read" else MAP_WRITERS
     if suffix not in known:
         what = f"{suffix} files cannot be {done}" if suffix else "has no suffix that would say its format"
         raise MeshFileError(path, what, remedy=f"supported are {', '.join(known)}")

@@ -7,6 +7,8 @@ the factorisation reads.
 
 from __future__ import annotations
 
+from threading import Lock
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +24,8 @@ DISSECT_FROM = 30_000
 
 class Laplacian:
     """The pattern of ``Gᵀ A G`` restricted to the free vertices, analysed once for any number of tensor fields A.
+
+    Threads may share it: each gets the answers for its own tensors, though they refactor in turn.
 
     Parameters
     ----------
@@ -89,6 +93,8 @@ class Laplacian:
         indices[self._above] = self._column
         self._values = np.empty(indptr[-1])
         self.solver = make_solver(indptr, indices, name=linear_solver, ordered=order is not None)
+        # Whose the one factor is may be asked only while nobody can overwrite it before the solve.
+        self._lock = Lock()
         self._factored: FactoredLaplacian | None = None
 
         # Half-edges between a free and a fixed vertex carry the boundary's positions into the right-hand side.
@@ -125,16 +131,17 @@ class Laplacian:
             When rounding leaves no positive definite matrix.
         """
         made = FactoredLaplacian(self, stiffness.ravel())
-        self._refactor(made)
+        with self._lock:
+            self._refactor(made)
         return made
 
     def _refactor(self, operator: FactoredLaplacian) -> None:
-        """Make the solver's one factor that of an operator."""
+        """Make the solver's one factor that of an operator; with the lock held."""
         self._factored = None
         stiffness, size = operator.stiffness, self.free.size
         above = self._sum @ stiffness
         # Rows of Gᵀ A G sum to zero, so each half-edge is taken off the diagonal at both of its ends.
-        # Of nothing, which is where no two free vertices are neighbours, bincount makes integers.
+        # Where no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
         diagonal = np.bincount(self._row, above, size).astype(np.float64, copy=False)
         diagonal += np.bincount(self._column, above, size)
         diagonal += np.bincount(self._border_row, stiffness[self._border], size)
@@ -145,11 +152,12 @@ class Laplacian:
 
     def _solve(self, operator: FactoredLaplacian, load: ComplexArray) -> ComplexArray:
         """One solve for both coordinates with an operator's factor; (n - k,) complex128."""
-        if self._factored is not operator:
-            self._refactor(operator)
         rhs = np.empty((load.size, 2), order="F")
         rhs[:, 0], rhs[:, 1] = load.real, load.imag
-        solution = self.solver.solve(rhs)
+        with self._lock:
+            if self._factored is not operator:
+                self._refactor(operator)
+            solution = self.solver.solve(rhs)
         out = np.empty(load.size, dtype=np.complex128)
         out.real, out.imag = solution[:, 0], solution[:, 1]
         return out

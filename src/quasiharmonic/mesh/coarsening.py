@@ -158,7 +158,8 @@ def _independent(T: IntArray, free: BoolArray, degree: IntArray, dice: FloatArra
     """A set of free vertices of few neighbours, no two of them neighbours."""
     order = np.where(free & (degree <= _MOST_NEIGHBOURS), dice + _PER_NEIGHBOUR * degree, np.inf)
     chosen = np.zeros(order.size, dtype=bool)
-    # The first in order of all triangles around it is chosen; then the same among what is left: half as many again.
+    # A vertex that comes before all its neighbours in `order` is chosen. A second round among the vertices that have no
+    # chosen neighbour finds half as many again.
     for _ in range(2):
         at = order.take(T)
         first = np.minimum(np.minimum(at[:, 0], at[:, 1]), at[:, 2])

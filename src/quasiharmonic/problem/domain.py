@@ -47,7 +47,8 @@ class Domain:
 
     Notes
     -----
-    Factorisations are shared by all that is asked of a domain, one thread at a time; see `exclusive`.
+    Factorisations are shared by all that is asked of a domain, in any thread. Answers do not depend on that; to save
+    the refactoring, see `exclusive`.
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike) -> None:
@@ -58,10 +59,10 @@ class Domain:
         self.fixed = _fixed(fixed, len(self.V))
         for array in (self.V, self.F, self.fixed):
             array.flags.writeable = False
-        self._make_room()
+        self._empty_caches()
 
-    def _make_room(self) -> None:
-        """For what is made when it is first asked for, and kept."""
+    def _empty_caches(self) -> None:
+        """Nothing made yet of what is made when it is first asked for, and kept."""
         self._lock = Lock()
         self._laplacians: dict[str, Laplacian] = {}
         self._meshes: dict[Reference, ReferenceMesh] = {}
@@ -72,7 +73,7 @@ class Domain:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._make_room()
+        self._empty_caches()
 
     @contextmanager
     def exclusive(self) -> Iterator[Domain]:

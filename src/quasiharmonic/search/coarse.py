@@ -17,11 +17,17 @@ from quasiharmonic.mesh.prolongation import prolong
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.problem import Domain, Problem
 
-# The coarse mesh has an eighth of the vertices or so many, whichever is less, but some for every fixed vertex: as many
-# as it takes to grade the mesh from the boundary, whose vertices all stay, to the inside.
-_SHARE, _MOST, _PER_FIXED = 1 / 8, 1500, 3
-# Where no more than this share of the vertices would go, or so few are there, the mesh itself is as quickly dealt with.
-_WORTHWHILE, _LEAST = 0.5, 1500
+# Vertices of the coarse mesh as a fraction of the mesh's.
+_SHARE = 1 / 8
+# Vertices of the coarse mesh at most,
+_MOST = 1500
+# unless there are so many fixed vertices, all of which stay, that it takes more: so many for each of them suffice to
+# grade the triangles from the boundary to the inside.
+_PER_FIXED = 3
+# A coarse mesh with this fraction of the vertices or more saves too little to be made.
+_WORTHWHILE = 0.5
+# Nor is one made of a mesh with fewer vertices than these, which is quickly searched itself.
+_LEAST = 1500
 
 
 #: Coarse meshes of domains in use, None where there is none to be had.

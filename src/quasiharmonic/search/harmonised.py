@@ -86,6 +86,8 @@ class Harmonised(Functional):
 
     def _deformation(self, energy: DeformationEnergy, at: QuasiHarmonicMap) -> Deformation:
         """The map's Jacobians, which value and gradient both need."""
-        if self._known is None or self._known[0] is not at.w:
-            self._known = at.w, energy.deform(at.w)
-        return self._known[1]
+        # As of `Poisson.response`: what is returned is a local, whoever overwrites what is kept.
+        known = self._known
+        if known is None or known[0] is not at.w:
+            known = self._known = at.w, energy.deform(at.w)
+        return known[1]

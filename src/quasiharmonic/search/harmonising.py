@@ -216,7 +216,8 @@ def harmonise_map(
                     status = Status.POLISHED if rest else Status.STILL_FALLING
                 if descent.right() or values == len(schedule) * schedule[-1:]:
                     break
-                # What cannot be righted was moved too far: once more, in shorter steps.
+                # The schedule's long steps left triangles that cannot be righted: from the start once more, with the
+                # last η alone.
                 descent.back()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED

@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Descent, Newton, Patches, Untangling, VectorAdam
-from quasiharmonic.descent.base import SoFar, Steps
+from quasiharmonic.descent.base import Runner, SearchStage, SoFar, Steps
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.field.objective import Iterate, Objective
@@ -34,7 +34,7 @@ _TO_LEAST_AREA = 30
 
 
 @dataclass(frozen=True)
-class CoarseToFine:
+class CoarseToFine(SearchStage):
     """A stage that searches on a coarse mesh, if this one is large, and carries the map that it finds to this one.
 
     Attributes
@@ -45,14 +45,25 @@ class CoarseToFine:
 
     first: Descent
 
+    coarse: ClassVar[bool] = True
+
     @property
     def name(self) -> str:
         """How reports call this stage."""
         return f"coarse-to-fine, {self.first.name}"
 
+    @property
+    def begins_with(self) -> Descent:
+        """``first``."""
+        return self.first
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.attempt_on_coarse(self, before)
+
 
 #: Whatever a strategy is made of.
-Stages: TypeAlias = Sequence[Descent | CoarseToFine]
+Stages: TypeAlias = Sequence[SearchStage]
 
 
 class Search:
@@ -123,38 +134,40 @@ class Search:
     def _run(self, stages: Stages) -> Status:
         """Stage after stage, as long as there is hope."""
         status = Status.OUT_OF_ITERATIONS
-        here = [stage for stage in stages if isinstance(stage, Descent)]
-        plain = here[0] if here else next(stage.first for stage in stages if isinstance(stage, CoarseToFine))
+        on_the_mesh = [stage.begins_with for stage in stages if not stage.coarse]
+        fallback = on_the_mesh[0] if on_the_mesh else stages[0].begins_with
         if not self.problem.encloses_area:
             self._descend(VectorAdam(iterations=1))
             self._examine()
             return Status.IMPOSSIBLE
         if self._first is not None:
             # From a map at hand the first stage is tried before all, and no coarse mesh.
-            status = self._attempt(plain, status)
-            stages = here or [plain]
+            status = self._descend_by_any(fallback, status)
+            stages = on_the_mesh or [fallback]
         for stage in stages:
-            if status is Status.INJECTIVE or self._left <= 0:
+            # Later stages take long, and are in vain where no injective map exists.
+            hopeless = self.diagnosis is not None and self.diagnosis.forbids_injective
+            if status is Status.INJECTIVE or self._left <= 0 or hopeless:
                 break
-            if isinstance(stage, CoarseToFine):
-                if self._from_coarse(stage) is Status.INJECTIVE:
-                    return Status.INJECTIVE
-                continue
-            status = self._attempt(stage, status)
-            # What is tried after the first stage takes long, and is pointless where there is a reason.
-            if status is not Status.INJECTIVE and self._examine().forbids_injective:
-                break
+            status = stage.run(self, status)
         if self.best_field is None and self._left > 0:
-            # Stages for a coarse mesh alone, and none was to be had or it led to nothing.
-            status = self._attempt(plain, status)
+            # Every stage was for a coarse mesh, and there was none or its search came to nothing.
+            status = self._descend_by_any(fallback, status)
         if status is Status.INJECTIVE:
             return status
         if self._examine().forbids_injective:
-            self._sink()
+            self._towards_least_area()
             return Status.IMPOSSIBLE
         return Status.ROUNDED if self._rounded else status
 
-    def _attempt(self, stage: Descent, before: Status) -> Status:
+    def attempt(self, stage: Descent, before: Status) -> Status:
+        """Run a stage on the mesh itself; where it finds no map, find out whether there is one."""
+        status = self._descend_by_any(stage, before)
+        if status is not Status.INJECTIVE:
+            self._examine()
+        return status
+
+    def _descend_by_any(self, stage: Descent, before: Status) -> Status:
         """Run one stage, by another linear solver where one has failed; how it ended, or else the search so far."""
         status = self._descend(stage)
         while status is Status.UNSOLVABLE and self._spare and self._left > 0:
@@ -165,15 +178,17 @@ class Search:
             return before
         return status
 
-    def _from_coarse(self, stage: CoarseToFine) -> Status:
+    def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
         """Search on a coarse mesh, if there is one to be had, and carry its map to this one."""
-        # What is recorded are maps of this mesh.
+        # A recording shows maps of this mesh only, so no coarse one is searched.
         coarse = None if self.record else coarse_mesh(self.problem)
         if coarse is None:
-            return Status.OUT_OF_ITERATIONS
-        done, began, before = max(len(self.history), 1), time.perf_counter(), self.best
+            return before
+        done, began, best = max(len(self.history), 1), time.perf_counter(), self.best
         problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
-        status, uv, self.linear_solver = _on_coarse(problem, stage.first, self.linear_solver, self._left, self._note)
+        status, uv, self.linear_solver = _on_coarse(
+            problem, stage.begins_with, self.linear_solver, self._left, self._note
+        )
         if status in (Status.INJECTIVE, Status.INTERRUPTED):
             w = coarse.prolong(problem.frame.inward(uv))
             mesh = self.problem.domain.mesh("equilateral")
@@ -189,14 +204,14 @@ class Search:
                 name=f"{stage.name}, {len(problem.F)} triangles",
                 iterations=len(self.history) - done,
                 seconds=time.perf_counter() - began,
-                flipped=(before[0], self.best[0]),
-                energy=(before[1], self.best[1]),
-                kept=self.best != before,
+                flipped=(best[0], self.best[0]),
+                energy=(best[1], self.best[1]),
+                kept=self.best != best,
             )
         )
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        return Status.INJECTIVE if self.best[0] == 0 else Status.SETTLED
+        return Status.INJECTIVE if self.best[0] == 0 else before
 
     def _note(self, step: Step) -> None:
         """Write a step down, whatever its number was where it was made."""
@@ -213,7 +228,7 @@ class Search:
             self.diagnosis = diagnose(self.problem)
         return self.diagnosis
 
-    def _sink(self) -> None:
+    def _towards_least_area(self) -> None:
         """Where no map is injective, go to the one of least area: the target's area and V₃ make it up (eq. 42)."""
         if self._left > 0:
             self._descend(Newton(iterations=_TO_LEAST_AREA, resume=True))

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from quasiharmonic.descent import Descent, Newton, Patches, RandomRestarts, Untangling, VectorAdam
+from quasiharmonic.descent.base import SearchStage
 from quasiharmonic.problem import Problem
 from quasiharmonic.search.stages import CoarseToFine, Stages
 
-# Vertices from which on a coarse mesh, made, solved and refined again, is quicker than ten iterations on the mesh.
+# Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
+# than ten iterations on the mesh.
 _LARGE = 6000
 
 
@@ -83,7 +85,7 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
             raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
         return STRATEGIES[strategy](problem)
     given = list(strategy) if isinstance(strategy, Sequence) else []
-    stages = [stage for stage in given if isinstance(stage, (Descent, CoarseToFine))]
+    stages = [stage for stage in given if isinstance(stage, SearchStage)]
     if not stages or len(stages) < len(given):
         raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
     return stages

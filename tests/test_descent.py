@@ -1,12 +1,15 @@
-"""The optimisers: what each of them must do, against brute force and differences."""
+"""The descents: what each of them must do, against brute force and differences."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import Problem, solve
+from quasiharmonic import Problem, descent, solve
 from quasiharmonic.descent import (
     LBFGS,
     Alternating,
@@ -18,6 +21,7 @@ from quasiharmonic.descent import (
     VectorAdam,
     reweighting,
 )
+from quasiharmonic.descent.base import SoFar, Steps
 from quasiharmonic.descent.newton import SecondOrderModel
 from quasiharmonic.descent.patches import Patch, last_untangled
 from quasiharmonic.descent.random_restarts import left_of, nearest
@@ -60,6 +64,76 @@ class TestParameterisation:
         rho, h = np.linspace(0.1, 4, 20), 1e-5
         slope = (p.radial(rho + h)[2] - p.radial(rho - h)[2]) / (2 * h)
         np.testing.assert_allclose(p.bend(rho), slope, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [getattr(descent, name) for name in descent.__all__ if name != "Descent"])
+class TestEvery:
+    """What a search relies on, of each that the package has."""
+
+    @staticmethod
+    def posed():
+        return Problem(*star_problem(depth=0.4, n=200))
+
+    def begun(self, method):
+        """An objective, and where the method begins after a search has been at Tutte's embedding."""
+        problem = self.posed()
+        objective = method.objective(problem, "auto")
+        tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
+        assert tutte.flipped > 0
+        return objective, method.start(objective, SoFar(None, tutte.w, tutte))
+
+    def test_is_one_with_defaults_a_word_and_a_way_to_resume(self, kind):
+        method = kind()
+        assert issubclass(kind, Descent)
+        assert method.word in method.name
+        assert replace(method, resume=True) == kind(resume=True)
+        assert replace(method, resume=True) != method
+        objective, start = self.begun(kind(resume=True))
+        assert start.objective.problem is objective.problem
+        assert np.isfinite(start.energy)
+
+    def test_interleaved_and_abandoned(self, kind):
+        """Another run of the same on the same domain, midway or abandoned, changes no map of this one."""
+        method = kind()
+        objective, start = self.begun(method)
+        alone = [at.w for at in islice(method.iterates(objective, start), 4)]
+        one, other = method.iterates(objective, start), method.iterates(objective, start)
+        begun = [at.w for at in islice(one, 2)]
+        beside = [at.w for at in islice(other, 3)]
+        other.close()
+        begun += [at.w for at in islice(one, 2)]
+        one.close()
+        for expected, found in ((alone, begun), (alone[:3], beside)):
+            assert len(found) == len(expected)
+            for here, there in zip(expected, found, strict=True):
+                np.testing.assert_allclose(there, here, rtol=0, atol=1e-12)
+
+    def test_leaves_floating_point_alone(self, kind):
+        before = np.geterr()
+        method = kind()
+        iterates = method.iterates(*self.begun(method))
+        for _ in islice(iterates, 3):
+            assert np.geterr() == before
+        iterates.close()
+        assert np.geterr() == before
+
+    def test_says_whether_it_is_at_rest(self, kind):
+        method = kind()
+        if "iterations" in kind.__dataclass_fields__:
+            method = kind(iterations=2)
+        steps = Steps(method.iterates(*self.begun(method)))
+        assert len(list(steps)) <= 2 or "iterations" not in kind.__dataclass_fields__
+        assert isinstance(steps.at_rest, bool)
+
+    def test_a_solve_after_an_abandoned_one(self, kind):
+        method = kind()
+        objective, start = self.begun(method)
+        unfinished = method.iterates(objective, start)
+        next(unfinished, None)
+        again, fresh = (
+            solve(problem, strategy=[method], max_iterations=6) for problem in (objective.problem, self.posed())
+        )
+        np.testing.assert_array_equal(again.uv, fresh.uv)
 
 
 class TestAlternating:
@@ -367,7 +441,7 @@ class TestStrategy:
         ("arguments", "words"),
         [
             ({"parameterisation": "log"}, "parameterisation must be one of tanh, si-log"),
-            ({"functional": "v3"}, "functional must be one of dirichlet"),
+            ({"functional": "v3"}, "functional must be one of neumann, sobolev, dirichlet, poisson"),
             ({"reference": "square"}, "reference must be one of"),
             ({"iterations": 0}, "iterations must be a whole number of at least 1"),
             ({"iterations": 2.5}, "iterations must be a whole number"),

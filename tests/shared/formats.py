@@ -1,0 +1,58 @@
+"""What is asked of every mesh format: maps come back as they were, and what is no such file is told so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import certify
+from quasiharmonic.io import MeshData, MeshFileError, map_of
+from quasiharmonic.surfaces import disk
+
+GARBAGE = b"", b"\0" * 64, b"no mesh\n", b"PK\x03\x04" + b"\xff" * 60, bytes(range(256)) * 4
+
+
+def maps():
+    """A planar mesh, two maps of it that are not its positions, and the triangles that each inverts."""
+    V, F = disk(4)
+    uv = V * (1 + 0.3 * V[:, :1]) / 3
+    flipped = uv.copy()
+    inner = int(np.argmin((V**2).sum(axis=1)))
+    flipped[inner] = uv[F[(inner == F).any(axis=1)]].max(axis=(0, 1)) + 1
+    return MeshData(V, F), [uv, flipped]
+
+
+def try_format(read, write, path):
+    """Put a reader and a writer of maps through their trials, at a path with their suffix."""
+    mesh, uvs = maps()
+    for uv in uvs:
+        write(path, mesh, uv)
+        again = read(path)
+        np.testing.assert_array_equal(again.F, mesh.F)
+        np.testing.assert_array_equal(map_of(again).view(np.int64), uv.view(np.int64))
+        expected, found = certify(mesh.F, uv), certify(again.F, map_of(again))
+        np.testing.assert_array_equal(found.flipped, expected.flipped)
+    assert expected.flipped.size
+    assert not certify(mesh.F, uvs[0]).flipped.size
+
+    whole = path.read_bytes()
+    for bad in (uv[:-1], np.full_like(uv, np.nan)):
+        with pytest.raises(ValueError, match="uv"):
+            write(path, mesh, bad)
+        assert path.read_bytes() == whole
+
+    for garbage in (*GARBAGE, whole[: len(whole) // 2]):
+        path.write_bytes(garbage)
+        with pytest.raises(MeshFileError, match=path.name):
+            read(path)
+    for cut in range(0, len(whole), max(len(whole) // 50, 1)):
+        path.write_bytes(whole[:cut] + b"\xff" + whole[cut + 1 :])
+        try:
+            read(path)
+        except MeshFileError as error:
+            str(error).encode()
+    path.unlink()
+    for make in (lambda: None, path.mkdir):
+        make()
+        with pytest.raises(MeshFileError, match=path.name):
+            read(path)
