@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic import batch, certify, io
+from quasiharmonic import batch, certify, flatten, io
 from quasiharmonic.batch import driver, records, supervisor
 from quasiharmonic.batch import settings as settings_module
 from quasiharmonic.batch.supervisor import Finished
 from quasiharmonic.cli import main
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.surfaces import annulus
+from quasiharmonic.surfaces import annulus, cat
 from quasiharmonic.targets import outline, signed_area
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
@@ -248,6 +248,53 @@ class TestRun:
             areas = [abs(signed_area(uv[loop])) for loop in boundary_loops(written.F, len(uv))]
             np.testing.assert_allclose(sorted(areas), sorted(abs(signed_area(c)) for c in loops), rtol=0.2)
 
+    def test_free_boundaries(self, tmp_path):
+        V, F = cat(5)
+        (tmp_path / "set" / "rings").mkdir(parents=True)
+        io.write_off(tmp_path / "set" / "rings" / "ring.off", io.MeshData(*annulus(6)))
+        io.write_obj(tmp_path / "set" / "cat.obj", io.MeshData(V, F))
+        closed = io.MeshData(np.eye(4)[:, :3], np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
+        io.write_obj(tmp_path / "set" / "closed.obj", closed)
+        flat = io.MeshData(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+        io.write_obj(tmp_path / "set" / "flat.obj", flat)
+        settings = batch.Settings(flatten=True, energy="mips")
+        progress = batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1)
+        assert progress.outcomes == {"bijective": 2, "invalid": 2}
+        assert (progress.solved, progress.failed) == (2, 2)
+        record = record_of(tmp_path / "out", "cat.obj")
+        written = io.read_mesh(tmp_path / "out" / "results" / "cat.obj" / "map.obj")
+        assert certify(written.F, io.map_of(written)).bijective
+        assert (record["outcome"], record["certified"], record["bijective"]) == ("bijective", True, True)
+        assert (record["vertices"], record["triangles"], record["loops"]) == (len(V), len(F), 1)
+        assert record["status"] == "polished"
+        # The mean of that measure is this energy.
+        assert record["energy"] == pytest.approx(record["mips"], rel=1e-9)
+        np.testing.assert_array_equal(io.map_of(written), flatten(V, F, energy="mips").uv)
+        assert record_of(tmp_path / "out", "rings/ring.off")["loops"] == 2
+        assert "closed" in record_of(tmp_path / "out", "closed.obj")["error"]
+        assert "zero area" in record_of(tmp_path / "out", "flat.obj")["error"]
+        # What is finished is known again, and another energy is another question.
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).resumed == 4
+        cats = tmp_path / "set" / "cat.obj"
+        assert batch.run(cats, tmp_path / "out", batch.Settings(flatten=True), jobs=1).resumed == 0
+        other = batch.Settings(flatten=True, energy="distances")
+        assert batch.run(cats, tmp_path / "out", other, jobs=1).outcomes == {"bijective": 1}
+        assert "guarded descent, distances" in record_of(tmp_path / "out", "cat.obj")["stages"]
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
+            ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
+            ({"energy": "mips"}, "energy is what flatten lowers"),
+            ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
+        ],
+    )
+    def test_what_free_boundaries_do_not_go_with(self, stars, tmp_path, options, message):
+        with pytest.raises(ValueError, match=message):
+            batch.run(stars, tmp_path / "out", batch.Settings(**options))
+        assert not (tmp_path / "out").exists()
+
     @pytest.mark.slow
     def test_a_drawing_is_part_of_the_input(self, stars, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
@@ -429,6 +476,8 @@ class TestCommand:
         (stars / "a" / "input.obj").write_text("nonsense")
         assert main(["batch", str(stars), "-o", out]) == 1
         assert "the others: 1 input cannot be used" in capsys.readouterr().out
+        assert main(["batch", str(stars / "b"), "-o", out, "-j", "1", "--flatten", "--energy", "mips"]) == 0
+        assert "2 of 2 problems have a certified bijective map" in capsys.readouterr().out
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from quasiharmonic import batch
+from quasiharmonic import batch, io
 from quasiharmonic.batch import records
 from quasiharmonic.cli import main
 from quasiharmonic.report import figures, numbers, page, write_report
@@ -104,6 +104,21 @@ class TestPage:
         assert "75.0 %" in read.text
         assert "input cannot be used" in read.text
         assert str(source) in read.text
+
+    def test_of_free_boundaries(self, tmp_path):
+        for k in range(2):
+            V, F, _, _ = star_of(3)
+            (tmp_path / "set").mkdir(exist_ok=True)
+            io.write_obj(tmp_path / "set" / f"{k}.obj", io.MeshData(V, F))
+        (tmp_path / "set" / "bad.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+        batch.run(tmp_path / "set", tmp_path / "out", batch.Settings(flatten=True), jobs=1)
+        text = Reader(written(tmp_path, tmp_path / "out")).text
+        assert "2 of 3 certified bijective" in text
+        assert "2 certified bijective, 1 input cannot be used" in text
+        assert "certified injective" not in text
+        assert "Settings: flatten True" in text
+        # The table alone tells it too.
+        assert "2 of 3 certified bijective" in Reader(written(tmp_path, tmp_path / "out" / "records.csv")).text
 
     def test_of_a_run_that_is_going_on(self, tmp_path):
         source = write_stars(tmp_path / "set", ["a", "b", "c"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import numpy as np
@@ -15,6 +16,7 @@ from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.distance_descent import DistanceDescent, keep_distances
 from quasiharmonic.flattening.distance_energy import DistanceEnergy
 from quasiharmonic.flattening.distances import distance_error, surface_distances
+from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.geodesics import straight_segments
 from quasiharmonic.flattening.piece import Piece
 from quasiharmonic.result import Status
@@ -194,6 +196,18 @@ def test_bad_input_is_named(options, message):
     given = {"V": [[0, 0], [1, 0], [1, 1], [0, 1]], "F": [[0, 1, 2], [0, 2, 3]], "uv": np.eye(4)[:, :2], **options}
     with pytest.raises(ValueError, match=re.escape(message)):
         distance_error(**given)
+
+
+def test_figures_come_with_how_they_were_taken(dome):
+    V, F = dome
+    found = distance_error(V, F, V[:, :2], rings=3, sources=25, crossings=2)
+    told = found.to_dict()
+    assert (told["rings"], told["sources"], told["targets"], told["crossings"]) == (3, 25, None, 2)
+    assert told["pairs"] == found.relative.size
+    assert (told["mean"], told["rms"], told["scale"]) == (found.mean, found.rms, found.scale)
+    assert "25 vertices with all others at most 3 edges away" in told["sampling"]
+    assert "cross at most 2 edges each" in found.summary()
+    json.dumps(told, allow_nan=False)
 
 
 # --- the energy and its descent
@@ -390,3 +404,104 @@ def test_starts_that_will_not_do(dome, change, message):
     V, F = dome
     with pytest.raises(ValueError, match=re.escape(message)):
         keep_distances(V, F, change(V[:, :2]))
+
+
+def test_record_keeps_maps_on_the_way(dome):
+    V, F = dome
+    result = keep_distances(V, F, V[:, :2], rings=6, record=2)
+    last = result.history[-1].iteration
+    assert [kept.iteration for kept in result.path] == [*range(0, last + 1, 2)]
+    assert all(certify(F, kept.uv).bijective for kept in result.path)
+    if last % 2 == 0:
+        assert np.array_equal(result.path[-1].uv, result.uv)
+    assert not keep_distances(V, F, V[:, :2], rings=6).path
+    with pytest.raises(ValueError, match="record must be a whole number"):
+        keep_distances(V, F, V[:, :2], record=-1)
+
+
+# --- as an energy of `flatten`
+
+
+def test_flatten_ends_with_the_descent_of_distances():
+    V, F = surfaces.cat(6)
+    plain = flatten(V, F)
+    result = flatten(V, F, energy="distances", rings=8, record=1)
+    alone = keep_distances(V, F, plain.uv, rings=8)
+    assert certify(F, result.uv).bijective
+    sample = surface_distances(V, F, rings=8)
+    errors = [sample.error(found.uv).mean for found in (plain, result, alone)]
+    assert errors[1] < 0.9 * errors[0]
+    assert errors[1] == pytest.approx(errors[2], rel=1e-3)
+    # In the surface's own unit, laid along its axis.
+    assert sample.error(result.uv).scale == pytest.approx(1, abs=0.02)
+    assert np.allclose(result.uv.min(axis=0), 0)
+    assert [stage.name for stage in result.stages][-1] == "guarded descent, distances"
+    assert [step.iteration for step in result.history] == [*range(len(result.history))]
+    assert [kept.iteration for kept in result.path] == [*range(len(result.history))]
+
+
+def test_flatten_keeps_the_distances_of_each_piece(dome):
+    V, F = dome
+    both = np.concatenate([V, 0.5 * V + [5, 0, 0]]), np.concatenate([F, F + len(V)])
+    result = flatten(*both, energy="distances", rings=6, gap=3.0)
+    alone = flatten(V, F, energy="distances", rings=6)
+    assert certify(both[1], result.uv).bijective
+    first, second = result.uv[: len(V)], result.uv[len(V) :]
+    assert np.allclose(first, alone.uv, atol=1e-9)
+    assert np.allclose(second - second.min(axis=0), 0.5 * alone.uv, atol=1e-9)
+    assert second[:, 0].min() - first[:, 0].max() == pytest.approx(3.0)
+    # By itself there is a twentieth of the longest side.
+    near = flatten(*both, energy="distances", rings=6).uv
+    room = near[len(V) :, 0].min() - near[: len(V), 0].max()
+    assert room == pytest.approx(0.05 * np.ptp(first, axis=0).max())
+
+
+def test_what_is_sampled_stands_for_all(dome):
+    """Also of few rings and on a small surface no map is made that pleases the pairs of the sample alone."""
+    V, F = spherical(surfaces.disk(14)[0], 0.45), dome[1]
+    sample = surface_distances(V, F, rings=4)
+    before, after = (sample.error(flatten(V, F, **o).uv) for o in ({}, {"energy": "distances", "rings": 4}))
+    assert after.mean < 0.99 * before.mean
+    assert after.rms < before.rms
+
+
+@pytest.mark.parametrize("stage", ["before", "in the middle"])
+def test_ctrl_c_ends_flattening_by_distances_with_a_map(dome, stage):
+    V, F = dome
+    plain = flatten(V, F)
+    last = len(plain.history) - 1 + (0 if stage == "before" else 3)
+
+    def stop(step):
+        if step.iteration == last:
+            raise KeyboardInterrupt
+
+    result = flatten(V, F, energy="distances", rings=6, callback=stop)
+    assert result.status is Status.INTERRUPTED
+    assert result.certificate.bijective
+    assert result.history[-1].iteration == last
+
+
+def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkeypatch):
+    from quasiharmonic.flattening import distance_descent
+
+    def cut_short(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(distance_descent, "surface_distances", cut_short)
+    result = flatten(*dome, energy="distances", rings=6)
+    assert result.status is Status.INTERRUPTED
+    assert np.array_equal(result.uv, flatten(*dome).uv)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"weights": np.ones(4)}, "leave fixed and weights out"),
+        ({"fixed": [0], "target": [[0, 0]]}, "leave fixed and weights out"),
+        ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
+        ({"gap": -1}, "gap must be a finite number of at least 0"),
+    ],
+)
+def test_what_distances_do_not_go_with_is_named(dome, options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        flatten(*dome, energy="distances", **options)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from quasiharmonic import io
 from quasiharmonic.cli import main
 from quasiharmonic.exact.certificate import certify
+from quasiharmonic.flattening.distances import distance_error
 from quasiharmonic.surfaces import cat, grid
 
 
@@ -112,3 +115,80 @@ def test_bad_weights_are_named(head, tmp_path, capsys):
     (tmp_path / "weights.txt").write_text("1\nheavy\n")
     assert run("flatten", head, "-o", tmp_path / "flat.obj", "--weights", tmp_path / "weights.txt") == 2
     assert "line 2: 'heavy' is not a number" in capsys.readouterr().err
+
+
+def test_distances(head, tmp_path, capsys):
+    out, report = tmp_path / "flat.obj", tmp_path / "report.json"
+    errors = []
+    for energy in ("symmetric-dirichlet", "distances"):
+        assert run("flatten", head, "-o", out, "--energy", energy, "--rings", 4, "--json", report) == 0
+        facts = json.loads(report.read_text())
+        assert ("distance_error" in facts) == (energy == "distances")
+        assert run("measure", out, "--distances", "--rings", 4, "--json", tmp_path / "measured.json") == 0
+        errors.append(json.loads((tmp_path / "measured.json").read_text())["distance_error"])
+    assert facts["distance_error"] == pytest.approx(errors[1])
+    assert errors[1]["mean"] < 0.9 * errors[0]["mean"]
+    V, F = cat(6)
+    assert facts["distance_error"]["mean"] == distance_error(V, F, io.map_of(io.read_mesh(out)), rings=4).mean
+    # What belongs beside the figure is beside it.
+    assert (errors[1]["rings"], errors[1]["crossings"], errors[1]["sources"]) == (4, 5, len(V))
+    said = capsys.readouterr().out
+    assert f"distances off by {100 * errors[1]['mean']:.3g} % on average" in said
+    assert "at most 4 edges away; along the surface, by chains of straight segments" in said
+
+
+@pytest.mark.parametrize("allowance", [0, 0.2])
+def test_pattern(tmp_path, allowance):
+    """Two squares of 1 and 0.6 inch: their outlines true to scale, far enough apart for their allowances."""
+    if allowance:
+        pytest.importorskip("shapely")
+    square, F = grid(3, 3)
+    V = np.concatenate([np.insert(square, 2, 0, axis=1), np.insert(0.6 * square, 2, 1, axis=1)])
+    io.write_obj(tmp_path / "two.obj", io.MeshData(V, np.concatenate([F, F + len(square)])))
+    drawing, report = tmp_path / "two.svg", tmp_path / "report.json"
+    options = ["--pattern", drawing, "--unit", "in", "--allowance", allowance, "--json", report]
+    assert run("flatten", tmp_path / "two.obj", "-o", tmp_path / "flat.obj", *options) == 0
+    facts = json.loads(report.read_text())
+    assert facts["pattern"] == str(drawing)
+    assert facts["mean_energy"] is None
+    uv = io.map_of(io.read_mesh(tmp_path / "flat.obj"))
+    assert uv[len(square) :, 0].min() - uv[: len(square), 0].max() > 2 * allowance
+    width = float(re.search(r'width="([0-9.]+)mm"', drawing.read_text()).group(1))
+    assert width == pytest.approx(25.4 * (np.ptp(uv[:, 0]) + 2 * allowance) + 10, rel=1e-4)
+    assert drawing.read_text().count("<path") == (4 if allowance else 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--pattern", "p.svg", "--unit-square"], "a pattern is true to scale, and --unit-square is not"),
+        (["--pattern", "p.pdf"], "as .svg or .dxf, not .pdf"),
+        (["--pattern", "p.svg", "--allowance", "-1"], "allowance must be a finite number of at least 0"),
+        (["--pattern", "nowhere/p.svg"], "nowhere"),
+        (["--allowance", "1"], "name its file by --pattern"),
+        (["--energy", "distances", "--fixed", "held.txt"], "leave fixed and weights out"),
+    ],
+)
+def test_wrong_patterns_and_distances(head, tmp_path, capsys, monkeypatch, options, words):
+    monkeypatch.chdir(tmp_path)
+    io.write_map(head, io.read_mesh(head), cat(6)[0][:, :2])
+    (tmp_path / "held.txt").write_text("0\n5\n")
+    assert run("flatten", head, "-o", "flat.obj", *options) == 2
+    assert words in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["head.obj", "held.txt"]
+
+
+@pytest.mark.parametrize(("package", "name", "extra"), [("ezdxf", "p.dxf", "patterns"), ("shapely", "p.svg", "shapes")])
+def test_missing_packages_are_named_before_any_work(head, tmp_path, capsys, monkeypatch, package, name, extra):
+    for loaded in [module for module in sys.modules if module.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert run("flatten", head, "-o", tmp_path / "f.obj", "--pattern", tmp_path / name, "--allowance", 0.1) == 2
+    assert f"pip install 'quasiharmonic[{extra}]'" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["head.obj"]
+
+
+def test_no_output_takes_the_place_of_another(head, tmp_path, capsys):
+    drawing = tmp_path / "one.svg"
+    assert run("flatten", head, "-o", tmp_path / "f.obj", "--pattern", drawing, "--json", drawing) == 2
+    assert "is also the file of --pattern" in capsys.readouterr().err

@@ -17,13 +17,17 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
     from quasiharmonic.apply.transfer import SurfaceMap
     from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
+    from quasiharmonic.curves import Rails
     from quasiharmonic.descent import Descent
     from quasiharmonic.energy.energies import Energy
     from quasiharmonic.energy.measures import Distortion, distortion
     from quasiharmonic.energy.polishing import polish
     from quasiharmonic.exact.certificate import Certificate, certify, flipped_triangles, is_injective
     from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
+    from quasiharmonic.flattening.distance_descent import keep_distances
+    from quasiharmonic.flattening.distances import distance_error
     from quasiharmonic.flattening.flattened import flatten
+    from quasiharmonic.flattening.patterns import write_pattern
     from quasiharmonic.mesh.refinement import Refined, refine
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
@@ -45,6 +49,7 @@ _HOME = {
     "Morphed": "apply.morphing",
     "Opened": "apply.cutting",
     "Problem": "problem",
+    "Rails": "curves",
     "Refined": "mesh.refinement",
     "RefinedProblem": "apply.refining",
     "Repaired": "apply.repairing",
@@ -59,12 +64,14 @@ _HOME = {
     "certify": "exact.certificate",
     "cut_open": "apply.cutting",
     "diagnose": "exact.diagnosis",
+    "distance_error": "flattening.distances",
     "distortion": "energy.measures",
     "flatten": "flattening.flattened",
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
     "injective_map": "search.solving",
     "is_injective": "exact.certificate",
+    "keep_distances": "flattening.distance_descent",
     "morph": "apply.morphing",
     "polish": "energy.polishing",
     "quasi_harmonic_map": "search.solving",
@@ -74,6 +81,7 @@ _HOME = {
     "solve": "search.solving",
     "warp_along": "apply.warping",
     "warp_by_landmarks": "apply.warping",
+    "write_pattern": "flattening.patterns",
 }
 
 __all__ = [
@@ -89,6 +97,7 @@ __all__ = [
     "Morphed",
     "Opened",
     "Problem",
+    "Rails",
     "Refined",
     "RefinedProblem",
     "Repaired",
@@ -103,12 +112,14 @@ __all__ = [
     "certify",
     "cut_open",
     "diagnose",
+    "distance_error",
     "distortion",
     "flatten",
     "flipped_triangles",
     "harmonise",
     "injective_map",
     "is_injective",
+    "keep_distances",
     "morph",
     "polish",
     "quasi_harmonic_map",
@@ -118,6 +129,7 @@ __all__ = [
     "solve",
     "warp_along",
     "warp_by_landmarks",
+    "write_pattern",
 ]
 
 

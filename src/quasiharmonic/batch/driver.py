@@ -54,8 +54,8 @@ class Progress:
 
     @property
     def solved(self) -> int:
-        """Problems with a certified injective map."""
-        return self.outcomes.get("injective", 0)
+        """Problems with a map certified to be what was asked for."""
+        return sum(self.outcomes.get(outcome, 0) for outcome in records.SOLVED)
 
     @property
     def failed(self) -> int:
@@ -179,6 +179,7 @@ def _checked(settings: Settings) -> Settings:
 
     for name, words in (
         ("strategy", list(STRATEGIES)),
+        ("energy", [None, *ENERGIES, "distances"]),
         ("polish", [None, *ENERGIES]),
         ("reference", [None, *get_args(Reference)]),
         ("linear_solver", ["auto", *available()]),
@@ -186,6 +187,7 @@ def _checked(settings: Settings) -> Settings:
         given = getattr(settings, name)
         if given not in words:
             raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
+    _check_flatten(settings)
     if settings.max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, not {settings.max_iterations}")
     if settings.to is None:
@@ -194,6 +196,20 @@ def _checked(settings: Settings) -> Settings:
 
     outline(settings.to)
     return replace(settings, to=os.path.abspath(settings.to)) if os.path.isfile(settings.to) else settings
+
+
+def _check_flatten(settings: Settings) -> None:
+    """Refuse settings of maps onto given boundaries where boundaries are free, and the other way round."""
+    if not settings.flatten:
+        if settings.energy is not None:
+            raise ValueError("energy is what flatten lowers: ask for that, or for polish")
+        return
+    plain = Settings()
+    for name in ("to", "strategy", "polish", "reference"):
+        if getattr(settings, name) != getattr(plain, name):
+            raise ValueError(
+                f"{name} is of maps onto a given boundary, and flatten sets it free: leave one of them out"
+            )
 
 
 def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limit: int | None, scheduler: Any) -> None:
@@ -219,7 +235,7 @@ def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> 
     if not count:
         raise ValueError(
             f"there are no problems in {source}: a problem is a folder with input.obj and handles.txt"
-            + ("" if settings.plain else "; to take plain meshes, say what to map them to")
+            + ("" if settings.plain else "; to take plain meshes, say what to map them to, or to flatten them")
         )
     return count
 

@@ -24,6 +24,8 @@ Record = dict[str, Any]
 OUTCOMES: dict[str, str] = {
     "injective": "certified injective",
     "not injective": "no injective map found",
+    "bijective": "certified bijective",
+    "not bijective": "no bijective map found",
     "invalid": "input cannot be used",
     "error": "unexpected error",
     "timeout": "over the time limit",
@@ -31,13 +33,18 @@ OUTCOMES: dict[str, str] = {
     "crash": "process died",
 }
 
+#: Of these, those that a problem is solved by, and those that its written map decides.
+SOLVED = "injective", "bijective"
+JUDGED = *SOLVED, "not injective", "not bijective"
+
 #: Columns of a table, in order, and the types of what is in them; every one may be empty.
 COLUMNS: dict[str, type] = {
     "problem": str,
     "source": str,
     # One of `OUTCOMES`.
     "outcome": str,
-    # Whether every triangle of the written map is positive, and whether it is bijective besides; decided exactly.
+    # Whether the written map is what was asked for, injective or, where the boundary is free, bijective, and whether it
+    # is bijective in either case; decided exactly.
     "certified": bool,
     "bijective": bool,
     # Why it ended: the name of a `quasiharmonic.Status`.
@@ -64,6 +71,8 @@ COLUMNS: dict[str, type] = {
     # Mean of σ₁/σ₂ + σ₂/σ₁ − 2 (§10), and the largest max(σ₁, 1/σ₂) after scaling to the surface's area.
     "mips": float,
     "isometric": float,
+    # Mean energy that the flattening of a connected surface has come to.
+    "energy": float,
     # Resident memory of the process at its most, bytes.
     "peak_memory": int,
     "linear_solver": str,

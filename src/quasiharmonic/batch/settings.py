@@ -25,6 +25,11 @@ class Settings:
         Problems are plain meshes, and their boundaries go to this outline, as `quasiharmonic.targets.outline` reads
         it; its holes are filled for a surface that has none. None where problems say themselves where fixed vertices
         go.
+    flatten : bool
+        Problems are plain meshes whose boundaries are free: `quasiharmonic.flatten` lays them flat, and what it makes
+        must be bijective. Then of what follows only ``max_iterations`` and ``linear_solver`` are read.
+    energy : str or None
+        What a flattening lowers; see `quasiharmonic.flatten` for the names. ``"symmetric-dirichlet"`` where None.
     strategy : {"speed", "quality"}
     polish : str or None
         Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
@@ -35,6 +40,8 @@ class Settings:
     """
 
     to: str | None = None
+    flatten: bool = False
+    energy: str | None = None
     strategy: str = "speed"
     polish: str | None = None
     reference: str | None = None
@@ -44,7 +51,7 @@ class Settings:
     @property
     def plain(self) -> bool:
         """Whether problems are plain meshes."""
-        return self.to is not None
+        return self.flatten or self.to is not None
 
     def key(self, files: ProblemFiles) -> str:
         """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.

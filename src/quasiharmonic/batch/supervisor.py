@@ -189,7 +189,7 @@ def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
 def _settled(folder: Path, record: Record, orders: Orders) -> bool:
     """Whether a record of the same input and settings stands under these orders."""
     outcome = record["outcome"]
-    if outcome in ("injective", "not injective"):
+    if outcome in records.JUDGED:
         return records.is_complete(folder, record)
     if outcome == "invalid":
         return True

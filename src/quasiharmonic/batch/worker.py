@@ -33,9 +33,10 @@ from quasiharmonic.batch.records import Record
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.certificate import certify
+from quasiharmonic.flattening.flattened import flatten, flattenable
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Problem
-from quasiharmonic.result import MapResult, Status
+from quasiharmonic.result import MapResult, Stage, Status
 from quasiharmonic.search.solving import solve
 
 #: What a process says when it has imported what it needs.
@@ -139,6 +140,24 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
     with _timed(record, "read"):
         mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
+    if settings["flatten"]:
+        found = _flattened(mesh, settings, record, tell)
+    else:
+        found = _mapped(mesh, fixed, settings, record, tell)
+    with _timed(record, "write"):
+        record |= _written(records.map_path(folder), mesh, found, "bijective" if settings["flatten"] else "injective")
+    with _timed(record, "measure"):
+        record |= _measured(mesh, found)
+
+
+def _mapped(
+    mesh: io.MeshData,
+    fixed: NDArray[np.signedinteger] | None,
+    settings: dict[str, Any],
+    record: Record,
+    tell: Callable[[dict[str, Any]], None],
+) -> MapResult:
+    """Map a mesh onto a given boundary."""
     with _timed(record, "setup"):
         arrays = io.problem_arrays(mesh, fixed) if settings["to"] is None else _onto(settings["to"], mesh)
         problem = Problem(*arrays, reference=settings["reference"])
@@ -159,20 +178,47 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
                 problem.domain, result.uv, energy=settings["polish"], linear_solver=settings["linear_solver"]
             )
         stages = stages + found.stages
-    record |= {
-        "status": found.status.name.lower(),
-        "flips_before": result.history[0].flipped if result.history else None,
-        "iterations": sum(stage.iterations for stage in stages),
-        "stages": json.dumps([stage.to_dict() for stage in stages]),
-        "linear_solver": result.linear_solver,
-    }
+    record |= _told(found, stages, result.linear_solver)
+    record["flips_before"] = result.history[0].flipped if result.history else None
     if result.status is not Status.INJECTIVE:
         why = result.diagnosis
         record["error"] = result.status.value if why is None or not why.obstructions else why.summary()
-    with _timed(record, "write"):
-        record |= _written(records.map_path(folder), mesh, found)
-    with _timed(record, "measure"):
-        record |= _measured(problem, found)
+    return found
+
+
+def _flattened(
+    mesh: io.MeshData, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
+) -> MapResult:
+    """Lay a mesh flat, its boundary free."""
+    with _timed(record, "setup"):
+        pieces = flattenable(mesh.V, mesh.F)
+    record |= {"vertices": len(mesh.V), "triangles": len(mesh.F), "fixed": 0, "pins": 0}
+    record["loops"] = sum(len(piece.loops) for piece in pieces)
+    tell({"facts": record})
+    with _timed(record, "map"):
+        result = flatten(
+            mesh.V,
+            mesh.F,
+            energy=settings["energy"] or "symmetric-dirichlet",
+            max_iterations=settings["max_iterations"],
+            linear_solver=settings["linear_solver"],
+        )
+    record |= _told(result, result.stages, result.linear_solver)
+    if len(pieces) == 1 and isfinite(result.history[-1].energy):
+        record["energy"] = result.history[-1].energy
+    if not result.certificate.bijective:
+        record["error"] = result.certificate.summary()
+    return result
+
+
+def _told(result: MapResult, stages: list[Stage], linear_solver: str) -> Record:
+    """What a record says of how a map was found."""
+    return {
+        "status": result.status.name.lower(),
+        "iterations": sum(stage.iterations for stage in stages),
+        "stages": json.dumps([stage.to_dict() for stage in stages]),
+        "linear_solver": linear_solver,
+    }
 
 
 def _onto(to: str, mesh: io.MeshData) -> io.ProblemArrays:
@@ -193,24 +239,25 @@ def _outline(to: str, _changed: int) -> list[NDArray[np.float64]]:
     return outline(to)
 
 
-def _written(path: Path, mesh: io.MeshData, result: MapResult) -> Record:
-    """Write a map, and judge the file as a reader gets it."""
+def _written(path: Path, mesh: io.MeshData, result: MapResult, wanted: str) -> Record:
+    """Write a map, and judge the file as a reader gets it: whether it is what is wanted, injective or bijective."""
     # Waiting for the disk would take longer than most problems. What a power failure takes is found by its length.
     io.write_obj(path, mesh.with_map(result.uv), durable=False)
     written = io.read_mesh(path)
     certificate = certify(written.F, io.map_of(written))
+    certified = certificate.bijective if wanted == "bijective" else certificate.injective
     return {
-        "outcome": "injective" if certificate.injective else "not injective",
-        "certified": certificate.injective,
+        "outcome": wanted if certified else f"not {wanted}",
+        "certified": certified,
         "bijective": certificate.bijective,
         "flips_after": len(certificate.flipped) + len(certificate.degenerate),
         "map_bytes": path.stat().st_size,
     }
 
 
-def _measured(problem: Problem, result: MapResult) -> Record:
-    measured = distortion(problem.V, problem.F, result.uv)
-    if len(measured.flat) == len(problem.F):
+def _measured(mesh: io.MeshData, result: MapResult) -> Record:
+    measured = distortion(mesh.V, mesh.F, result.uv)
+    if len(measured.flat) == len(mesh.F):
         return {}
     values = {"mips": measured.summary("mips").mean, "isometric": measured.summary("isometric").maximum}
     return {name: value if isfinite(value) else None for name, value in values.items()}

@@ -9,6 +9,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 # Those of quasiharmonic.energy.polishing, .harmonising, .linsolve and .measures, which are not imported to say them.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
+FLATTENED = *ENERGIES, "distances"
 HARMONISED = "arap", "area", "springs", "mips", "symmetric-dirichlet"
 MEASURES = (
     "sigma1",
@@ -32,6 +33,17 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 def add_linear_solver(parser: argparse._ActionsContainer) -> None:
     """``--linear-solver``."""
     parser.add_argument("--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the best present)")
+
+
+def add_rings(parser: argparse._ActionsContainer) -> None:
+    """``--rings``."""
+    parser.add_argument(
+        "--rings",
+        type=count,
+        default=20,
+        metavar="N",
+        help="distances: how many edges apart vertices are at most (default: 20)",
+    )
 
 
 def count(text: str) -> int:

@@ -29,8 +29,8 @@ def add_parser(commands: Commands) -> None:
         "Maps and records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has "
         "all records. The same command again goes on where the last one ended, however it ended. `qhm report OUT` "
         "makes a page of it.",
-        epilog="Exit status: 0 every problem has a certified injective map; 1 some have not (the records say why); "
-        "2 wrong call, or stopped: what was finished is kept.",
+        epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
+        "(the records say why); 2 wrong call, or stopped: what was finished is kept.",
     )
     parser.add_argument(
         "source",
@@ -75,6 +75,16 @@ def add_parser(commands: Commands) -> None:
         help=f"take every OBJ and OFF file, its boundary to go to {targets.FORMS}",
     )
     solver.add_argument(
+        "--flatten",
+        action="store_true",
+        help="take every OBJ and OFF file and lay it flat, its boundary free, without overlap",
+    )
+    solver.add_argument(
+        "--energy",
+        choices=arguments.FLATTENED,
+        help="what --flatten lowers (default: symmetric-dirichlet)",
+    )
+    solver.add_argument(
         "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
     )
     solver.add_argument(
@@ -92,6 +102,8 @@ def run(options: argparse.Namespace) -> int:
 
     settings = batch.Settings(
         to=options.to,
+        flatten=options.flatten,
+        energy=options.energy,
         strategy=options.strategy,
         polish=options.polish,
         reference=options.reference,
@@ -122,19 +134,20 @@ def run(options: argparse.Namespace) -> int:
         return 2
     finally:
         show.clear()
-    print(_account(progress, options.output / f"records.{options.table}"))
+    wanted = "bijective" if options.flatten else "injective"
+    print(_account(progress, wanted, options.output / f"records.{options.table}"))
     return 0 if progress.solved == progress.total else 1
 
 
-def _account(progress: Progress, table: Path) -> str:
+def _account(progress: Progress, wanted: str, table: Path) -> str:
     from quasiharmonic.batch import OUTCOMES
 
     failures = [
         f"{progress.outcomes[outcome]} {words}"
         for outcome, words in OUTCOMES.items()
-        if outcome != "injective" and progress.outcomes.get(outcome)
+        if outcome != wanted and progress.outcomes.get(outcome)
     ]
-    lines = [f"{progress.solved} of {progress.total} problems have a certified injective map"]
+    lines = [f"{progress.solved} of {progress.total} problems have a certified {wanted} map"]
     lines += ["the others: " + ", ".join(failures)] if failures else []
     resumed = f", {progress.resumed} of them done before" if progress.resumed else ""
     lines.append(f"wrote {table} in {_duration(progress.seconds)}{resumed}")

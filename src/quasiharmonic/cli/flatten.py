@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
 
+# Pieces are so many allowances apart: more than two, or these would touch.
+_ROOM = 2.1
+
+
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.cli import arguments
@@ -29,10 +33,12 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
     parser.add_argument(
         "--energy",
-        choices=arguments.ENERGIES,
+        choices=arguments.FLATTENED,
         default="symmetric-dirichlet",
-        help="what is lowered; mips is for angles alone (default: symmetric-dirichlet)",
+        help="what is lowered; mips is for angles alone, distances for those between vertices some edges apart "
+        "(default: symmetric-dirichlet)",
     )
+    arguments.add_rings(parser)
     parser.add_argument(
         "--weights", type=Path, metavar="FILE", help="how much each triangle counts, a positive number on each line"
     )
@@ -49,6 +55,15 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--cut", action="store_true", help="cut a closed surface, or one with handles, open first (copies vertices)"
     )
+    parser.add_argument(
+        "--pattern", type=Path, metavar="FILE", help="draw the outline true to scale too, as .svg or .dxf"
+    )
+    parser.add_argument(
+        "--unit", choices=("mm", "cm", "m", "in"), default="mm", help="of the surface, for --pattern (default: mm)"
+    )
+    parser.add_argument(
+        "--allowance", type=float, default=0.0, metavar="WIDTH", help="cut so far outside of the outline, in that unit"
+    )
     parser.add_argument("--max-iterations", type=arguments.count, default=500, metavar="N", help="(default: 500)")
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
@@ -61,10 +76,14 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.cli import progress, report
     from quasiharmonic.energy.measures import distortion
     from quasiharmonic.exact.certificate import certify
+    from quasiharmonic.flattening.distances import distance_error
     from quasiharmonic.flattening.flattened import flatten
+    from quasiharmonic.flattening.patterns import write_pattern
 
     began = time.perf_counter()
-    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.weights, options.fixed))
+    inputs = options.input, options.weights, options.fixed
+    report.check_outputs(options.output, None, options.json, inputs, pattern=options.pattern)
+    _check_pattern(options)
     mesh = io.read_mesh(options.input)
     given: dict[str, Any] = {}
     if options.start:
@@ -85,6 +104,8 @@ def run(options: argparse.Namespace) -> int:
                 mesh.F,
                 energy=options.energy,
                 unit_square=options.unit_square,
+                rings=options.rings,
+                gap=_ROOM * options.allowance,
                 max_iterations=options.max_iterations,
                 linear_solver=options.linear_solver,
                 callback=show,
@@ -102,7 +123,8 @@ def run(options: argparse.Namespace) -> int:
             "triangles": len(mesh.F),
             "copied_vertices": copies,
             "energy": options.energy,
-            "mean_energy": result.history[-1].energy if result.history else None,
+            # Each piece begins anew; of several, none is the energy of all.
+            "mean_energy": result.history[-1].energy if sum(not s.iteration for s in result.history) == 1 else None,
             "distortion": measured.to_dict(),
             "input": str(options.input),
             "output": str(options.output),
@@ -112,9 +134,31 @@ def run(options: argparse.Namespace) -> int:
         lines = [report.of_map(result, certificate, options.output)]
         if copies:
             lines.append(f"cut open: {copies} vertices along the cut have a copy at the end of the list")
-        lines += [f"stretched {worst:.3g} times at worst", result.status.value]
+        lines += [f"stretched {worst:.3g} times at worst"]
+        if options.energy == "distances":
+            error = distance_error(mesh.V, mesh.F, result.uv, rings=options.rings)
+            facts["distance_error"] = error.to_dict()
+            lines.append(error.summary())
+        if options.pattern is not None:
+            facts["pattern"] = str(options.pattern)
+            write_pattern(options.pattern, mesh.F, result.uv, unit=options.unit, allowance=options.allowance)
+            lines.append(f"wrote {options.pattern}, true to scale")
+        lines.append(result.status.value)
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if certificate.bijective else 1
+
+
+def _check_pattern(options: argparse.Namespace) -> None:
+    """Refuse before any work what would make no pattern."""
+    from quasiharmonic.flattening.patterns import check_pattern
+
+    if options.pattern is None:
+        if options.allowance:
+            raise ValueError("--allowance is of a pattern: name its file by --pattern")
+        return
+    if options.unit_square:
+        raise ValueError("a pattern is true to scale, and --unit-square is not: leave one of them out")
+    check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
 
 
 def _opened(mesh: MeshData) -> tuple[MeshData, int]:

@@ -27,6 +27,13 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--export", type=Path, metavar="FILE", help="write every measure of every triangle as .csv, .npz or .ply"
     )
+    parser.add_argument(
+        "--distances",
+        action="store_true",
+        help="measure too how far distances between vertices some edges apart are off, along the surface against in "
+        "the plane",
+    )
+    arguments.add_rings(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
@@ -36,6 +43,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.cli import report
     from quasiharmonic.energy.measures import distortion
+    from quasiharmonic.flattening.distances import distance_error
 
     report.check_json(options.json, inputs=(options.input, options.export))
     if options.export is not None:
@@ -44,12 +52,17 @@ def run(options: argparse.Namespace) -> int:
     V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
     with report.about(options.input):
         found = distortion(V, F, uv)
+        off = distance_error(V, F, uv, rings=options.rings) if options.distances else None
     if options.export is not None:
         # What is coloured by first is what bounds the error of a texture.
         values = {"isometric": found.isometric, **found.per_triangle()}
         io.write_per_triangle(options.export, V, F, uv, values)
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
-    report.emit(facts, options.json, _table(found, len(mesh.F)))
+    lines = [_table(found, len(mesh.F))]
+    if off is not None:
+        facts["distance_error"] = off.to_dict()
+        lines.append(off.summary())
+    report.emit(facts, options.json, "\n".join(lines))
     return 0
 
 

@@ -56,7 +56,14 @@ def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
     print(text, flush=True)
 
 
-def check_outputs(map_path: Path, plot: Path | None, json_path: str | None, inputs: Sequence[Path | None]) -> None:
+def check_outputs(
+    map_path: Path,
+    plot: Path | None,
+    json_path: str | None,
+    inputs: Sequence[Path | None],
+    *,
+    pattern: Path | None = None,
+) -> None:
     """Say before any work that something could not be written, or would be written over something else.
 
     Raises
@@ -71,7 +78,8 @@ def check_outputs(map_path: Path, plot: Path | None, json_path: str | None, inpu
     if plot is not None:
         check_picture("--plot", plot, inputs)
     taken = {map_path.resolve(): "the map (-o)"}
-    for option, path in (("--plot", plot), ("--json", None if json_path in (None, "-") else Path(str(json_path)))):
+    told = None if json_path in (None, "-") else Path(str(json_path))
+    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", told)):
         if path is None:
             continue
         _check_replaces_nothing(option, path, inputs)

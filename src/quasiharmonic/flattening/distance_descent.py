@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,12 +30,12 @@ from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
 from quasiharmonic.flattening.distances import SurfaceDistances, surface_distances
-from quasiharmonic.flattening.piece import Piece
-from quasiharmonic.result import MapResult, Stage, Status, Step
+from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
-# The pairs that are kept: from every so manieth vertex, but at most so many, to so many others, along segments across
-# so many edges. Twice as many pairs lower the error by a hundredth of it, half as many raise it by as much.
-_SPARSE, _SOURCES, _TARGETS, _CROSSINGS = 4, 2500, 120, 3
+# The pairs that are kept: from so many vertices to so many others, along segments across so many edges. On a cortex of
+# 9,465 vertices twice as many pairs lower the error by a hundredth of it, half as many raise it by as much.
+_SOURCES, _TARGETS, _CROSSINGS = 2500, 120, 3
 # Gradients are followed until the residual has fallen to this share, or there were so many.
 _ACCURACY, _GRADIENTS = 0.1, 20
 
@@ -49,14 +50,15 @@ def keep_distances(
     tolerance: float = 1e-3,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
+    record: int = 0,
 ) -> MapResult:
     """Bring distances in the plane near to distances along the surface; every map on the way is bijective.
 
     What is lowered is the mean, over a sample of pairs of vertices at most ``rings`` edges apart, of how far their
     distance is off, as `distance_error` measures it but for errors below 30 % counting by their squares; and a small
     share of the symmetric Dirichlet energy, which keeps triangles from collapsing
-    (`quasiharmonic.flattening.distance_energy`). The sample has a quarter of the vertices, at most 2,500, with 120
-    others each, drawn at random, always the same.
+    (`quasiharmonic.flattening.distance_energy`). The sample has 2,500 vertices, or all if there are
+    no more, with 120 others each, drawn at random, always the same.
 
     Parameters
     ----------
@@ -77,6 +79,8 @@ def keep_distances(
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at the start and after every step.
+    record : int
+        Keep the map of every ``record``-th step in the result's ``path``; none of them by default.
 
     Returns
     -------
@@ -109,6 +113,7 @@ def keep_distances(
     """
     began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=0)
+    whole_number("record", record, least=0)
     not_negative("tolerance", tolerance)
     piece = Piece(V, F)
     n = len(piece.V)
@@ -119,26 +124,58 @@ def keep_distances(
     judged = certify(piece.F, places, loops=piece.loops)
     if not judged.bijective:
         raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
+    settings = Settings(SymmetricDirichlet(), "distances", tolerance, max_iterations, linear_solver, callback, record)
+    result = kept(piece, places, rings, settings)
+    uv = np.ldexp(result.uv, piece.exponent)
+    certificate = certify(piece.F, uv, loops=piece.loops)
+    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began)
+
+
+def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first: int = 0) -> MapResult:
+    """Bring distances in a bijective map of a piece near to those along it.
+
+    Parameters
+    ----------
+    piece : Piece
+    uv : (n, 2) float64
+        A bijective map of any size.
+    rings : int
+        As `keep_distances` has it.
+    settings : Settings
+        Of which the density is not read.
+    first : int
+        The number of the first step.
+
+    Returns
+    -------
+    MapResult
+        As `keep_distances` makes it, ``uv`` in the piece's unit and ``path`` in the surface's.
+    """
+    began = time.perf_counter()
+    n = len(piece.V)
     distances = surface_distances(
-        piece.V, piece.F, rings=rings, sources=min(-(-n // _SPARSE), _SOURCES), targets=_TARGETS, crossings=_CROSSINGS
+        piece.V, piece.F, rings=rings, sources=_SOURCES, targets=_TARGETS, crossings=_CROSSINGS
     )
-    start = _in_scale(places, distances, piece)
+    start = _in_scale(uv, distances, piece)
     with np.errstate(all="ignore"):
         energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), n)
-        descent = DistanceDescent(energy, start, linear_solver, Rim(piece.loops))
+        descent = DistanceDescent(energy, start, settings.linear_solver, Rim(piece.loops))
     history: list[Step] = []
+    path: list[Snapshot] = []
 
     def report() -> None:
-        history.append(Step(len(history), 0, descent.distortion))
-        if callback is not None:
-            callback(history[-1])
+        history.append(Step(first + len(history), 0, descent.distortion))
+        if settings.record and history[-1].iteration % settings.record == 0:
+            path.append(Snapshot(history[-1].iteration, np.ldexp(descent.uv, piece.exponent)))
+        if settings.callback is not None:
+            settings.callback(history[-1])
 
     status = Status.STILL_FALLING
     try:
         report()
-        for _ in range(max_iterations):
+        for _ in range(settings.max_iterations):
             with np.errstate(all="ignore"):
-                outcome = descent.step(tolerance)
+                outcome = descent.step(settings.tolerance)
             report()
             if outcome is not None and not descent.ease():
                 status = outcome
@@ -148,11 +185,12 @@ def keep_distances(
     seconds = time.perf_counter() - began
     energies = history[0].energy, descent.distortion
     return MapResult(
-        uv=np.ldexp(descent.uv, piece.exponent),
+        uv=descent.uv,
         status=status,
-        certificate=certify(piece.F, np.ldexp(descent.uv, piece.exponent), loops=piece.loops),
+        certificate=certify(piece.F, descent.uv, loops=piece.loops),
         stages=[Stage("guarded descent, distances", len(history) - 1, seconds, (0, 0), energies)],
         history=history,
+        path=path,
         linear_solver=descent.system.solver.name,
         seconds=seconds,
     )

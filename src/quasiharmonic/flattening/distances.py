@@ -19,6 +19,7 @@ way along edges has k of them. What is measured here, all of which belongs besid
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +29,36 @@ from quasiharmonic.flattening.geodesics import chain_lengths, edge_graph, neighb
 
 # The farthest vertices are looked for up to so many mean edges for each ring.
 _REACH = 1.5
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How distances were sampled; belongs beside any figure made of them.
+
+    Attributes
+    ----------
+    rings : int
+        How many edges apart vertices of a pair are at most.
+    sources : int
+        Vertices from which distances were taken.
+    targets : int or None
+        To how many others, drawn at random, at most from each; None for all within so many rings.
+    crossings : int
+        How many edges each straight segment of a path along the surface may cross.
+    """
+
+    rings: int
+    sources: int
+    targets: int | None
+    crossings: int
+
+    def summary(self) -> str:
+        """In words."""
+        others = "all others" if self.targets is None else f"at most {self.targets} others"
+        return (
+            f"pairs of {self.sources} vertices with {others} at most {self.rings} edges away; along the surface, by "
+            f"chains of straight segments that cross at most {self.crossings} edges each, against straight in the plane"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +71,13 @@ class DistanceError:
         What the map was multiplied by: the factor for which `mean` is least.
     relative : (k,) float64
         ``scale · d_plane / d_surface − 1`` of every pair: positive where the map has it longer.
+    sampling : Sampling
+        Which pairs they are, and how their distances were taken.
     """
 
     scale: float
     relative: FloatArray
+    sampling: Sampling
 
     @property
     def mean(self) -> float:
@@ -60,6 +94,25 @@ class DistanceError:
         """Root of the mean square, which minds large errors more."""
         return float(np.sqrt(np.mean(self.relative**2)))
 
+    def to_dict(self) -> dict[str, Any]:
+        """The figures, and all that belongs beside them, for JSON."""
+        return {
+            "mean": self.mean,
+            "median": self.median,
+            "rms": self.rms,
+            "scale": self.scale,
+            "pairs": int(self.relative.size),
+            **vars(self.sampling),
+            "sampling": self.sampling.summary(),
+        }
+
+    def summary(self) -> str:
+        """In a sentence."""
+        return (
+            f"distances off by {100 * self.mean:.3g} % on average (root mean square {100 * self.rms:.3g} %), the map "
+            f"scaled by {self.scale:.4g}; {self.sampling.summary()}"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDistances:
@@ -71,11 +124,13 @@ class SurfaceDistances:
         Vertices; sources ascending.
     length : (k,) float64
         Along the surface, positive.
+    sampling : Sampling
     """
 
     source: IntArray
     target: IntArray
     length: FloatArray
+    sampling: Sampling
 
     def error(self, uv: ArrayLike) -> DistanceError:
         """Compare with distances in the plane.
@@ -97,7 +152,7 @@ class SurfaceDistances:
         apart = places[self.source] - places[self.target]
         ratio = np.hypot(apart[:, 0], apart[:, 1]) / self.length
         scale = _best_scale(ratio)
-        return DistanceError(scale, scale * ratio - 1)
+        return DistanceError(scale, scale * ratio - 1, self.sampling)
 
 
 def surface_distances(
@@ -164,7 +219,7 @@ def surface_distances(
     segments = straight_segments(V, F, crossings)
     mean_edge = (segments * edges).sum() / edges.nnz
     length = chain_lengths(segments, source, row, target, float(_REACH * rings * mean_edge))
-    return SurfaceDistances(source[row], target, length)
+    return SurfaceDistances(source[row], target, length, Sampling(rings, source.size, targets, crossings))
 
 
 def distance_error(
@@ -192,7 +247,8 @@ def distance_error(
     Returns
     -------
     DistanceError
-        With `~DistanceError.mean`, `~DistanceError.median` and `~DistanceError.rms` of ``|relative|``.
+        With `~DistanceError.mean`, `~DistanceError.median` and `~DistanceError.rms` of ``|relative|``, and in
+        `~DistanceError.sampling` what belongs beside them.
 
     Raises
     ------

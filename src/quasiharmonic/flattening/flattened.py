@@ -28,14 +28,17 @@ from quasiharmonic.arrays import (
     real_array,
     whole_number,
 )
-from quasiharmonic.energy.energies import Energy
+from quasiharmonic.energy.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify, flipped_triangles
+from quasiharmonic.flattening.distance_descent import kept
 from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
 from quasiharmonic.flattening.piece import Flattening, Piece, Settings
 from quasiharmonic.mesh.topology import components
 from quasiharmonic.result import MapResult, Status, Step
 
+# A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
+_SAMPLED = 10.0
 # Several pieces together are as far as the one that comes first here.
 _FURTHEST_LAST = Status.INTERRUPTED, Status.STILL_FALLING, Status.EXHAUSTED, Status.POLISHED
 
@@ -50,6 +53,8 @@ def flatten(
     weights: ArrayLike | None = None,
     start: ArrayLike | None = None,
     unit_square: bool = False,
+    rings: int = 20,
+    gap: float = 0.0,
     max_iterations: int = 500,
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
@@ -70,7 +75,9 @@ def flatten(
         Their positions.
     energy : str or Energy
         What is lowered, the mean over the surface's area: ``"symmetric-dirichlet"``, ``"mips"`` (angles alone),
-        ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`.
+        ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`. Or ``"distances"``: the symmetric
+        Dirichlet energy first, and then how far distances between vertices some edges apart are off, as
+        `quasiharmonic.keep_distances` lowers it; without pins and weights.
     weights : (f,) array, optional
         How much each triangle's distortion counts; positive, 1 by default.
     start : (n, 2) array, optional
@@ -78,16 +85,22 @@ def flatten(
         of it, a start of the library's own is taken.
     unit_square : bool
         Scale the map evenly into the unit square. By default it is in the surface's own unit of length.
+    rings : int
+        For ``"distances"``: how many edges apart vertices are at most whose distance is to be kept.
+    gap : float
+        The least space between the bounding boxes of several pieces, in the surface's unit; a twentieth of the longest
+        of their sides is always left. Not negative.
     max_iterations : int
-        Newton steps at most on each connected piece, counted anew where an overlap makes the descent begin again.
+        Newton steps at most on each connected piece, counted anew where an overlap makes the descent begin again, and
+        for distances.
     tolerance : float
         The descent has converged when Newton's model promises a further decrease below this fraction of the
-        energy. Not negative.
+        energy; for distances, which are a sample, below ten times of it. Not negative.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step; its ``energy`` is the mean energy. It may raise
-        `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
+        Called with a `Step` at the start and after every step; its ``energy`` is the mean of what is being lowered. It
+        may raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
     record : int
         Keep the map of every ``record``-th step in the result's ``path``, before it is laid out; none of them by
         default, and none of several pieces.
@@ -127,9 +140,18 @@ def flatten(
         raise ValueError("vertices that are held decide the map's size: leave unit_square out")
     whole_number("max_iterations", max_iterations, least=0)
     whole_number("record", record, least=0)
+    whole_number("rings", rings, least=1)
+    not_negative("gap", gap)
     not_negative("tolerance", tolerance)
-    name = energy if isinstance(energy, str) else type(energy).__name__
-    settings = Settings(energy_named(energy), name, tolerance, max_iterations, linear_solver, callback, record)
+    of_distances = isinstance(energy, str) and energy == "distances"
+    if of_distances and not (fixed is None and weights is None):
+        raise ValueError(
+            "distances are kept of a map whose vertices are all free and whose triangles all count alike: leave fixed "
+            "and weights out, or choose another energy"
+        )
+    density = SymmetricDirichlet() if of_distances else energy_named(energy)
+    name = "symmetric-dirichlet" if of_distances else energy if isinstance(energy, str) else type(energy).__name__
+    settings = Settings(density, name, tolerance, max_iterations, linear_solver, callback, record)
     V, F = real_array("V", V), index_array("F", F)
     weights = None if weights is None else _positive(weights, len(F))
     given = None if start is None else _injective(start, V, F)
@@ -138,7 +160,7 @@ def flatten(
 
         return replace(pinned(V, F, fixed, target, settings, weights, given), seconds=time.perf_counter() - began)
     parts = _parts(V, F)
-    pieces = [Piece(V, F)] if len(parts) == 1 else [_piece(V, F, *part) for part in parts]
+    pieces = _pieces(V, F, parts)
     results: list[MapResult] = []
     for piece, (vertices, triangles) in zip(pieces, parts, strict=True):
         if results and results[-1].status is Status.INTERRUPTED:
@@ -146,10 +168,13 @@ def flatten(
             settings = replace(settings, max_iterations=0, callback=None)
         uv = None if given is None else np.ldexp(given[vertices], -piece.exponent)
         run = Flattening(piece, settings, None if weights is None else weights[triangles])
-        results.append(run.run(uv))
+        result = run.run(uv)
+        if of_distances and result.status is not Status.INTERRUPTED:
+            result = _with_distances(piece, result, rings, replace(settings, tolerance=_SAMPLED * tolerance))
+        results.append(result)
     uv = np.zeros((len(V), 2))
     placed = [_laid_out(piece, result.uv) for piece, result in zip(pieces, results, strict=True)]
-    for place, (vertices, _) in zip(side_by_side(placed) if len(placed) > 1 else placed, parts, strict=True):
+    for place, (vertices, _) in zip(side_by_side(placed, gap) if len(placed) > 1 else placed, parts, strict=True):
         uv[vertices] = place
     if unit_square:
         uv = in_unit_square(uv)
@@ -163,6 +188,45 @@ def flatten(
         path=results[0].path if len(results) == 1 else [],
         linear_solver=results[0].linear_solver,
         seconds=time.perf_counter() - began,
+    )
+
+
+def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
+    """The connected pieces of a mesh, largest first, if it is one that `flatten` takes; raises what that would.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+    F : (f, 3) array of int
+
+    Returns
+    -------
+    list of Piece
+
+    Raises
+    ------
+    ValueError
+        As `flatten` says of surfaces.
+    """
+    V, F = real_array("V", V), index_array("F", F)
+    pieces = _pieces(V, F, _parts(V, F))
+    for piece in pieces:
+        # Says which rest triangles have no area.
+        piece.energy(SymmetricDirichlet(), None)
+    return pieces
+
+
+def _with_distances(piece: Piece, found: MapResult, rings: int, settings: Settings) -> MapResult:
+    """A piece's map after the descent of distances; the one at hand if Ctrl-C comes before there is another."""
+    try:
+        then = kept(piece, found.uv, rings, settings, first=len(found.history))
+    except KeyboardInterrupt:
+        return replace(found, status=Status.INTERRUPTED)
+    return replace(
+        then,
+        stages=found.stages + then.stages,
+        history=found.history + then.history,
+        path=found.path + then.path,
     )
 
 
@@ -182,6 +246,10 @@ def _parts(V: FloatArray, F: IntArray) -> list[tuple[IntArray, IntArray]]:
         (np.flatnonzero(label == own), np.flatnonzero(of_triangle == own))
         for own in labels[np.argsort(-count, kind="stable")].tolist()
     ]
+
+
+def _pieces(V: FloatArray, F: IntArray, parts: list[tuple[IntArray, IntArray]]) -> list[Piece]:
+    return [Piece(V, F)] if len(parts) == 1 else [_piece(V, F, *part) for part in parts]
 
 
 def _piece(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -> Piece:

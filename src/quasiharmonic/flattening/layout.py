@@ -45,9 +45,12 @@ def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
     return laid - laid.min(axis=0)
 
 
-def side_by_side(parts: Sequence[FloatArray]) -> list[FloatArray]:
-    """Shift maps (n, 2) whose bounding boxes begin at the origin such that they stand in a row, with gaps between."""
-    gap = _GAP * max(float(part.max()) for part in parts)
+def side_by_side(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArray]:
+    """Shift maps (n, 2) whose bounding boxes begin at the origin such that they stand in a row.
+
+    Between them there is a share of the largest side of all, or ``gap`` if that is more.
+    """
+    gap = max(gap, _GAP * max(float(part.max()) for part in parts))
     shifted, right = [], 0.0
     for part in parts:
         shifted.append(part + np.array([right, 0.0]))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, index_array, not_negative, real_array
 from quasiharmonic.exact.certificate import certify
-from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.mesh.topology import components
 
 #: Millimetres in each unit that a map may be in.
@@ -120,13 +120,28 @@ def write_pattern(
     quasiharmonic.io.OutputError
         When the file cannot be written.
     """
-    ending = os.path.splitext(os.fspath(path))[1].lower()
+    check_pattern(path, unit=unit, allowance=allowance)
+    lines = pattern(F, uv, unit=unit, allowance=allowance)
+    write_whole(path, _dxf(lines) if _ending(path) == ".dxf" else _svg(lines))
+
+
+def check_pattern(path: str | os.PathLike[str], *, unit: str = "mm", allowance: float = 0.0) -> None:
+    """Say before there is a map whether its pattern could be written; raises what `write_pattern` would."""
+    ending = _ending(path)
     if ending not in (".svg", ".dxf"):
         raise ValueError(f"a pattern is written as .svg or .dxf, not {ending or 'without an ending'}: {path}")
+    if unit not in UNITS:
+        raise ValueError(f"unit must be one of {', '.join(UNITS)}, not {unit!r}")
+    not_negative("allowance", allowance)
+    check_writable(path)
     if ending == ".dxf":
         _ezdxf()
-    lines = pattern(F, uv, unit=unit, allowance=allowance)
-    write_whole(path, _svg(lines) if ending == ".svg" else _dxf(lines))
+    if allowance:
+        _shapely()
+
+
+def _ending(path: str | os.PathLike[str]) -> str:
+    return os.path.splitext(os.fspath(path))[1].lower()
 
 
 def _widened(pieces: list[list[FloatArray]], allowance: float) -> list[FloatArray]:

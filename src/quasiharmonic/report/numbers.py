@@ -41,6 +41,12 @@ class Run:
     results: Path | None
     about: Record
 
+    @property
+    def wanted(self) -> str:
+        """What maps were asked to be: ``"bijective"`` where boundaries were free, else ``"injective"``."""
+        free = any(row.get("outcome") in ("bijective", "not bijective") for row in self.rows)
+        return "bijective" if free or self.about.get("settings", {}).get("flatten") is True else "injective"
+
     def column(self, name: str) -> FloatArray:
         """A column of numbers, NaN where there is none; (records,)."""
         values = (row.get(name) for row in self.rows)
@@ -48,7 +54,7 @@ class Run:
 
     @property
     def certified(self) -> NDArray[np.bool_]:
-        """Which records have a certified injective map."""
+        """Which records have a map certified to be what was asked for."""
         return np.array([row.get("certified") is True for row in self.rows], dtype=np.bool_)
 
 

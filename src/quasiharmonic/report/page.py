@@ -10,7 +10,7 @@ from math import isfinite, isnan
 
 import numpy as np
 
-from quasiharmonic.batch.records import OUTCOMES, Record
+from quasiharmonic.batch.records import OUTCOMES, SOLVED, Record
 from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.report import figures, numbers
 from quasiharmonic.report.numbers import PHASES, Run
@@ -123,7 +123,7 @@ def _origin(run: Run) -> str:
 def _tiles(run: Run) -> str:
     whole = numbers.groups(run)[-1]
     tiles = [
-        (percent(whole.certified, whole.problems), f"{whole.certified:,} of {whole.problems:,} certified injective"),
+        (percent(whole.certified, whole.problems), f"{whole.certified:,} of {whole.problems:,} certified {run.wanted}"),
         (number(whole.seconds[0], "s"), f"median time of these; 95 % within {number(whole.seconds[1], 's')}"),
         (number(whole.mips), "median MIPS distortion"),
         (number(whole.triangles), "triangles in all"),
@@ -135,7 +135,7 @@ def _tiles(run: Run) -> str:
 
 def _outcomes(run: Run) -> str:
     counted = numbers.outcomes(run)
-    css = {"injective": "good", "not injective": "bad"}
+    css = {**dict.fromkeys(SOLVED, "good"), "not injective": "bad", "not bijective": "bad"}
     bar = "".join(f'<i class="{css.get(name, "broken")}" style="flex:{count}"></i>' for name, count in counted)
     words = ", ".join(f"{count:,} {shown(OUTCOMES.get(name, name))}" for name, count in counted)
     impossible = sum(row.get("status") == "impossible" for row in run.rows)
@@ -184,7 +184,7 @@ def _times(run: Run) -> str:
     good = run.certified
     size, seconds = run.column("triangles"), run.column("seconds")
     series = [("ours", size[good], seconds[good]), ("failed", size[~good], seconds[~good])]
-    legend = [("ours", "certified injective"), ("failed", "not")] if not good.all() else []
+    legend = [("ours", f"certified {run.wanted}"), ("failed", "not")] if not good.all() else []
     caption = "Each dot is a problem; wall time from the file to the record."
     return _figure("Time and size", figures.scatter(series, "triangles", "seconds"), legend, caption)
 
