@@ -334,3 +334,14 @@ def test_loops_are_the_surface_s():
     V, F = annulus(8)
     result = flatten(V, F)
     assert [loop.tolist() for loop in result.certificate.loops] == [b.tolist() for b in boundary_loops(F, len(V))]
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-200, 1e-162, 1e-155, 1e155, 1e200, 1e300])
+def test_a_start_of_any_size_is_brought_to_the_surfaces(size):
+    V, F = disk(8)
+    V = np.column_stack([V, np.sqrt(1.2 - (V**2).sum(axis=1))])
+    own = flatten(V, F)
+    result = flatten(V, F, start=own.uv * size)
+    assert result.status is Status.POLISHED
+    assert result.certificate.bijective
+    assert result.history[-1].energy == pytest.approx(own.history[-1].energy, rel=1e-6)

@@ -173,3 +173,9 @@ def test_missing_packages_are_named(ring, tmp_path, monkeypatch, package, name, 
     with pytest.raises(ImportError, match=rf"pip install 'quasiharmonic\[{extra}\]'"):
         write_pattern(tmp_path / name, F, V, allowance=0.1)
     assert not list(tmp_path.iterdir())
+
+
+def test_coordinates_that_no_double_holds_in_mm_are_refused():
+    V, F = surfaces.grid(2, 2)
+    with pytest.raises(ValueError, match=r"beyond the largest double; is m its unit\?"):
+        pattern(F, 1e306 * V, unit="m")

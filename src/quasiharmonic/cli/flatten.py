@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quasiharmonic.cli.arguments import Commands
     from quasiharmonic.io import MeshData
+    from quasiharmonic.result import MapResult
 
 
 # Pieces are so many allowances apart: more than two, or these would touch.
@@ -124,7 +126,7 @@ def run(options: argparse.Namespace) -> int:
             "copied_vertices": copies,
             "energy": options.energy,
             # Each piece begins anew; of several, none is the energy of all.
-            "mean_energy": result.history[-1].energy if sum(not s.iteration for s in result.history) == 1 else None,
+            "mean_energy": _mean_energy(result),
             "distortion": measured.to_dict(),
             "input": str(options.input),
             "output": str(options.output),
@@ -161,6 +163,12 @@ def _check_pattern(options: argparse.Namespace) -> None:
     check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
 
 
+def _mean_energy(result: MapResult) -> float | None:
+    """Of a surface in one piece; JSON has neither infinity nor NaN, which pins far apart may bring about."""
+    whole = sum(not step.iteration for step in result.history) == 1
+    return result.history[-1].energy if whole and isfinite(result.history[-1].energy) else None
+
+
 def _opened(mesh: MeshData) -> tuple[MeshData, int]:
     """The mesh cut open, if it is closed or has handles, and how many vertices that has copied."""
     from quasiharmonic.apply.cutting import cut_open
@@ -185,4 +193,6 @@ def _numbers(path: Path) -> list[float]:
                 values.append(float(text))
             except ValueError:
                 raise ValueError(f"{path}, line {number}: {text!r} is not a number") from None
+            if not values[-1] > 0:
+                raise ValueError(f"{path}, line {number}: a weight must be positive, not {text}")
     return values

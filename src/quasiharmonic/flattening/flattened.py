@@ -70,7 +70,7 @@ def flatten(
     F : (f, 3) array of int
         Triangles of one or several surfaces, each with at least one boundary loop, holes welcome, and no handles.
     fixed : (k,) array of int, optional
-        Vertices held at ``target``, to the last bit. The map then stays where they put it.
+        Vertices held at ``target``, to the last bit, of one connected surface. The map then stays where they put it.
     target : (k, 2) array, optional
         Their positions.
     energy : str or Energy
@@ -111,6 +111,8 @@ def flatten(
         Its ``uv`` is bijective, certified; the principal axis lies along x, the bounding box begins at the origin, and
         several pieces stand side by side. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration,
         ``EXHAUSTED`` when doubles cannot express a better map, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+        With pins it may also be ``IMPOSSIBLE``, the ``diagnosis`` naming why, or what the search has ended with; the
+        map then is the best found, and only the certificate says what it is, as after an interrupt of that search.
 
     Raises
     ------

@@ -89,7 +89,10 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     judged = certify(triangles, places)
     if not judged.bijective:
         raise ValueError(f"what overlaps itself cannot be cut out. {judged.summary()}")
-    seam = [places[loop] * UNITS[unit] for loop in judged.loops]
+    with np.errstate(over="ignore"):
+        seam = [places[loop] * UNITS[unit] for loop in judged.loops]
+    if not all(np.isfinite(line).all() for line in seam):
+        raise ValueError(f"in mm the map's coordinates are beyond the largest double; is {unit} its unit?")
     if not allowance:
         return Pattern(seam, seam)
     label = components(triangles, len(places))

@@ -209,11 +209,13 @@ class Flattening:
         return abs(self._measure.value(2 * w) / self._measure.value(w) - 1) < _SAME
 
     def _in_scale(self, uv: FloatArray) -> FloatArray:
-        """A map scaled to the surface's area."""
-        centred = uv - uv.mean(axis=0)
+        """A map scaled to the surface's area; only by a power of two, exactly, where more would invert a triangle."""
+        unit = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
+        centred = unit - unit.mean(axis=0)
         area = float(signed_areas(self._piece.F, in_units(centred, 0)).sum())
-        scaled = centred * np.sqrt(self._piece.area / area)
-        return scaled if is_injective(self._piece.F, scaled) else uv
+        factor = np.sqrt(self._piece.area / area)
+        scaled = centred * factor
+        return scaled if is_injective(self._piece.F, scaled) else np.ldexp(unit, round(np.log2(factor)))
 
     def _descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
         """Descend from a map, which is bijective if the descent is guarded; None where the end overlaps itself."""
