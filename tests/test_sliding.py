@@ -548,3 +548,15 @@ def test_morph_slides(tmp_path):
     assert np.abs(after[walls] - V[walls]).max() > 0.03
     assert (np.abs(after[walls]).max(axis=1) == 1).all()
     assert main([*call, "--energy", "none"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"curves": None}, "curves must be a Curve, a polygon"),
+        ({"curves": [SQUARE], "on": [1, 2]}, "on must say which vertex is on which curve"),
+    ],
+)
+def test_rails_of_what_is_none(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        Rails(**arguments)

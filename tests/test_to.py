@@ -510,7 +510,11 @@ def test_a_point_says_which_loop_goes_where():
             "letter:i",
             r"the outline is in 2 separate pieces \(beginning at \(.*\), \(.*\)\), and a connected surface can fill",
         ),
-        (torus(), "disk", r"the surface is closed: .* cut it open first \(cut_open; qhm map --cut\)"),
+        (
+            torus(),
+            "disk",
+            r"the surface is closed: .* cut it open first \(cut_open; --cut of qhm map and qhm flatten\)",
+        ),
         (octahedron(), "disk", "the surface is closed"),
         ((torus()[0], torus()[1][1:]), "disk", "the surface has a handle and fits into no outline: cut it open"),
         (surfaces.disk(1), "letter:H", "the loop has 6 vertices, too few to keep the 12 corners"),

@@ -61,10 +61,14 @@ class Rails:
     ) -> None:
         if isinstance(curves, Curve) or (isinstance(curves, np.ndarray) and curves.ndim == 2):
             curves = [curves]
+        if not isinstance(curves, Iterable):
+            raise ValueError(f"curves must be a Curve, a polygon (k, 2) or a list of those, not {curves!r}")
         self.curves = [curve if isinstance(curve, Curve) else Curve.polygon(curve) for curve in curves]
         if not self.curves:
             raise ValueError("there is no curve to slide along")
-        on = on or {}
+        on = {} if on is None else on
+        if not isinstance(on, Mapping):
+            raise ValueError(f"on must say which vertex is on which curve, as in {{12: 0}}, and is {type(on).__name__}")
         told = zip(index_array("on", list(on)).tolist(), index_array("on", list(on.values())).tolist(), strict=True)
         self.on: dict[int, int] = dict(told)
         self.held = index_array("held", held).ravel()

@@ -92,7 +92,7 @@ class Piece:
         if handles or odd:
             raise ValueError(
                 f"the surface has {counted('handle', 'handles', handles)} and cannot lie in the plane: "
-                "cut it open first (cut_open; qhm flatten --cut)"
+                "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
             )
         self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
         self.V = np.zeros((domain.n, 3))

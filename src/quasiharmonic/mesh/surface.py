@@ -49,7 +49,8 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
         )
     if not closed and not found.boundary.size:
         raise ValueError(
-            "the surface is closed: it has no boundary to place; cut it open first (cut_open; qhm map --cut)"
+            "the surface is closed: it has no boundary to place; cut it open first "
+            "(cut_open; --cut of qhm map and qhm flatten)"
         )
     if components(F, n).any():
         first = np.unique(components(F, n))

@@ -112,7 +112,7 @@ def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
     if handles:
         raise ValueError(
             f"the surface has {'a handle' if handles == 1 else f'{handles} handles'} and fits into no outline: "
-            "cut it open first (cut_open; qhm map --cut)"
+            "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
         )
     pieces = [one.points[0].tolist() for one in contours if one.depth % 2 == 0]
     if len(pieces) > 1:
