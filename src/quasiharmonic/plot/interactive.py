@@ -95,7 +95,7 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
     for name, points in (("surface", solid), ("map", beside)):
         if not inverted.all():
             drawn = polyscope.register_surface_mesh(name, points, F[~inverted], edge_width=0.3)
-            drawn.add_parameterisation_quantity(
+            drawn.add_parameterization_quantity(
                 "checkerboard",
                 unit,
                 enabled=True,
