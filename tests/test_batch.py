@@ -26,6 +26,8 @@ from quasiharmonic.surfaces import annulus, cat
 from quasiharmonic.targets import outline, signed_area
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
+pytestmark = pytest.mark.slow
+
 
 def names(source, **options):
     return [problem.name for problem in batch.find_problems(source, **options)]
@@ -214,7 +216,6 @@ class TestRun:
         assert refused[-1] == 4
         assert batch.run(stars, out).resumed == 4
 
-    @pytest.mark.slow
     def test_nothing_that_is_not_of_a_run_is_written_over(self, stars, tmp_path):
         for out in (stars, stars / "b", stars / "a"):
             with pytest.raises(ValueError, match=r"holds a problem, .*input.obj: name another folder"):
@@ -229,13 +230,11 @@ class TestRun:
         (tmp_path / "records.csv").unlink()
         assert batch.run(stars / "b", stars).solved == batch.run(stars / "b", stars).resumed == 2
 
-    @pytest.mark.slow
     def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
         batch.run(stars, tmp_path / "out", jobs=1)
         monkeypatch.setattr(supervisor, "COMMAND", ["/nonexistent"])
         assert batch.run(stars, tmp_path / "out").resumed == 4
 
-    @pytest.mark.slow
     def test_plain_meshes_onto_an_outline(self, stars, tmp_path):
         io.write_off(stars / "ring.off", io.MeshData(*annulus(6)))
         settings = batch.Settings(to="letter:O")
@@ -295,7 +294,6 @@ class TestRun:
             batch.run(stars, tmp_path / "out", batch.Settings(**options))
         assert not (tmp_path / "out").exists()
 
-    @pytest.mark.slow
     def test_a_drawing_is_part_of_the_input(self, stars, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         Path("outline.csv").write_text("0,0\n2,0\n2,1\n0,1\n")
@@ -308,7 +306,6 @@ class TestRun:
             batch.run(stars, "other", batch.Settings(to="blob:3"))
         assert not Path("other").exists()
 
-    @pytest.mark.slow
     def test_parquet(self, stars, tmp_path):
         pytest.importorskip("pyarrow")
         batch.run(stars, tmp_path / "out", jobs=1, table="parquet")
@@ -352,7 +349,6 @@ class TestRun:
         assert main(["batch", str(stars), "-o", str(tmp_path / "out")]) == 2
         assert "cannot start /nonexistent" in capsys.readouterr().err
 
-    @pytest.mark.slow
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
         """Thousands of folders with a file each that nobody looks into."""
 
@@ -380,7 +376,6 @@ class TestRun:
         # A list of the problems would take half a megabyte.
         assert sizes[1000] < sizes[100] + 50_000
 
-    @pytest.mark.slow
     def test_an_interrupt_stops_at_once_and_keeps_what_is_done(self, stars, tmp_path, troubled):
         write_stars(stars, ["y_sleep"])
 
@@ -481,7 +476,6 @@ class TestCommand:
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 
-    @pytest.mark.slow
     def test_full_disk(self, tmp_path, capsys, troubled):
         write_stars(tmp_path / "set", ["full"])
         assert main(["batch", str(tmp_path / "set"), "-o", str(tmp_path / "out")]) == 2
@@ -508,7 +502,6 @@ class TestCommand:
         assert stop.value.code == 2
         assert "is not a size" in capsys.readouterr().err
 
-    @pytest.mark.slow
     def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
         pty = pytest.importorskip("pty")
         leader, follower = pty.openpty()

@@ -18,6 +18,8 @@ from quasiharmonic.cli import main
 from quasiharmonic.report import figures, numbers, page, write_report
 from shared.datasets import star_of, write_problem, write_stars
 
+pytestmark = pytest.mark.slow
+
 VILE = '<script>alert(1)</script>"><img src=x onerror=alert(2)>&amp;\u202egnp'
 
 
@@ -127,7 +129,6 @@ class TestPage:
         (tmp_path / "out" / "results" / "c" / "record.json").unlink()
         assert "2 of 2 certified" in Reader(written(tmp_path, tmp_path / "out")).text
 
-    @pytest.mark.slow
     def test_spoilt_files_are_passed_over(self, tmp_path):
         out = tmp_path / "out"
         batch.run(write_stars(tmp_path / "set", list("abcdefg")), out, jobs=1)
@@ -189,7 +190,6 @@ class TestPage:
         parquet.write_table(pyarrow.table({"problem": [0, 1], "seconds": [0.5, None]}), tmp_path / "t.parquet")
         assert "0 of 2 certified" in Reader(written(tmp_path, tmp_path / "t.parquet")).text
 
-    @pytest.mark.slow
     def test_many_failures_and_many_dots_stay_bounded(self, tmp_path):
         made(tmp_path, 20_000, name="many.csv")
         text = written(tmp_path, tmp_path / "many.csv", tmp_path / "many.csv")

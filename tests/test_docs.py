@@ -36,6 +36,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", CASES)
 def test_block_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

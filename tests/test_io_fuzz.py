@@ -16,6 +16,9 @@ from shared.damaged import VALID, damaged
 quick = settings(max_examples=150, deadline=None)
 
 
+pytestmark = pytest.mark.slow
+
+
 def held(mesh):
     """Everything in a mesh, comparable to the last bit."""
 
@@ -159,7 +162,6 @@ def test_both_off_readers_agree(data):
         assert outcome(io.read_off, path) == either
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", VALID)
 @quick
 @given(data=st.data())

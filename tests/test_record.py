@@ -19,7 +19,8 @@ def turned_ring():
     return V, F, fixed, target
 
 
-@pytest.mark.parametrize("k", [pytest.param(1, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow), 7])
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [1, 3, 7])
 def test_every_kth_map_is_kept(k):
     V, F, fixed, target = turned_ring()
     result = injective_map(V, F, fixed, target, record=k)

@@ -434,6 +434,7 @@ class TestLinearSolver:
         assert np.sum(signed_areas(problem.F, result.uv) <= 0) < result.history[2].flipped
         assert np.all(np.isfinite(result.uv))
 
+    @pytest.mark.slow
     def test_another_backend_takes_over(self, monkeypatch):
         problem = Problem(*turned_ring(180))
         best, *others = quasiharmonic.linsolve.available()
