@@ -168,3 +168,20 @@ def _weights(weights: ArrayLike, f: int) -> FloatArray:
     if bad.size:
         raise ValueError(f"the weight is negative or not finite at {named('triangle', 'triangles', bad)}")
     return array
+
+
+def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
+    """Weights of ``f`` triangles, each positive, as (f,) float64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When they are not; names the first triangles.
+    """
+    array = real_array("weights", weights)
+    if array.shape != (f,):
+        raise ValueError(f"weights must have shape ({f},), one for every triangle, not {array.shape}")
+    bad = np.flatnonzero(~(array > 0))
+    if bad.size:
+        raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
+    return array

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, map_array, named, not_negative, real_array, whole_number
+from quasiharmonic.arrays import FloatArray, map_array, named, not_negative, whole_number
 from quasiharmonic.curves.rails import Rails
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
 from quasiharmonic.energy.energies import (
     ARAP,
     MIPS,
@@ -160,10 +160,7 @@ def polish_map(
     if track is not None:
         start = track.uv
     if weights is not None:
-        weights = real_array("weights", weights)
-        bad = np.flatnonzero(~(weights > 0))
-        if bad.size:
-            raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
+        weights = positive_weights(weights, len(domain.F))
     # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never accepted.
     with np.errstate(all="ignore"):
         # Products of coordinates must not leave the numbers' range. A power of two costs no digits.

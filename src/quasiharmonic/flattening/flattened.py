@@ -20,14 +20,15 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
-    check_finite,
     check_range,
     index_array,
+    map_array,
     named,
     not_negative,
     real_array,
     whole_number,
 )
+from quasiharmonic.energy.deformation import positive_weights
 from quasiharmonic.energy.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify, flipped_triangles
@@ -155,7 +156,7 @@ def flatten(
     name = "symmetric-dirichlet" if of_distances else energy if isinstance(energy, str) else type(energy).__name__
     settings = Settings(density, name, tolerance, max_iterations, linear_solver, callback, record)
     V, F = real_array("V", V), index_array("F", F)
-    weights = None if weights is None else _positive(weights, len(F))
+    weights = None if weights is None else positive_weights(weights, len(F))
     given = None if start is None else _injective(start, V, F)
     if fixed is not None and target is not None:
         from quasiharmonic.flattening.pins import pinned
@@ -263,21 +264,8 @@ def _piece(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) 
         raise ValueError(f"the piece around vertex {vertices[0]}, its elements numbered anew: {error}") from None
 
 
-def _positive(weights: ArrayLike, f: int) -> FloatArray:
-    array = real_array("weights", weights)
-    if array.shape != (f,):
-        raise ValueError(f"weights must have shape ({f},), one for every triangle, not {array.shape}")
-    bad = np.flatnonzero(~(array > 0))
-    if bad.size:
-        raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
-    return array
-
-
 def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
-    array = real_array("start", start)
-    if array.shape != (len(V), 2):
-        raise ValueError(f"start must have shape ({len(V)}, 2), a position for every vertex, not {array.shape}")
-    check_finite("start", "vertex", "vertices", array)
+    array = map_array("start", start, len(V))
     flipped = flipped_triangles(F, array)
     if flipped.size:
         raise ValueError(

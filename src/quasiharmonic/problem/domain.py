@@ -120,11 +120,6 @@ class Domain:
                 "choose the reference 'equilateral' to map it all the same"
             )
 
-    @property
-    def analysed(self) -> bool:
-        """Whether a Laplacian of this mesh has been asked for."""
-        return bool(self._laplacians)
-
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
         """The Laplacian of this mesh and these fixed vertices, analysed once and kept (§6.2, eq. 12).
 
