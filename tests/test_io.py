@@ -170,11 +170,14 @@ def test_decimal_text_is_rounded_correctly(put, regular):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (SQUARE + "f 1 2 3 4\n", "face with 4 corners at line 5; triangulate first"),
-        (SQUARE + "f 1 2 3\n\nf 1 2 3 4 1\n", "face with 5 corners at line 7; triangulate first"),
+        (SQUARE + "f 1 2 3 2\n", "face with 4 corners that uses a vertex twice at line 5; remove the repetition"),
+        (
+            SQUARE + "f 1 2 3\n\nf 1 2 3 4 1\n",
+            "face with 5 corners that uses a vertex twice at line 7; remove the repetition",
+        ),
         (SQUARE + "f 1 2\n", "face with 2 corners at line 5"),
         (SQUARE + "f\n", "face with 0 corners at line 5"),
-        (SQUARE + "f" + " 1" * 200 + "\n", "more than 100 corners at line 5; triangulate first"),
+        (SQUARE + "f" + " 1" * 2000 + "\n", "more than 1000 corners at line 5; triangulate it first"),
         (SQUARE + "f 1 2 5\n", "index 5, but the file has 4 vertices at line 5"),
         (SQUARE + "f 1 2 3\nf 1 2 2147483648\n", "index 2147483648, but the file has 4 vertices at line 6"),
         (SQUARE + f"f 1 2 {10**30}\n", "'1" + "0" * 30 + "' is far too large at line 5"),
@@ -202,7 +205,7 @@ def test_decimal_text_is_rounded_correctly(put, regular):
         (SQUARE + "v 0 0 " + "x" * 9999 + "\n", f"'{'x' * 40}...' is not a finite number at line 5"),
         (SQUARE + "vt nan 0\nf 1 2 3\n", "'nan' is not a finite number at line 5"),
         (SQUARE + "vt 0.5\nf 1 2 3\n", "a texture coordinate with 1 number at line 5"),
-        (SQUARE + "f 1 2 3\nsurf 0 1 0 1 1 2 3\n", "'surf' statement at line 6; only triangles"),
+        (SQUARE + "f 1 2 3\nsurf 0 1 0 1 1 2 3\n", "'surf' statement at line 6; only polygons"),
         (SQUARE + "f 1 2 3\nl 1/1 2/2\n", "'l' element with relative or texture indices at line 6"),
         (SQUARE + "f 1 2 3\np -1\n", "'p' element with relative or texture indices at line 6"),
         (SQUARE, "holds no faces"),
@@ -226,8 +229,8 @@ def test_malformed_obj_is_named_with_its_line(put, text, message):
 
 
 def test_lines_are_counted_across_continuations(put):
-    with pytest.raises(MeshFileError, match="4 corners at line 9"):
-        io.read_mesh(put("# a\r\n\r\n" + SQUARE + "f 1 \\\n2 3\nf 1 \\\n2 \\\n3 4\n"))
+    with pytest.raises(MeshFileError, match="4 corners that uses a vertex twice at line 9"):
+        io.read_mesh(put("# a\r\n\r\n" + SQUARE + "f 1 \\\n2 3\nf 1 \\\n2 \\\n3 2\n"))
 
 
 def test_a_comment_that_ends_in_a_backslash_ends_there(put):
@@ -569,7 +572,10 @@ def test_off(put, text):
         (f"OFF\n{10**17} {10**17} 0\n0 0 0\n", f"ends after 1 of {10**17} vertices and 0 of {10**17} faces"),
         ("OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "a vertex with fewer than three coordinates at line 4"),
         ("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n", "'nan' is not a finite number at line 4"),
-        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2 0\n", "face with 4 corners at line 6; triangulate first"),
+        (
+            "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2 0\n",
+            "face with 4 corners that uses a vertex twice at line 6; remove the rep",
+        ),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "face of 3 corners with 2 of them at line 6"),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "index 3, but the file has 3 vertices at line 6"),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 -1\n", "index -1, but the file has 3 vertices at line 6"),

@@ -8,27 +8,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic import certify, distortion, flipped_triangles, io, repair
-from quasiharmonic.mesh.seams import fans, islands
+from quasiharmonic import distortion, flipped_triangles, io, repair
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.commands import run
 from shared.meshes import bend, boundary_of, lift, signed_areas
-
-
-def atlas(cells=12):
-    """A curved square, its map cut into three strips that lie apart and differ in shape.
-
-    Returns V, F, places, their indices by corner, and the strip of each triangle.
-    """
-    plane, F = grid(3 * cells, cells)
-    strip = np.minimum((plane[F, 0].mean(axis=1) * 3).astype(int), 2)
-    places, FT = [], np.empty_like(F)
-    for k in range(3):
-        used, local = np.unique(F[strip == k], return_inverse=True)
-        FT[strip == k] = local.reshape(-1, 3) + sum(map(len, places))
-        own = (plane[used] - [k / 3, 0]) * [3, 1]
-        places.append((own, bend(own), own @ [[0.0, 1.5], [-1.5, 0.0]])[k] + [3 * k, 0])
-    return lift(plane), F, np.concatenate(places), FT, strip
+from shared.seamed import islands, strips
 
 
 def damaged(uv, inner, count, scale, seed=0):
@@ -54,92 +38,6 @@ def exact_signs(uv, FT):
         )
         signs.append((area > 0) - (area < 0))
     return np.array(signs)
-
-
-class TestIslands:
-    def test_one_piece_keeps_its_numbers(self):
-        V, F = random_delaunay(60, seed=1)
-        (one,) = islands(F, V)
-        assert np.array_equal(one.F, F)
-        assert np.array_equal(one.triangles, np.arange(len(F)))
-        assert np.array_equal(one.vertices, np.arange(len(V)))
-        assert np.array_equal(one.uv, V)
-
-    def test_strips(self):
-        _, F, uv, FT, strip = atlas(4)
-        found = islands(F, uv, FT)
-        assert len(found) == 3
-        for k, island in enumerate(found):
-            assert np.array_equal(island.triangles, np.flatnonzero(strip == k))
-            assert np.array_equal(island.vertices[island.F], F[strip == k])
-            assert np.array_equal(island.uv[island.F], uv[FT[strip == k]])
-            assert np.all(np.diff(island.vertices) > 0)
-            assert certify(island.F, island.uv).bijective
-
-    def test_a_place_for_every_corner_is_no_seam(self):
-        V, F = random_delaunay(60, seed=1)
-        (one,) = islands(F, V[F.ravel()], np.arange(F.size).reshape(-1, 3))
-        assert np.array_equal(one.F, F)
-        assert np.array_equal(one.uv, V)
-
-    def test_equal_numbers_are_one_place_whatever_the_sign_of_zero(self):
-        F = np.array([[0, 1, 2], [1, 0, 3]])
-        uv = np.array([[0.0, 0.0], [1, 0], [0.5, 1], [-0.0, -0.0], [1, -0.0], [0.5, -1]])
-        assert len(islands(F, uv, [[0, 1, 2], [4, 3, 5]])) == 1
-        uv[4, 0] = np.nextafter(1, 2)
-        assert len(islands(F, uv, [[0, 1, 2], [4, 3, 5]])) == 2
-
-    def test_triangles_that_touch_at_a_vertex_are_apart(self):
-        F = np.array([[0, 1, 2], [0, 3, 4]])
-        found = islands(F, [[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
-        assert [island.vertices.tolist() for island in found] == [[0, 1, 2], [0, 3, 4]]
-
-    def test_a_seam_can_run_to_a_vertex_from_both_sides(self):
-        """An open ring of triangles around a vertex, and a pinched one."""
-        _, F = disk(1)
-        split, component = fans(F[:-1])
-        assert len(np.unique(split)) == 7
-        assert not component.any()
-        _, ring = disk(2)
-        pinched = ring[(ring != 0).all(axis=1)].copy()
-        pinched[pinched == 4] = 1
-        split, component = fans(pinched)
-        assert not component.any()
-        assert len(np.unique(split)) == len(np.unique(pinched)) + 1
-
-    def test_what_is_no_surface_comes_apart(self):
-        three_at_an_edge = [[0, 1, 2], [1, 0, 3], [0, 1, 4]]
-        assert len(islands(three_at_an_edge, np.random.default_rng(0).random((5, 2)))) == 3
-        wound_differently = [[0, 1, 2], [0, 1, 3]]
-        assert len(islands(wound_differently, np.random.default_rng(0).random((4, 2)))) == 2
-
-    def test_triangles_without_places(self):
-        V, F = grid(4, 4)
-        FT = F.copy()
-        FT[3] = -1
-        FT[13, 1] = -1
-        found = islands(F, V, FT)
-        assert np.array_equal(
-            np.sort(np.concatenate([island.triangles for island in found])), np.setdiff1d(np.arange(len(F)), [3, 13])
-        )
-        assert islands(F, V, np.full_like(F, -1)) == []
-
-    def test_bad_input_is_named(self):
-        V, F = grid(2, 2)
-        with pytest.raises(ValueError, match="FT must have as many rows as F, 8, not 7"):
-            islands(F, V, F[:-1])
-        with pytest.raises(ValueError, match="F refers to vertex 9, but there are only vertices 0 … 8"):
-            islands(np.where(np.arange(8)[:, None] == 2, 9, F), V)
-        with pytest.raises(ValueError, match="F refers to vertex -1, but"):
-            islands(F - 1, V, F)
-        with pytest.raises(ValueError, match="FT refers to row 9, but there are only rows 0 … 8"):
-            islands(F, V, np.where(np.arange(8)[:, None] == 2, 9, F))
-        with pytest.raises(ValueError, match="FT refers to row -2, but there are only rows 0 … 8"):
-            islands(F, V, F - 2)
-        with pytest.raises(ValueError, match="must hold integer"):
-            islands(F, V, F.astype(float))
-        with pytest.raises(ValueError, match="uv must have shape"):
-            islands(F, V[:, :1])
 
 
 class TestRepair:
@@ -183,7 +81,7 @@ class TestRepair:
         assert one.injective
 
     def test_nothing_to_repair(self):
-        V, F, uv, FT, _ = atlas(3)
+        V, F, uv, FT, _ = strips(3)
         result = repair(V, F, uv, FT=FT)
         assert np.array_equal(result.uv, uv)
         assert np.array_equal(result.FT, FT)
@@ -192,7 +90,7 @@ class TestRepair:
         assert result.summary() == "3 islands: 0 triangles inverted before, 0 now; 0 vertices moved"
 
     def test_islands_one_by_one(self):
-        V, F, uv, FT, strip = atlas()
+        V, F, uv, FT, strip = strips()
         start, pushed = damaged(uv, inner_rows(FT, strip == 1), 10, 0.1)
         result = repair(V, F, start, FT=FT)
         assert result.injective
@@ -206,7 +104,7 @@ class TestRepair:
         assert np.array_equal(result.islands[1].moved, np.unique(F[np.isin(FT, changed)]))
 
     def test_whole_islands_when_asked(self):
-        V, F, uv, FT, strip = atlas()
+        V, F, uv, FT, strip = strips()
         start, _ = damaged(uv, inner_rows(FT, strip == 1), 10, 0.1)
         result = repair(V, F, start, FT=FT, whole=True)
         assert result.injective
@@ -317,7 +215,7 @@ class TestRepair:
 class TestBeyondRepair:
     def test_the_boundary_alone_inverts_a_triangle(self):
         """The rest is repaired all the same, and the reason names elements by the mesh's numbers."""
-        V, F, uv, FT, strip = atlas()
+        V, F, uv, FT, strip = strips()
         # An ear of the last strip: a triangle with two boundary edges, folded inwards.
         ear = np.array([[0, 1, 2]]) + len(V)
         V = np.concatenate([V, V[:3] + 9, V[:1] + 8])
@@ -350,7 +248,7 @@ class TestBeyondRepair:
         assert "edge" in result.islands[0].reason or "triangle" in result.islands[0].reason
 
     def test_mirrored(self):
-        V, F, uv, FT, strip = atlas(4)
+        V, F, uv, FT, strip = strips(4)
         rows = np.unique(FT[strip == 2])
         uv[rows] *= [-1, 1]
         result = repair(V, F, uv, FT=FT)
@@ -388,7 +286,7 @@ class TestBeyondRepair:
 @pytest.fixture
 def uv_file(tmp_path):
     """An atlas with flips in two islands, as another program might have written it."""
-    V, F, uv, FT, strip = atlas(8)
+    V, F, uv, FT, strip = strips(8)
     start, _ = damaged(uv, inner_rows(FT, strip == 0), 6, 0.1)
     start, _ = damaged(start, inner_rows(FT, strip == 2), 3, 0.2, seed=1)
     lines = ["# an atlas", "mtllib some.mtl", "o curved"]
@@ -490,7 +388,7 @@ class TestCommand:
         [
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.obj", "no face has texture coordinates"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3\n", "out.obj", "at all three corners"),
-            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 3\n", "out.obj", "face with 4 corners"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 2\n", "out.obj", "uses a vertex twice"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "written as .obj"),
             (None, "out.obj", "there is no such file"),
         ],

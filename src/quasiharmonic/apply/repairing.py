@@ -5,7 +5,7 @@ A map comes apart into islands at its seams, and each is repaired on its own (`I
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,17 +16,13 @@ from quasiharmonic.apply.island_repair import IslandRepair
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
-    check_range,
     counted,
-    map_array,
     named,
-    triangle_rows,
-    vertex_array,
     whole_number,
 )
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Diagnosis
-from quasiharmonic.mesh.seams import Island, islands
+from quasiharmonic.mesh.seams import SeamedMesh
 from quasiharmonic.result import Step
 
 
@@ -168,7 +164,7 @@ def repair(
         The map: places. Interior vertices may be anywhere, even at NaN.
     FT : (f, 3) array of int, optional
         For a map with seams, the row of ``uv`` that each corner is at; a triangle with a corner at -1 has no place
-        and is left alone. By default ``F``. See `quasiharmonic.mesh.seams.islands` for what counts as a seam.
+        and is left alone. By default ``F``. See `quasiharmonic.mesh.seams.SeamedMesh` for what counts as a seam.
     whole : bool
         Map every island that has inverted triangles anew as a whole, and polish it.
     max_iterations : int
@@ -202,14 +198,11 @@ def repair(
     (2, True, [0])
     """
     whole_number("max_iterations", max_iterations, least=1)
-    surface, triangles = vertex_array(V), triangle_rows(F)
-    check_range("F", triangles, len(surface))
-    places = map_array("uv", uv, finite=False)
-    parts = islands(triangles, places, FT)
+    mesh = SeamedMesh(V, F, FT, uv)
     done = []
-    for island in parts:
+    for island in mesh.islands:
         one = IslandRepair(
-            surface, island, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback
+            mesh.V, island, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback
         )
         before = island.triangles[one.inverted]
         if before.size:
@@ -229,36 +222,6 @@ def repair(
                 ),
             )
         )
-    rows = triangles if FT is None else triangle_rows(FT, "FT")
-    places, rows = _written(places, rows, parts, [new for new, _ in done])
-    return Repaired(places, rows, tuple(report for _, report in done))
-
-
-def _written(
-    uv: FloatArray, FT: IntArray, parts: Sequence[Island], places: Sequence[FloatArray]
-) -> tuple[FloatArray, IntArray]:
-    """Bring the islands' places into the rows of the map, new rows where others use the same."""
-    # Each vertex of each island by a number of its own; the last one is for corners that have a place alone.
-    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    owner = np.full(FT.shape, start[-1])
-    for offset, part in zip(start, parts, strict=False):
-        owner[part.triangles] = part.F + offset
-    nowhere = np.full((1, 2), np.nan)
-    before = np.concatenate([*(part.uv for part in parts), nowhere])
-    now = np.concatenate([*places, nowhere])
-    given = FT >= 0
-    row, vertex = np.unique(np.stack([FT[given], owner[given]], axis=1), axis=0).T
-    moved = (now[vertex] != before[vertex]).any(axis=1) & np.isfinite(now[vertex]).all(axis=1)
-    # A row goes along where all that use it go to the same place.
-    first = np.searchsorted(row, row)
-    apart = (now[vertex] != now[vertex[first]]).any(axis=1)
-    together = ~np.isin(row, row[apart])
-    uv, FT = uv.copy(), FT.copy()
-    uv[row[moved & together]] = now[vertex[moved & together]]
-    row, vertex = row[moved & ~together], vertex[moved & ~together]
-    if row.size:
-        # Row and vertex in one number, ascending.
-        wanted, corner = row * len(now) + vertex, FT * len(now) + owner
-        at = np.minimum(np.searchsorted(wanted, corner), row.size - 1)
-        FT = np.where(wanted[at] == corner, len(uv) + at, FT)
-    return np.concatenate([uv, now[vertex]]), FT
+    mended = mesh.with_places([new for new, _ in done])
+    assert mended.uv is not None
+    return Repaired(mended.uv, mended.FT, tuple(report for _, report in done))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,13 +19,16 @@ from quasiharmonic.arrays import (
     vertex_array,
 )
 from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.mesh.polygons import Polygons, triangulated
+from quasiharmonic.mesh.seams import SeamedMesh
 
 
 @dataclass(frozen=True, eq=False)
 class MeshData:
-    """A triangle mesh as a file has it, with all that is needed to write the file again.
+    """A mesh as a file has it, with all that is needed to write the file again.
 
-    Only ``V`` and ``F`` are needed to make one. Vertices and faces keep the order of the file.
+    Only ``V`` and ``F`` are needed to make one. Vertices and faces keep the order of the file. Faces of more than three
+    corners are known by their triangles (see `polygon_mesh`), and written as they were.
 
     Attributes
     ----------
@@ -45,7 +49,9 @@ class MeshData:
     statements : bytes
         Lines that are neither vertex nor face (groups, materials, comments), each as it stood.
     statement_faces : (s,) int64
-        For each line of ``statements``, how many faces come before it; -1 before the first vertex.
+        For each line of ``statements``, how many of the file's faces come before it; -1 before the first vertex.
+    polygons : Polygons or None
+        The file's faces as rings of corners of the triangles; None where they are these.
     source : str
         The file it came from, for messages.
     """
@@ -59,6 +65,7 @@ class MeshData:
     FN: IntArray | None = None
     statements: bytes = b""
     statement_faces: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    polygons: Polygons | None = None
     source: str = "mesh"
 
     def __post_init__(self) -> None:
@@ -79,6 +86,16 @@ class MeshData:
         if self.FN is not None:
             object.__setattr__(self, "FN", self._corners("FN", self.FN, self.normals.count(b"\n")))
 
+    @property
+    def faces(self) -> int:
+        """How many faces the file has."""
+        return len(self.F) if self.polygons is None else len(self.polygons)
+
+    @property
+    def seamed(self) -> SeamedMesh:
+        """The mesh with the map that it carries, which may have seams; without places where it carries none."""
+        return SeamedMesh(self.V, self.F, self.FT, self.vt if self.FT is not None else None)
+
     def with_map(self, uv: ArrayLike) -> MeshData:
         """Return the same mesh with one texture coordinate for each vertex.
 
@@ -98,6 +115,20 @@ class MeshData:
         """
         return replace(self, vt=map_array("uv", uv, len(self.V)), FT=self.F)
 
+    def with_places(self, mapped: SeamedMesh) -> MeshData:
+        """Return the same mesh with the texture coordinates of a map that may have seams.
+
+        Parameters
+        ----------
+        mapped : SeamedMesh
+            With as many triangles, in the same order.
+
+        Returns
+        -------
+        MeshData
+        """
+        return replace(self, vt=mapped.uv, FT=mapped.FT)
+
     def as_plane(self, uv: ArrayLike) -> MeshData:
         """Return the map alone: a mesh in the plane z = 0 with the same faces.
 
@@ -116,7 +147,7 @@ class MeshData:
         ValueError
             When the shape is another, or a place is not finite.
         """
-        return MeshData(map_array("uv", uv, len(self.V)), self.F, source=self.source)
+        return MeshData(map_array("uv", uv, len(self.V)), self.F, polygons=self.polygons, source=self.source)
 
     def _corners(self, name: str, values: ArrayLike, rows: int) -> IntArray:
         """For every corner one of some rows, or -1; (f, 3) int64."""
@@ -125,6 +156,52 @@ class MeshData:
             raise ValueError(f"{name} must have as many rows as F, {len(self.F)}, not {len(table)}")
         check_range(name, table, rows, "row", "rows", least=-1)
         return table
+
+
+def polygon_mesh(
+    V: FloatArray,
+    corners: IntArray,
+    starts: IntArray,
+    *,
+    places: IntArray | None = None,
+    normal_lines: IntArray | None = None,
+    **rest: Any,
+) -> MeshData:
+    """Make a mesh of faces of any number of corners.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+        Positions.
+    corners : (c,) int64
+        The faces' vertices, ring after ring.
+    starts : (p + 1,) int64
+        Where each ring begins, and the end of the last one.
+    places, normal_lines : (c,) int64, optional
+        For every corner its row of ``vt`` and its line of ``normals``; -1 where it has none.
+    **rest
+        As `MeshData` has it.
+
+    Returns
+    -------
+    MeshData
+        Its ``polygons`` are None where all faces are triangles.
+
+    Raises
+    ------
+    ValueError
+        When a face has fewer than three corners, or a vertex twice, or refers to a vertex that there is not.
+    """
+    check_range("the faces", corners, len(V))
+    T, polygons = triangulated(V, corners, starts)
+    return MeshData(
+        V,
+        corners[T],
+        FT=None if places is None else places[T],
+        FN=None if normal_lines is None else normal_lines[T],
+        polygons=None if (polygons.sizes == 3).all() else polygons,
+        **rest,
+    )
 
 
 def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
-from quasiharmonic.io.meshdata import MeshData
+from quasiharmonic.io.meshdata import MeshData, polygon_mesh
 from quasiharmonic.io.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.textual import integer_table, number_table, read_text
 
@@ -20,17 +20,13 @@ _BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)
 # Lines that look like statements to that reader and want the careful one.
 _CAREFUL = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
 _NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _CAREFUL + rb")\s)", re.MULTILINE)
-_FORMS = {
-    b"f 1 1 1\n": (0,),
-    b"f 1/1 1/1 1/1\n": (0, 1),
-    b"f 1//1 1//1 1//1\n": (0, 2),
-    b"f 1/1/1 1/1/1 1/1/1\n": (0, 1, 2),
-}
+# What a corner of each form refers to: 0 vertices, 1 texture coordinates, 2 normals.
+_FORMS = {b"1": (0,), b"1/1": (0, 1), b"1//1": (0, 2), b"1/1/1": (0, 1, 2)}
 _CHUNK = 100_000
 
 
 def read_obj(path: str | os.PathLike[str]) -> MeshData:
-    """Read a triangle mesh from an OBJ file.
+    """Read a mesh of triangles and other polygons from an OBJ file.
 
     Vertices, faces and the statements between faces keep their order. Faces may refer to vertices
     in any form (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative). Every ``v`` and ``vt`` must be
@@ -53,10 +49,10 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
     Raises
     ------
     MeshFileError
-        With the line, for a face that is not a triangle, an index that refers to nothing, a number
-        that is none or not finite, free-form geometry, and ``l`` or ``p`` elements whose indices
-        are not plain (they could not be kept); for a file without vertices or faces, one that is
-        not text, or none at all.
+        With the line, for a face of fewer than three corners or a polygon with a vertex twice, an
+        index that refers to nothing, a number that is none or not finite, free-form geometry, and
+        ``l`` or ``p`` elements whose indices are not plain (they could not be kept); for a file
+        without vertices or faces, one that is not text, or none at all.
     """
     data = read_text(path)
     return read_regular(path, data) or read_obj_lines(path, data)
@@ -111,14 +107,16 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
         return None
     before = np.cumsum(kinds == _FACE)
     before[: int(np.argmax((kinds > _BLANK) & (kinds < _STATEMENT)))] = -1
-    return MeshData(
+    flat = {part: indices.ravel() for part, indices in parts.items()}
+    return polygon_mesh(
         np.ascontiguousarray(rows[:, :3]),
-        parts[0],
+        flat[0],
+        parts[0].shape[1] * np.arange(len(parts[0]) + 1),
+        places=flat.get(1),
+        normal_lines=flat.get(2),
         vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
-        FT=parts.get(1),
         extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
         normals=_lines_of(_NORMAL, data, ends, kinds),
-        FN=parts.get(2),
         statements=statements,
         statement_faces=before[kinds == _STATEMENT],
         source=os.fspath(path),
@@ -154,28 +152,30 @@ def _lines_of(kind: int, data: bytes, ends: NDArray[np.int64], kinds: NDArray[np
 
 
 def _regular_faces(block: bytes, counts: NDArray[np.int64]) -> dict[int, NDArray[np.int64]] | None:
-    """Return the indices of faces by what they refer to (0 vertices, 1 texture coordinates, 2 normals)."""
-    # No more of a line is taken apart than the longest regular face has, nine indices.
-    first = re.sub(rb"[0-9]+", b"1", block[: min(block.index(b"\n"), 200)])
-    form = b" ".join(first.split()) + b"\n"
-    if form not in _FORMS:
+    """Return the indices (p, k) of faces with k corners each, by what they refer to (see `_FORMS`)."""
+    # No more of a line is taken apart than the longest regular face has, twelve indices.
+    first = re.sub(rb"[0-9]+", b"1", block[: min(block.index(b"\n"), 250)]).split()
+    corners = first[1:]
+    if len(corners) not in (3, 4) or corners[0] not in _FORMS or len(set(corners)) > 1:
         return None
-    table = integer_table(block, form, int(counts[_FACE]))
+    table = integer_table(block, b" ".join(first) + b"\n", int(counts[_FACE]))
     if table is None:
         return None
-    referred = _FORMS[form]
+    referred = _FORMS[corners[0]]
     parts = {}
     for column, part in enumerate(referred):
         indices = table[:, column :: len(referred)] - 1
         if indices.min() < 0 or indices.max() >= counts[(_VERTEX, _TEXTURE, _NORMAL)[part]]:
             return None
         parts[part] = indices
-    return parts
+    ring = np.sort(parts[0], axis=1)
+    # Polygons with a vertex twice are refused with their line.
+    return None if len(corners) > 3 and (ring[:, 1:] == ring[:, :-1]).any() else parts
 
 
 def _pieces(mesh: MeshData) -> Iterator[bytes]:
     """Yield the contents of the file to write."""
-    at = np.concatenate((mesh.statement_faces, [len(mesh.F)]))
+    at = np.concatenate((mesh.statement_faces, [mesh.faces]))
     statements = mesh.statements.split(b"\n")
     head = int(np.count_nonzero(at < 0))
     yield b"".join(line + b"\n" for line in statements[:head])
@@ -189,11 +189,13 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
         yield from _number_lines("vt", mesh.vt)
     yield mesh.normals
     corners = _corner_texts(mesh)
+    starts = 3 * np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.starts
     begin = 0
     for end, line in zip(at[head:].tolist(), [*statements[head:-1], b""], strict=True):
-        for start in range(begin, end, _CHUNK):
-            stop = min(start + _CHUNK, end)
-            yield ("f %s %s %s\n" * (stop - start) % tuple(corners[3 * start : 3 * stop])).encode()
+        for first in range(begin, end, _CHUNK):
+            bounds = starts[first : min(first + _CHUNK, end) + 1]
+            forms = ["f" + " %s" * size + "\n" for size in np.diff(bounds).tolist()]
+            yield ("".join(forms) % tuple(corners[bounds[0] : bounds[-1]])).encode()
         begin = end
         yield line + b"\n" if line else b""
 
@@ -208,13 +210,16 @@ def _number_lines(keyword: str, rows: NDArray[np.float64]) -> Iterator[bytes]:
 
 def _corner_texts(mesh: MeshData) -> list[str]:
     """Text of every corner of every face, one after another."""
-    parts = [mesh.F, mesh.FT, mesh.FN]
-    if mesh.FN is None and (mesh.FT is None or np.array_equal(mesh.F, mesh.FT)):
+    ring = slice(None) if mesh.polygons is None else mesh.polygons.corners
+    parts = [None if part is None else part.ravel()[ring] for part in (mesh.F, mesh.FT, mesh.FN)]
+    F, FT, FN = parts
+    assert F is not None
+    if FN is None and (FT is None or np.array_equal(F, FT)):
         # Each vertex always looks the same: made once and looked up.
-        texts = [f"{i}" if mesh.FT is None else f"{i}/{i}" for i in range(1, len(mesh.V) + 1)]
-        return list(map(texts.__getitem__, mesh.F.ravel().tolist()))
-    absent = [-1] * mesh.F.size
-    columns = [absent if part is None else part.ravel().tolist() for part in parts]
+        texts = [f"{i}" if FT is None else f"{i}/{i}" for i in range(1, len(mesh.V) + 1)]
+        return list(map(texts.__getitem__, F.tolist()))
+    absent = [-1] * F.size
+    columns = [absent if part is None else part.tolist() for part in parts]
     texts = []
     for a, b, c in zip(*columns, strict=True):
         place = str(b + 1) if b >= 0 else ""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.meshdata import MeshData
+from quasiharmonic.io.meshdata import MeshData, polygon_mesh
 from quasiharmonic.io.textual import integer, number, shown
 
 # Statements whose geometry would be lost, and elements that point to vertices in ways not kept.
@@ -20,7 +20,8 @@ REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"
 _PLAIN_ELEMENT = re.compile(rb"[lp][ \t0-9]*")
 # Weight and colour with opacity: what can stand behind the coordinates of a vertex.
 _MOST_EXTRA = 5
-_TRIANGULATE = "triangulate first"
+# A polygon of more is no polygon but a fault.
+_MOST_CORNERS = 1000
 
 
 def read_obj_lines(path: str | os.PathLike[str], data: bytes) -> MeshData:
@@ -40,6 +41,7 @@ class _Reader:
         self.normal_count = 0
         self.corners = array("q")
         self.face_line = array("q")
+        self.starts = array("q", [0])
         self.statements = bytearray()
         self.statement_faces = array("q")
         self.begun = False
@@ -79,49 +81,55 @@ class _Reader:
 
     def face(self, line: int, text: bytes) -> None:
         # However long the line, no more of it is taken apart than an error message needs.
-        corners = _uncommented(text).split(None, 101)[1:]
-        if len(corners) != 3:
-            count = _count(corners, "corner") if len(corners) <= 100 else "more than 100 corners"
-            remedy = _TRIANGULATE if len(corners) > 3 else "a triangle has 3"
-            raise _FaultError(f"face with {count}", remedy)
+        corners = _uncommented(text).split(None, _MOST_CORNERS + 1)[1:]
+        if len(corners) < 3:
+            raise _FaultError(f"face with {_count(corners, 'corner')}", "a triangle has 3")
+        if len(corners) > _MOST_CORNERS:
+            raise _FaultError(f"face with more than {_MOST_CORNERS} corners", "triangulate it first")
         counts = (len(self.width), len(self.vt) // 2, self.normal_count)
+        begin = len(self.corners)
         for corner in corners:
             self.corners.extend(_corner(corner, counts))
+        if len(corners) > 3 and len(set(self.corners[begin::3])) < len(corners):
+            raise _FaultError(f"face with {len(corners)} corners that uses a vertex twice", "remove the repetition")
         self.face_line.append(line)
+        self.starts.append(len(self.corners) // 3)
 
     def statement(self, keyword: bytes, text: bytes) -> None:
         if keyword in REFUSED:
-            raise _FaultError(f"{keyword.decode()!r} statement", "only triangles can be read; convert it first")
+            raise _FaultError(f"{keyword.decode()!r} statement", "only polygons can be read; convert it first")
         if keyword in (b"l", b"p") and not _PLAIN_ELEMENT.fullmatch(text.rstrip()):
             raise _FaultError(f"{keyword.decode()!r} element with relative or texture indices", "remove it")
         self.statements += text + b"\n"
         self.statement_faces.append(len(self.face_line) if self.begun else -1)
 
     def result(self) -> MeshData:
-        vertices, faces = len(self.width), len(self.face_line)
-        if not vertices:
+        count, faces = len(self.width), len(self.face_line)
+        if not count:
             raise MeshFileError(self.path, "holds no vertices", remedy="is it an OBJ file?")
         if not faces:
-            raise MeshFileError(self.path, "holds no faces", remedy="a triangle mesh is needed")
-        corners = np.array(self.corners, dtype=np.int64).reshape(faces, 3, 3)
-        counts = (vertices, len(self.vt) // 2, self.normal_count)
+            raise MeshFileError(self.path, "holds no faces", remedy="a surface is needed")
+        corners = np.array(self.corners, dtype=np.int64).reshape(-1, 3)
+        starts = np.array(self.starts, dtype=np.int64)
+        counts = (count, len(self.vt) // 2, self.normal_count)
         names = ("vertices", "texture coordinates", "normals")
         for part, (count, what) in enumerate(zip(counts, names, strict=True)):
-            beyond = np.argwhere(corners[:, :, part] >= count)
+            beyond = np.flatnonzero(corners[:, part] >= count)
             if beyond.size:
-                face, corner = beyond[0].tolist()
-                fault = f"index {corners[face, corner, part] + 1}, but the file has {count} {what}"
+                face = int(np.searchsorted(starts, beyond[0], side="right")) - 1
+                fault = f"index {corners[beyond[0], part] + 1}, but the file has {count} {what}"
                 raise MeshFileError(self.path, fault, self.face_line[face])
-        F, FT, FN = (np.ascontiguousarray(corners[:, :, part]) for part in range(3))
+        vertices, places, normals = (np.ascontiguousarray(corners[:, part]) for part in range(3))
         V, extra = self.vertices()
-        return MeshData(
+        return polygon_mesh(
             V,
-            F,
+            vertices,
+            starts,
+            places=places if (places >= 0).any() else None,
+            normal_lines=normals if (normals >= 0).any() else None,
             vt=np.array(self.vt, dtype=np.float64).reshape(-1, 2) if self.vt else None,
-            FT=FT if (FT >= 0).any() else None,
             extra=extra,
             normals=bytes(self.normals),
-            FN=FN if (FN >= 0).any() else None,
             statements=bytes(self.statements),
             statement_faces=np.array(self.statement_faces, dtype=np.int64),
             source=os.fspath(self.path),

@@ -1,4 +1,4 @@
-"""OFF, the Object File Format of Geomview, as far as triangle meshes go."""
+"""OFF, the Object File Format of Geomview, as far as surfaces go."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ import numpy as np
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.meshdata import MeshData
+from quasiharmonic.io.meshdata import MeshData, polygon_mesh
 from quasiharmonic.io.textual import integer, integer_table, number, number_table, read_text, shown
 
 # Texture coordinates, colours and normals stand behind the coordinates, so they can be passed over.
 _HEADER = re.compile(rb"(?:ST)?C?N?OFF")
-_TRIANGULATE = "triangulate first"
+# A polygon of more is no polygon but a fault.
+_MOST_CORNERS = 1000
 
 
 def read_off(path: str | os.PathLike[str]) -> MeshData:
-    """Read a triangle mesh from an OFF file.
+    """Read a mesh of triangles and other polygons from an OFF file.
 
     The counts may share the line of the header. Comments, and what stands behind the coordinates of
     a vertex or the corners of a face (colours, normals), are ignored.
@@ -40,9 +41,9 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
     Raises
     ------
     MeshFileError
-        With the line, for a face that is not a triangle, an index that refers to nothing, a number
-        that is none or not finite, counts that the file does not keep; for another kind of OFF
-        (binary, four-dimensional), a file that is not text, or none at all.
+        With the line, for a face of fewer than three corners or a polygon with a vertex twice, an
+        index that refers to nothing, a number that is none or not finite, counts that the file does
+        not keep; for another kind of OFF (binary, four-dimensional), a file that is not text, or none at all.
     """
     data = read_text(path)
     lines = _content(data)
@@ -61,13 +62,13 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
         raise MeshFileError(path, f"no counts of vertices and faces: {error}", line) from None
     if vertices < 1 or faces < 1:
         what = f"holds {vertices} vertices and {faces} faces"
-        raise MeshFileError(path, what, line, "a triangle mesh is needed")
+        raise MeshFileError(path, what, line, "a surface is needed")
     arrays = read_regular(data, line, vertices, faces) or _read_lines(path, lines, vertices, faces)
-    return MeshData(*arrays, source=os.fspath(path))
+    return polygon_mesh(*arrays, source=os.fspath(path))
 
 
 def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
-    """Write a triangle mesh as an OFF file, whole or not at all.
+    """Write a mesh as an OFF file, whole or not at all.
 
     Numbers are written such that reading them gives the same double.
 
@@ -83,14 +84,18 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
     OutputError
         When it cannot be written; the old file is then untouched.
     """
-    head = f"OFF\n{len(mesh.V)} {len(mesh.F)} 0\n"
+    head = f"OFF\n{len(mesh.V)} {mesh.faces} 0\n"
     points = "%r %r %r\n" * len(mesh.V) % tuple(mesh.V.ravel().tolist())
-    triangles = "3 %d %d %d\n" * len(mesh.F) % tuple(mesh.F.ravel().tolist())
-    write_whole(path, (head + points + triangles).encode())
+    if mesh.polygons is None:
+        faces = "3 %d %d %d\n" * len(mesh.F) % tuple(mesh.F.ravel().tolist())
+    else:
+        forms = [f"{size}" + " %d" * size + "\n" for size in mesh.polygons.sizes.tolist()]
+        faces = "".join(forms) % tuple(mesh.F.ravel()[mesh.polygons.corners].tolist())
+    write_whole(path, (head + points + faces).encode())
 
 
-def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray] | None:
-    """Read what follows ``line`` when it is all of one form; None when it is not."""
+def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray, IntArray] | None:
+    """Read triangles that follow ``line`` when it is all of one form; None when it is not."""
     if data.count(b"\n") != line + vertices + faces:
         return None
     ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
@@ -99,15 +104,15 @@ def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[Flo
     F = integer_table(data[middle:], b"1 1 1 1\n", faces)
     if V is None or V.shape[1] < 3 or F is None or np.any(F[:, 0] != 3) or F.max() >= vertices:
         return None
-    return np.ascontiguousarray(V[:, :3]), np.ascontiguousarray(F[:, 1:])
+    return np.ascontiguousarray(V[:, :3]), F[:, 1:].ravel(), 3 * np.arange(faces + 1)
 
 
 def _read_lines(
     path: str | os.PathLike[str], lines: Iterator[tuple[int, bytes]], vertices: int, faces: int
-) -> tuple[FloatArray, IntArray]:
-    """Read vertices and faces line by line."""
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Read vertices and faces line by line: positions, corners ring after ring, where rings begin."""
     # Never sized by the counts, which may say anything.
-    V, F = array("d"), array("q")
+    V, corners, starts = array("d"), array("q"), array("q", [0])
     line = 0
     for line, text in lines:
         try:
@@ -117,27 +122,40 @@ def _read_lines(
                     raise MeshFileError(path, "a vertex with fewer than three coordinates", line)
                 V.extend([number(token) for token in tokens])
                 continue
-            if len(F) == 3 * faces:
+            if len(starts) == faces + 1:
                 raise MeshFileError(path, f"more follows the {faces} faces", line, "correct the counts")
-            count, *corners = text.split(None, 4)[:4]
-            if integer(count) != 3:
-                raise MeshFileError(path, f"face with {integer(count)} corners", line, _TRIANGULATE)
-            if len(corners) < 3:
-                raise MeshFileError(path, f"face of 3 corners with {len(corners)} of them", line)
-            for corner in corners:
-                index = integer(corner)
-                if not 0 <= index < vertices:
-                    fault = f"index {index}, but the file has {vertices} vertices"
-                    raise MeshFileError(path, fault, line, "OFF counts from 0")
-                F.append(index)
+            corners.extend(_ring(path, line, text, vertices))
+            starts.append(len(corners))
         except MeshFileError:
             raise
         except ValueError as error:
             raise MeshFileError(path, str(error), line) from None
-    if len(F) < 3 * faces:
-        have = f"{len(V) // 3} of {vertices} vertices and {len(F) // 3} of {faces} faces"
+    if len(starts) <= faces:
+        have = f"{len(V) // 3} of {vertices} vertices and {len(starts) - 1} of {faces} faces"
         raise MeshFileError(path, f"ends after {have}", remedy="it was cut off, or its counts are wrong")
-    return np.array(V, dtype=np.float64).reshape(-1, 3), np.array(F, dtype=np.int64).reshape(-1, 3)
+    return (
+        np.array(V, dtype=np.float64).reshape(-1, 3),
+        np.array(corners, dtype=np.int64),
+        np.array(starts, dtype=np.int64),
+    )
+
+
+def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -> list[int]:
+    """The corners of the face on a line."""
+    count, *rest = text.split(None, _MOST_CORNERS + 1)
+    size = integer(count)
+    if not 3 <= size <= _MOST_CORNERS:
+        remedy = "a triangle has 3" if size < 3 else "triangulate it first"
+        raise MeshFileError(path, f"face with {size} corners", line, remedy)
+    if len(rest) < size:
+        raise MeshFileError(path, f"face of {size} corners with {len(rest)} of them", line)
+    ring = [integer(corner) for corner in rest[:size]]
+    beyond = next((index for index in ring if not 0 <= index < vertices), None)
+    if beyond is not None:
+        raise MeshFileError(path, f"index {beyond}, but the file has {vertices} vertices", line, "OFF counts from 0")
+    if size > 3 and len(set(ring)) < size:
+        raise MeshFileError(path, f"face with {size} corners that uses a vertex twice", line, "remove the repetition")
+    return ring
 
 
 def _content(data: bytes) -> Iterator[tuple[int, bytes]]:

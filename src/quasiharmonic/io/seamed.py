@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.io.meshdata import MeshData, check_mapped, map_of, vertex_places
-from quasiharmonic.mesh.seams import islands
+from quasiharmonic.io.meshdata import MeshData, check_mapped, map_of
 
 
 def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -32,22 +31,11 @@ def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
         When the mesh has no map, or has it on some faces only.
     """
     check_mapped(mesh)
-    if mesh.vt is None or mesh.FT is None or not vertex_places(mesh)[1].any():
+    if mesh.FT is None:
         return mesh.V, mesh.F, map_of(mesh)
-    parts = islands(mesh.F, mesh.vt, mesh.FT)
-    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    own = np.empty_like(mesh.F)
-    for offset, part in zip(start, parts, strict=False):
-        own[part.triangles] = part.F + offset
-    vertices = np.concatenate([part.vertices for part in parts])
-    further = np.ones(len(vertices), dtype=np.bool_)
-    further[np.unique(vertices, return_index=True)[1]] = False
-    number = vertices.copy()
-    number[further] = len(mesh.V) + np.arange(np.count_nonzero(further))
-    origin = np.concatenate([np.arange(len(mesh.V)), vertices[further]])
-    uv = np.full((len(origin), 2), np.nan)
-    uv[number] = np.concatenate([part.uv for part in parts])
-    return mesh.V[origin], number[own], uv
+    opened = mesh.seamed.opened()
+    assert opened.uv is not None
+    return opened.V, opened.F, opened.uv
 
 
 def without_idle(V: FloatArray, F: IntArray, uv: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:

@@ -8,12 +8,25 @@ joined in that way; an island is a component, and always a surface.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_range, map_array, triangle_rows
+from quasiharmonic.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    map_array,
+    named,
+    named_edges,
+    triangle_rows,
+    vertex_array,
+)
 from quasiharmonic.mesh.topology import edge_keys
 
 
@@ -40,55 +53,249 @@ class Island:
     uv: FloatArray
 
 
-def islands(F: ArrayLike, uv: ArrayLike, FT: ArrayLike | None = None) -> list[Island]:
-    """Take a map apart at its seams.
+class SeamedMesh:
+    """A surface and a map of it that may have seams.
 
     Parameters
     ----------
+    V : (n, 2) or (n, 3) array
+        Positions.
     F : (f, 3) array of int
-        Triangles of the mesh.
-    uv : (m, 2) array
-        Places.
+        Triangles.
     FT : (f, 3) array of int, optional
-        For every corner the row of ``uv`` it is at; a triangle with a corner at -1 has no place. By default ``F``:
-        a map without seams.
-
-    Returns
-    -------
-    list of Island
-        By their first triangle. Edges at which three or more triangles meet, or two that are wound differently,
-        are seams.
+        For every corner the row of ``uv`` it is at; a triangle with a corner at -1 has no place. By default ``F``.
+    uv : (m, 2) array, optional
+        Places in the plane, NaN where there is none; left out of a surface that is cut but not yet mapped.
 
     Raises
     ------
     ValueError
-        When the shapes do not fit, or there is no such row of ``uv``; the message names the rows.
+        When the shapes do not fit, or there is no such vertex or row; the message names them.
+
+    Attributes
+    ----------
+    V, F, FT, uv : arrays
+        As given, as float64 and int64; ``uv`` None if left out. Not writeable.
+
+    Examples
+    --------
+    A sheet cut along the line through its middle:
+
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> cut = SeamedMesh(V, F).cut([[1, 4], [4, 7]])
+    >>> len(cut.islands), len(cut.V), cut.seams.tolist()
+    (2, 9, [[1, 4], [4, 7]])
     """
-    F, places, FT = _checked(F, uv, FT)
-    mapped = np.flatnonzero((FT >= 0).all(axis=1))
-    # Equal numbers are one place, those that are none included.
-    pairs = np.ascontiguousarray(places + 0.0).view(np.complex128).ravel()
-    place = np.unique(pairs, return_inverse=True)[1].ravel()
-    corners = F[mapped] * len(places) + place[FT[mapped]]
-    welded = np.unique(corners, return_inverse=True)[1].reshape(-1, 3)
-    split, island = fans(welded)
-    by_island = np.argsort(island, kind="stable")
-    found = []
-    for rows in np.split(by_island, np.flatnonzero(np.diff(island[by_island])) + 1) if mapped.size else []:
-        triangles = mapped[rows]
-        of_mesh, at = F[triangles].ravel(), FT[triangles].ravel()
-        own, first = renumbered(split[rows], F[triangles])
-        found.append(Island(own, triangles, of_mesh[first], places[at[first]]))
-    return found
+
+    def __init__(self, V: ArrayLike, F: ArrayLike, FT: ArrayLike | None = None, uv: ArrayLike | None = None) -> None:
+        self.V, self.F = vertex_array(V), triangle_rows(F)
+        check_range("F", self.F, len(self.V))
+        self.uv = None if uv is None else map_array("uv", uv, finite=False)
+        self.FT = self.F if FT is None else triangle_rows(FT, "FT")
+        if len(self.FT) != len(self.F):
+            raise ValueError(f"FT must have as many rows as F, {len(self.F)}, not {len(self.FT)}")
+        rows = int(self.FT.max(initial=-1)) + 1 if self.uv is None else len(self.uv)
+        check_range("FT", self.FT, rows, "row", "rows", least=-1)
+        for array in (self.V, self.F, self.FT, self.uv):
+            if array is not None:
+                array.flags.writeable = False
+
+    @cached_property
+    def _welded(self) -> IntArray:
+        """For every corner of a triangle that has a place, vertex and place in one number; (g, 3) int64."""
+        if self.uv is None:
+            place: IntArray = np.arange(int(self.FT.max(initial=-1)) + 1)
+        else:
+            # Equal numbers are one place, those that are none included.
+            pairs = np.ascontiguousarray(self.uv + 0.0).view(np.complex128).ravel()
+            place = np.unique(pairs, return_inverse=True)[1].ravel()
+        corners = self.F[self.mapped] * max(len(place), 1) + place[self.FT[self.mapped]]
+        return np.unique(corners, return_inverse=True)[1].reshape(-1, 3)
+
+    @cached_property
+    def mapped(self) -> IntArray:
+        """Triangles that have a place, ascending; (g,) int64."""
+        return np.flatnonzero((self.FT >= 0).all(axis=1))
+
+    @property
+    def seamless(self) -> bool:
+        """Whether every triangle and no vertex has more than one place."""
+        return len(self.mapped) == len(self.F) and len(np.unique(self._welded)) == len(np.unique(self.F))
+
+    @cached_property
+    def islands(self) -> tuple[Island, ...]:
+        """The parts into which the seams cut the surface, by their first triangle.
+
+        Edges at which three or more triangles meet, or two that are wound differently, are seams.
+        """
+        places = np.full((int(self.FT.max(initial=-1)) + 1, 2), np.nan) if self.uv is None else self.uv
+        split, island = fans(self._welded)
+        by_island = np.argsort(island, kind="stable")
+        found = []
+        for rows in np.split(by_island, np.flatnonzero(np.diff(island[by_island])) + 1) if by_island.size else []:
+            triangles = self.mapped[rows]
+            of_mesh, at = self.F[triangles].ravel(), self.FT[triangles].ravel()
+            own, first = renumbered(split[rows], self.F[triangles])
+            found.append(Island(own, triangles, of_mesh[first], places[at[first]]))
+        return tuple(found)
+
+    @property
+    def seams(self) -> IntArray:
+        """Edges (k, 2) along which triangles meet on the surface, and not in the plane; by vertices, ascending."""
+        owner = self._owner()[1]
+        tail, head = self.F, self.F[:, (1, 2, 0)]
+        ends = np.sort(np.stack([tail, head], axis=2).reshape(-1, 2), axis=1)
+        here = np.stack([owner, owner[:, (1, 2, 0)]], axis=2).reshape(-1, 2)
+        here = np.where(tail.ravel()[:, None] <= head.ravel()[:, None], here, here[:, ::-1])
+        # An edge whose ends are at other places for one of its triangles than for another.
+        edges, which, sides = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+        rows = np.unique(np.column_stack([which.ravel(), here]), axis=0)
+        return edges[(np.bincount(rows[:, 0], minlength=len(edges)) > 1) & (sides > 1)]
+
+    def opened(self) -> SeamedMesh:
+        """Return the mesh with a vertex for each of a vertex's places: the same map without seams.
+
+        Returns
+        -------
+        SeamedMesh
+            Its vertices are this one's own, then a further one for each further place of one; its triangles these, in
+            their order. Where there are no seams, nothing is changed. Places of vertices that no triangle uses are NaN.
+
+        Raises
+        ------
+        ValueError
+            When a triangle has no place; names the first ones.
+        """
+        bare = np.flatnonzero((self.FT < 0).any(axis=1))
+        if bare.size:
+            raise ValueError(f"{named('triangle', 'triangles', bare)} without a place, which others have")
+        if self.seamless:
+            FT, origin = self.F, np.arange(len(self.V))
+        else:
+            FT, origin = self._numbered()
+        uv = None
+        if self.uv is not None:
+            uv = np.full((len(origin), 2), np.nan)
+            uv[FT] = self.uv[self.FT]
+        return SeamedMesh(self.V[origin], FT, FT, uv)
+
+    def cut(self, edges: ArrayLike) -> SeamedMesh:
+        """Cut along further edges; what comes out has no places yet.
+
+        Parameters
+        ----------
+        edges : (k, 2) array of int
+            Vertices at both ends of each.
+
+        Returns
+        -------
+        SeamedMesh
+            Of the same ``V`` and ``F``, without ``uv``. Its rows are numbered as the vertices are, then one for each
+            further place of one.
+
+        Raises
+        ------
+        ValueError
+            When one is no edge of the mesh; names the first ones.
+        """
+        pairs = index_array("edges", edges).reshape(-1, 2)
+        check_range("edges", pairs, len(self.V))
+        sides = edge_keys(self.F, self.F[:, (1, 2, 0)], len(self.V))
+        wanted = edge_keys(pairs[:, 0], pairs[:, 1], len(self.V))
+        absent = ~np.isin(wanted, sides)
+        if absent.any():
+            raise ValueError(f"{named_edges(pairs[absent])}: the mesh has no such edge to cut")
+        FT, _ = self._numbered(np.isin(sides, wanted))
+        return SeamedMesh(self.V, self.F, FT)
+
+    def with_places(self, places: Sequence[FloatArray]) -> SeamedMesh:
+        """Return the mesh with its islands in other places.
+
+        Parameters
+        ----------
+        places : sequence of (m_i, 2) float64
+            For each of `islands`, where its vertices are.
+
+        Returns
+        -------
+        SeamedMesh
+            Rows of ``uv`` stay what they are, unless a vertex moved from a row that others use and do not leave: then
+            it has a new one at the end. Where there was no ``uv``, there is a row for each place.
+        """
+        if self.uv is not None:
+            return self._moved(self.uv, places)
+        FT = np.full_like(self.FT, -1)
+        rows = np.unique(self.FT[self.mapped])
+        FT[self.mapped] = np.searchsorted(rows, self.FT[self.mapped])
+        uv = np.full((len(rows), 2), np.nan)
+        for island, now in zip(self.islands, places, strict=True):
+            uv[FT[island.triangles]] = now[island.F]
+        return SeamedMesh(self.V, self.F, FT, uv)
+
+    def _owner(self) -> tuple[int, IntArray]:
+        """A number for each vertex of each island, how many there are, and for every corner which it is.
+
+        Corners of triangles without a place have the number beyond the last.
+        """
+        start = np.cumsum([0, *(len(island.vertices) for island in self.islands)])
+        owner = np.full(self.F.shape, start[-1])
+        for offset, island in zip(start, self.islands, strict=False):
+            owner[island.triangles] = island.F + offset
+        return int(start[-1]), owner
+
+    def _numbered(self, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
+        """A vertex for each fan of triangles around one: the old numbers for the first, further ones at the end.
+
+        Returns
+        -------
+        FT : (f, 3) int64
+        origin : (n + c,) int64
+            The old vertex that each is.
+        """
+        split = np.full(self.F.shape, -1)
+        split[self.mapped] = fans(self._welded, None if cut is None else cut[self.mapped])[0]
+        corners = np.unique(split[self.mapped].ravel(), return_index=True)[1]
+        vertex = self.F[self.mapped].ravel()[corners]
+        further = np.ones(len(vertex), dtype=np.bool_)
+        further[np.unique(vertex, return_index=True)[1]] = False
+        number = vertex.copy()
+        number[further] = len(self.V) + np.arange(np.count_nonzero(further))
+        return np.where(split >= 0, number[split], -1), np.concatenate([np.arange(len(self.V)), vertex[further]])
+
+    def _moved(self, uv: FloatArray, places: Sequence[FloatArray]) -> SeamedMesh:
+        """Bring the islands' places into the rows of the map, new rows where others use the same."""
+        _, owner = self._owner()
+        nowhere = np.full((1, 2), np.nan)
+        before = np.concatenate([*(island.uv for island in self.islands), nowhere])
+        now = np.concatenate([*places, nowhere])
+        given = self.FT >= 0
+        row, vertex = np.unique(np.stack([self.FT[given], owner[given]], axis=1), axis=0).T
+        moved = (now[vertex] != before[vertex]).any(axis=1) & np.isfinite(now[vertex]).all(axis=1)
+        # A row goes along where all that use it go to the same place.
+        first = np.searchsorted(row, row)
+        apart = (now[vertex] != now[vertex[first]]).any(axis=1)
+        together = ~np.isin(row, row[apart])
+        uv, FT = uv.copy(), self.FT
+        uv[row[moved & together]] = now[vertex[moved & together]]
+        row, vertex = row[moved & ~together], vertex[moved & ~together]
+        if row.size:
+            # Row and vertex in one number, ascending.
+            wanted, corner = row * len(now) + vertex, FT * len(now) + owner
+            at = np.minimum(np.searchsorted(wanted, corner), row.size - 1)
+            FT = np.where(wanted[at] == corner, len(uv) + at, FT)
+        return SeamedMesh(self.V, self.F, FT, np.concatenate([uv, now[vertex]]))
 
 
-def fans(F: IntArray) -> tuple[IntArray, IntArray]:
+def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
     """Split vertices at which triangles touch without being joined by edges.
 
     Parameters
     ----------
     F : (f, 3) int64
         Triangles, of any kind.
+    cut : (f, 3) bool, optional
+        At which sides, from each corner to the next, triangles are not joined whatever they share.
 
     Returns
     -------
@@ -110,6 +317,8 @@ def fans(F: IntArray) -> tuple[IntArray, IntArray]:
     first = first[np.diff(first, append=key.size) == 2]
     one, other = order[first], order[first + 1]
     opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
+    if cut is not None:
+        opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
     one, other = one[opposed], other[opposed]
     # The half-edge of a corner begins there: a joined pair identifies begin with end and end with begin.
     joined = np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other])
@@ -148,17 +357,3 @@ def _by_appearance(label: NDArray[np.integer]) -> IntArray:
     rank = np.empty(first.size, dtype=np.int64)
     rank[np.argsort(first)] = np.arange(first.size)
     return rank[inverse.ravel()]
-
-
-def _checked(F: ArrayLike, uv: ArrayLike, FT: ArrayLike | None) -> tuple[IntArray, FloatArray, IntArray]:
-    triangles, places = triangle_rows(F), map_array("uv", uv, finite=False)
-    if FT is None:
-        check_range("F", triangles, len(places))
-        return triangles, places, triangles
-    # How many vertices there are is not known here, only that none is below 0.
-    check_range("F", triangles, int(triangles.max(initial=-1)) + 1)
-    rows = triangle_rows(FT, "FT")
-    if len(rows) != len(triangles):
-        raise ValueError(f"FT must have as many rows as F, {len(triangles)}, not {len(rows)}")
-    check_range("FT", rows, len(places), "row", "rows", least=-1)
-    return triangles, places, rows
