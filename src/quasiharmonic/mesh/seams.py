@@ -43,13 +43,16 @@ class Island:
     vertices : (m,) int64
         Which vertex of the mesh each of its own is, ascending. A seam may run to both sides of a vertex, which is
         then there repeatedly.
+    V : (m, 2) or (m, 3) float64
+        Where its vertices are on the surface.
     uv : (m, 2) float64
-        Where its vertices are.
+        Where they are in the plane; NaN where that is not known.
     """
 
     F: IntArray
     triangles: IntArray
     vertices: IntArray
+    V: FloatArray
     uv: FloatArray
 
 
@@ -137,7 +140,7 @@ class SeamedMesh:
             triangles = self.mapped[rows]
             of_mesh, at = self.F[triangles].ravel(), self.FT[triangles].ravel()
             own, first = renumbered(split[rows], self.F[triangles])
-            found.append(Island(own, triangles, of_mesh[first], places[at[first]]))
+            found.append(Island(own, triangles, of_mesh[first], self.V[of_mesh[first]], places[at[first]]))
         return tuple(found)
 
     @property

@@ -1,0 +1,173 @@
+"""What is done to the islands of a mesh, one after another, and what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.arrays import FloatArray, IntArray, counted
+from quasiharmonic.atlas.verdict import AtlasVerdict, certify, is_mirrored
+from quasiharmonic.exact.certificate import is_injective
+from quasiharmonic.mesh.seams import Island, SeamedMesh
+from quasiharmonic.mesh.surface import manifold_edges
+from quasiharmonic.result import MapResult, Status
+
+_MIRROR = np.array([-1.0, 1.0])
+# An atlas is as far as the island that comes first here; of others, as the first one.
+_FURTHEST_LAST = (Status.INTERRUPTED, Status.IMPOSSIBLE, Status.OUT_OF_ITERATIONS, Status.STILL_FALLING)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedIsland:
+    """What became of an island.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Its triangles of the mesh, ascending.
+    mirrored : bool
+        Whether it was, and is, mirrored; the result then is of its reflection at the v axis.
+    result : MapResult
+        By the island's own numbers.
+    """
+
+    triangles: IntArray
+    mirrored: bool
+    result: MapResult
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
+            **self.result.to_dict(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MappedAtlas:
+    """A map with seams, island by island.
+
+    Attributes
+    ----------
+    mesh : SeamedMesh
+        The surface with its new places.
+    islands : tuple of MappedIsland
+        By their first triangle. Those that Ctrl-C came before are not there, and are where they were.
+    """
+
+    mesh: SeamedMesh
+    islands: tuple[MappedIsland, ...]
+
+    @property
+    def injective(self) -> bool:
+        """Whether every island is injective, or mirrored and injective (certified)."""
+        return all(island.result.injective for island in self.islands)
+
+    @property
+    def status(self) -> Status:
+        """That of the island which went least far."""
+        found = [island.result.status for island in self.islands]
+        return next((status for status in _FURTHEST_LAST if status in found), found[0])
+
+    def verdict(self) -> AtlasVerdict:
+        """The exact verdict on the places as they are stored."""
+        return certify(self.mesh)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; of one island its result, of several their sums and the islands."""
+        results = [island.result for island in self.islands]
+        if len(results) == 1:
+            return results[0].to_dict()
+        return {
+            "injective": self.injective,
+            "status": self.status.name.lower(),
+            "message": self.status.value,
+            "iterations": sum(result.iterations for result in results),
+            "seconds": sum(result.seconds for result in results),
+            "linear_solver": results[0].linear_solver,
+            "islands": [island.to_dict() for island in self.islands],
+        }
+
+
+def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, reflect: bool = True) -> MappedAtlas:
+    """Do something to each island of a mesh.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+        A surface, if it has no seams; those in it may be anything else's edges.
+    lower : callable
+        Called with each island; its result has a place for every vertex of it.
+    reflect : bool
+        Hand islands that are mirrored over as their reflection, and reflect what comes out: they stay mirrored.
+
+    Returns
+    -------
+    MappedAtlas
+        Ctrl-C ends it, and what is not yet done stays where it was.
+
+    Raises
+    ------
+    ValueError
+        When the mesh is none, or ``lower`` refuses an island; the message says which.
+    KeyboardInterrupt
+        When Ctrl-C comes before an island has a place.
+    """
+    if mesh.seamless:
+        # What is no surface comes apart where it is none, which nobody has asked for.
+        manifold_edges(mesh.F, len(mesh.V))
+    islands = mesh.islands
+    if not islands:
+        raise ValueError("the mesh has no triangles" if not len(mesh.F) else "no triangle has a place")
+    done: list[MappedIsland] = []
+    places = [island.uv for island in islands]
+    for k, island in enumerate(islands):
+        if done and done[-1].result.status is Status.INTERRUPTED:
+            if np.isnan(island.uv).any():
+                raise KeyboardInterrupt
+            continue
+        mirrored = reflect and is_mirrored(island.F, island.uv)
+        with naming(island, len(islands)):
+            result = lower(replace(island, uv=island.uv * _MIRROR) if mirrored else island)
+        places[k] = result.uv * _MIRROR if mirrored else result.uv
+        done.append(MappedIsland(island.triangles, mirrored, result))
+    return MappedAtlas(mesh.with_places(places), tuple(done))
+
+
+class naming:  # noqa: N801 (a context manager, used as a word)
+    """Say of which island a ValueError speaks, where there are several."""
+
+    def __init__(self, island: Island, count: int) -> None:
+        self._island, self._count = island, count
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if self._count > 1 and isinstance(error, ValueError):
+            size = counted("triangle", "triangles", len(self._island.triangles))
+            where = f"the island at triangle {self._island.triangles[0]} ({size})"
+            raise ValueError(f"{where}, its elements numbered anew: {error}") from None
+
+
+def in_place_of(island: Island, uv: FloatArray) -> FloatArray:
+    """A map (m, 2) of an island, turned, scaled to its area and shifted to where the island was.
+
+    Where rounding would invert a triangle it is left as it is.
+    """
+    before, after = (np.ascontiguousarray(w).view(np.complex128).ravel() for w in (island.uv, uv))
+    centre, middle = before.mean(), after.mean()
+    turn = np.vdot(after - middle, before - centre)
+    area = [abs(_area(island.F, w)) for w in (before, after)]
+    scale = np.sqrt(area[0] / area[1]) * (turn / abs(turn) if turn else 1.0)
+    placed = ((after - middle) * scale + centre).view(np.float64).reshape(-1, 2)
+    return placed if is_injective(island.F, placed) else uv
+
+
+def _area(F: IntArray, w: np.ndarray[Any, np.dtype[np.complex128]]) -> float:
+    a, b, c = w[F].T
+    return 0.5 * float(((b - a).conj() * (c - a)).imag.sum())

@@ -1,0 +1,225 @@
+"""Maps with seams found, flattened and improved, island by island; each as the function of its name does a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import FloatArray, IntArray, index_array, map_array, named
+from quasiharmonic.atlas.mapped import MappedAtlas, each_island, in_place_of
+from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.flattening import flattened
+from quasiharmonic.flattening.layout import in_unit_square, side_by_side
+from quasiharmonic.mesh.seams import Island, SeamedMesh
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.result import MapResult
+from quasiharmonic.search.harmonising import harmonise_map
+from quasiharmonic.search.solving import solve
+
+
+def polish(
+    mesh: SeamedMesh,
+    *,
+    free: bool = False,
+    fixed: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+    **rest: Any,
+) -> MappedAtlas:
+    """Lower the distortion of every island of an injective map.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+        A map whose islands are injective, mirrored ones included.
+    free : bool
+        Let their borders go where distortion is least, rather than keep them. Islands then stay where they are as far
+        as their middle, their direction and their area go, and may come to overlap.
+    fixed : (k,) array of int, optional
+        Vertices of the mesh that stay, with all of their places; the borders by default. Not with ``free``.
+    weights : (f,) array, optional
+        How much each triangle's distortion counts.
+    **rest
+        As `quasiharmonic.polish`, or with ``free`` `quasiharmonic.flatten`, has it: ``energy``, ``max_iterations``,
+        ``tolerance``, ``linear_solver``, ``callback``; ``slide`` of the first.
+
+    Returns
+    -------
+    MappedAtlas
+
+    Raises
+    ------
+    ValueError
+        When an island is not injective or no surface, named by its first triangle.
+    """
+    if free and fixed is not None:
+        raise ValueError("with free borders nothing is held: leave fixed out, or free")
+    held = _fixed(mesh, fixed)
+
+    def lower(island: Island) -> MapResult:
+        own: dict[str, Any] = {} if weights is None else {"weights": np.asarray(weights)[island.triangles]}
+        if free:
+            result = flattened.flatten(island.V, island.F, start=island.uv, **own, **rest)
+            return replace(result, uv=in_place_of(island, result.uv))
+        domain = _domain(island, held)
+        return polish_map(domain, island.uv, **own, **rest)
+
+    return each_island(mesh, lower)
+
+
+def harmonise(mesh: SeamedMesh, *, fixed: ArrayLike | None = None, **rest: Any) -> MappedAtlas:
+    """Lower an energy of every island within the injective maps, its border kept; see `quasiharmonic.harmonise`.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+    fixed : (k,) array of int, optional
+        As `polish` has it.
+    **rest
+        As `quasiharmonic.harmonise` has it.
+
+    Returns
+    -------
+    MappedAtlas
+    """
+    held = _fixed(mesh, fixed)
+    return each_island(mesh, lambda island: harmonise_map(_domain(island, held), island.uv, **rest))
+
+
+def injective_map(
+    mesh: SeamedMesh, *, fixed: ArrayLike | None = None, reference: Any = None, **rest: Any
+) -> MappedAtlas:
+    """Map every island anew, its border kept; see `quasiharmonic.injective_map`.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+    fixed : (k,) array of int, optional
+        As `polish` has it.
+    reference, **rest
+        As `quasiharmonic.injective_map` has it.
+
+    Returns
+    -------
+    MappedAtlas
+        Where an island has no injective map, its result says so.
+    """
+    held = _fixed(mesh, fixed)
+
+    def find(island: Island) -> MapResult:
+        own = _held(island, held)
+        return solve(Problem(island.V, island.F, own, island.uv[own], reference=reference), **rest)
+
+    return each_island(mesh, find)
+
+
+def onto_outline(
+    mesh: SeamedMesh, place: Callable[[Island], tuple[IntArray, FloatArray]], *, reference: Any = None, **rest: Any
+) -> MappedAtlas:
+    """Map every island onto an outline of its own; several stand side by side.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+    place : callable
+        Says for an island which vertices are fixed, and where: `quasiharmonic.targets.boundary_to`, for instance.
+    reference, **rest
+        As `quasiharmonic.injective_map` has it.
+
+    Returns
+    -------
+    MappedAtlas
+    """
+    right = 0.0
+
+    def find(island: Island) -> MapResult:
+        nonlocal right
+        fixed, target = place(island)
+        target = map_array("target", target)
+        if len(mesh.islands) > 1:
+            low, high = target.min(axis=0), target.max(axis=0)
+            target = target + np.array([right - low[0], 0.0])
+            right += 1.05 * float(high[0] - low[0])
+        return solve(Problem(island.V, island.F, fixed, target, reference=reference), **rest)
+
+    return each_island(mesh, find, reflect=False)
+
+
+def flatten(
+    mesh: SeamedMesh,
+    *,
+    start: bool = False,
+    fixed: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+    unit_square: bool = False,
+    gap: float = 0.0,
+    **rest: Any,
+) -> MappedAtlas:
+    """Lay every island flat, its border free; several stand side by side, and none of them is mirrored.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+        Its islands need have no places.
+    start : bool
+        Begin with the places that the islands have.
+    fixed : (k,) array of int, optional
+        Vertices of the mesh that are held at their places. An island with such a vertex stays where these put it.
+    weights : (f,) array, optional
+        How much each triangle's distortion counts.
+    unit_square, gap, **rest
+        As `quasiharmonic.flatten` has it.
+
+    Returns
+    -------
+    MappedAtlas
+        In the surface's own unit of length, or in the unit square.
+    """
+    held = _fixed(mesh, fixed)
+    if held is not None and mesh.uv is None:
+        raise ValueError("nothing says where the fixed vertices go: the mesh has no places")
+
+    def lay(island: Island) -> MapResult:
+        own: dict[str, Any] = {} if weights is None else {"weights": np.asarray(weights)[island.triangles]}
+        if start:
+            own["start"] = island.uv
+        pins = _held(island, held) if held is not None else np.empty(0, dtype=np.int64)
+        if pins.size:
+            own |= {"fixed": pins, "target": island.uv[pins]}
+        return flattened.flatten(island.V, island.F, **own, **rest)
+
+    mapped = each_island(mesh, lay, reflect=start)
+    uv = [island.result.uv for island in mapped.islands]
+    if held is None and len(uv) > 1:
+        uv = side_by_side(uv, gap)
+    if unit_square:
+        sizes = np.cumsum([len(places) for places in uv])[:-1]
+        uv = np.split(in_unit_square(np.concatenate(uv)), sizes)
+    return replace(mapped, mesh=mesh.with_places(uv))
+
+
+def _fixed(mesh: SeamedMesh, fixed: ArrayLike | None) -> IntArray | None:
+    if fixed is None:
+        return None
+    array = index_array("fixed", fixed).ravel()
+    absent = array[(array < 0) | (array >= len(mesh.V))]
+    if absent.size:
+        raise ValueError(f"fixed refers to {named('vertex', 'vertices', absent)}, which the mesh has not")
+    return array
+
+
+def _held(island: Island, fixed: IntArray | None) -> IntArray:
+    """Which of an island's vertices stay."""
+    if fixed is None:
+        return np.unique(boundary_edges(island.F, len(island.vertices)))
+    return np.flatnonzero(np.isin(island.vertices, fixed))
+
+
+def _domain(island: Island, fixed: IntArray | None) -> Domain:
+    domain = Domain(island.V, island.F, _held(island, fixed))
+    domain.check_boundary_fixed()
+    return domain
