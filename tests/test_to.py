@@ -774,7 +774,7 @@ def test_flat_triangles_are_told_of_which_file(qhm):
     V[3] = V[0]
     status, _, said = qhm((V, F), "--to", "disk")
     assert status == 2
-    assert "in.obj: triangle" in said
+    assert "in.obj --to disk: triangle" in said
 
 
 @pytest.mark.parametrize(

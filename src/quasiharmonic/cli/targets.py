@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.apply.fitting import Fitted
     from quasiharmonic.curves import Rails
     from quasiharmonic.io import MeshData
-    from quasiharmonic.mesh.reference import Reference
-    from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.problem import Problem
+    from quasiharmonic.targets.asked_corners import AskedCorners
 
 # That of quasiharmonic.targets.specification, which is not imported to say it.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
@@ -60,8 +60,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--corners",
         metavar="V,V,…",
-        help="boundary vertices, 0-based, that go to the outline's corners in the order it has them in; or V:K for its "
-        "corner K (from 0), V:X:Y for its point (X, Y); or a file of these, one a line",
+        help="boundary vertices, 0-based, that go to the outline's corners in the order it has them in (qhm check "
+        "--boundary numbers them), near:x,y,z for the one nearest to a place; or V:K for its corner K (from 0), V:X:Y "
+        "for its point (X, Y); or a file of these, one a line; or auto, by angle",
     )
     group.add_argument(
         "--corner-angle",
@@ -71,7 +72,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "by edge (default: 20)",
     )
     group.add_argument(
-        "--cut", action="store_true", help="cut a closed surface, or one with handles, open first (copies vertices)"
+        "--cut", action="store_true", help="cut a surface that is no disk open first (copies vertices)"
     )
     group.add_argument(
         "--refine", action="store_true", help="split edges that leave the target no room (adds vertices at the end)"
@@ -93,6 +94,7 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
         When options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
     from quasiharmonic import io
+    from quasiharmonic.apply.fitting import Fitted, with_room
     from quasiharmonic.cli import report
     from quasiharmonic.problem import Problem
 
@@ -108,68 +110,58 @@ def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] |
                 "write some, or name an outline, as --to disk"
             )
         with report.about(mesh.source):
-            posed = Posed(mesh, Problem(*io.problem_arrays(mesh, fixed), reference=options.reference))
+            fitted = Fitted(mesh, Problem(*io.problem_arrays(mesh, fixed), reference=options.reference))
+        posed = Posed(mesh, fitted.problem)
     else:
-        from quasiharmonic.targets import outline
-
-        try:
-            contours = outline(options.to, font=options.font)
-        except ValueError as error:
-            text = str(error)
-            raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
-        posed = _onto_outline(options, mesh, contours)
+        posed, fitted = _onto_outline(options, mesh)
         if not options.refine:
             with report.about(mesh.source):
                 _check_room(posed.problem, options.to)
     if options.refine:
-        _refine(posed, options.reference)
+        roomy = with_room(fitted)
+        posed.mesh, posed.problem = roomy.mesh, roomy.problem
+        posed.facts["added_vertices"] = roomy.added
+        if roomy.added:
+            edges = "edge" if roomy.added == 1 else "edges"
+            posed.notes.append(f"split {roomy.added} {edges}: new vertices are at the end of the list")
     if options.slide:
         with report.about(mesh.source):
-            _slide(options, posed)
+            _slide(options, posed, fitted.held)
     return posed
 
 
-def _onto_outline(options: argparse.Namespace, mesh: MeshData, contours: list[NDArray[np.float64]]) -> Posed:
+def _onto_outline(options: argparse.Namespace, mesh: MeshData) -> tuple[Posed, Fitted]:
     """Lay the boundary along an outline."""
+    from quasiharmonic.apply.fitting import laid_along, opened
     from quasiharmonic.arrays import counted
     from quasiharmonic.cli import report
-    from quasiharmonic.mesh.topology import boundary_loops
-    from quasiharmonic.problem import Problem
-    from quasiharmonic.targets import boundary_to, filled
+    from quasiharmonic.targets import outline
 
+    try:
+        contours = outline(options.to, font=options.font)
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
     facts: dict[str, Any] = {"to": options.to}
     notes = []
     if options.cut:
-        from quasiharmonic.apply.cutting import cut_open
-
         with report.about(mesh.source):
-            opened = cut_open(mesh.V, mesh.F)
-        facts["copied_vertices"] = copies = len(opened.V) - len(mesh.V)
+            mesh, copies = opened(mesh)
+        facts["copied_vertices"] = copies
         which = counted("vertex along the cut has", "vertices along the cut have", copies)
-        notes.append(f"cut open: {which} a copy at the end of the list")
-        extra = None if mesh.extra is None else mesh.extra[opened.origin]
-        mesh = replace(mesh, V=opened.V, F=opened.F, extra=extra)
-    whole = filled(contours)
-    holes = len(contours) - len(whole)
-    try:
-        loops = len(boundary_loops(mesh.F, len(mesh.V)))
-    except ValueError:
-        # What has no loops is no surface; below it is said why.
-        loops = 0
-    if holes and loops == 1:
-        facts["filled_holes"] = holes
-        which = "the hole" if holes == 1 else f"the {holes} holes"
-        notes.append(f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled")
-        contours = whole
+        notes.append(f"cut open: {which} a copy at the end of the list" if copies else "a disk already: nothing to cut")
     corners = None if options.corners is None else read_corners(options.corners)
     angle = 20.0 if options.corner_angle is None else options.corner_angle
     with report.about(f"{mesh.source} --to {options.to}"):
-        places = boundary_to(mesh.V, mesh.F, contours, corners=corners, corner_angle=angle)
-    with report.about(mesh.source):
-        return Posed(mesh, Problem(mesh.V, mesh.F, *places, reference=options.reference), facts, notes)
+        fitted = laid_along(mesh, contours, corners=corners, corner_angle=angle, reference=options.reference)
+    if fitted.filled:
+        facts["filled_holes"] = holes = fitted.filled
+        which = "the hole" if holes == 1 else f"the {holes} holes"
+        notes.append(f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled")
+    return Posed(mesh, fitted.problem, facts, notes), fitted
 
 
-def _slide(options: argparse.Namespace, posed: Posed) -> None:
+def _slide(options: argparse.Namespace, posed: Posed, held: list[int]) -> None:
     """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
     from quasiharmonic.curves import Rails
     from quasiharmonic.energy.sliding import moved_onto
@@ -179,7 +171,7 @@ def _slide(options: argparse.Namespace, posed: Posed) -> None:
     if options.to is not None:
         posed.slide = Rails(
             outline_curves(options.to, font=options.font),
-            held=[] if options.corners is None else list(read_corners(options.corners)),
+            held=held,
             corner_angle=20.0 if options.corner_angle is None else options.corner_angle,
         )
     posed.problem = moved_onto(posed.slide, posed.problem)
@@ -200,78 +192,20 @@ def _check_room(problem: Problem, to: str) -> None:
         )
 
 
-def _refine(posed: Posed, reference: Reference | None) -> None:
-    """Split edges that stand in the way of a map, until none is known."""
-    from quasiharmonic.apply.refining import refine_problem
-    from quasiharmonic.mesh.refinement import refine
-    from quasiharmonic.targets import flattened_edges
-
-    before = posed.problem
-    # A chord along a straight side of the outline may be a rounding error off it; a diagnosis, which is exact, then
-    # does not name it.
-    flat = flattened_edges(before.F, before.fixed, before.target)
-    _take(posed, refine(before.V, before.F, flat), reference)
-    _take(posed, refine_problem(posed.problem).refined, reference)
-    posed.facts["added_vertices"] = added = posed.problem.n - before.n
-    if added:
-        posed.notes.append(f"split {added} edge{'' if added == 1 else 's'}: new vertices are at the end of the list")
-
-
-def _take(posed: Posed, refined: Refined, reference: Reference | None) -> None:
-    """Go over to a refined mesh, with all that stands in the file."""
-    import numpy as np
-
-    from quasiharmonic import io
-    from quasiharmonic.problem import Problem
-
-    if not len(refined.parents):
-        return
-    # The map is still to come, and takes the place of these zeros.
-    posed.mesh, _ = io.refined_mesh(posed.mesh, refined, np.zeros((posed.problem.n, 2)))
-    fixed, target = posed.problem.fixed, posed.problem.target
-    posed.problem = Problem(posed.mesh.V, posed.mesh.F, fixed, target, reference=reference)
-
-
-def read_corners(text: str) -> list[int] | dict[int, int | tuple[float, float]]:
+def read_corners(text: str) -> AskedCorners:
     """Read what ``--corners`` says, or the file that it names.
-
-    Parameters
-    ----------
-    text : str
-        ``V,V,…``, or ``V:K`` and ``V:X:Y`` in the place of ``V``; or a text file with one of these on each line,
-        blanks in the place of colons if need be, ``#`` before comments.
 
     Raises
     ------
     ValueError
-        When that is not what stands there, or a vertex stands there twice.
+        When that is not what stands there.
     """
-    if os.path.isfile(text):
-        lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
-        entries = [":".join(line.split("#")[0].replace(":", " ").split()) for line in lines]
-        entries = [entry for entry in entries if entry]
-    else:
-        entries = text.split(",")
-    chosen: dict[int, int | tuple[float, float]] = {}
-    vertices = []
-    for entry in entries:
-        vertex, *goal = entry.split(":")
-        try:
-            vertices.append(int(vertex))
-            if len(goal) == 1:
-                chosen[vertices[-1]] = int(goal[0])
-            elif goal:
-                x, y = map(float, goal)
-                chosen[vertices[-1]] = x, y
-        except ValueError:
-            raise ValueError(f"--corners {text}: {entry!r} is none of V, V:K and V:X:Y") from None
-    if len(set(vertices)) < len(vertices):
-        twice = next(v for v in vertices if vertices.count(v) > 1)
-        raise ValueError(f"--corners {text}: vertex {twice} is named more than once")
-    if chosen and len(chosen) < len(vertices):
-        lone = next(v for v in vertices if v not in chosen)
-        raise ValueError(f"--corners {text}: where does vertex {lone} go? Others have a corner or a point")
-    return chosen or vertices
+    from quasiharmonic.targets import asked_corners
+
+    try:
+        return asked_corners.read_corners(text)
+    except ValueError as error:
+        raise ValueError(f"--corners {text}: {error}") from None
 
 
 def _degrees(text: str) -> float:

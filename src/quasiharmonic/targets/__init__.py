@@ -1,5 +1,6 @@
 """Places to map a boundary to: outlines, and which boundary vertex goes where on them."""
 
+from quasiharmonic.targets.asked_corners import nearest_on_boundary
 from quasiharmonic.targets.boundary import boundary_to
 from quasiharmonic.targets.chords import flattened_edges
 from quasiharmonic.targets.contours import signed_area
@@ -11,15 +12,20 @@ from quasiharmonic.targets.outlines import disk, ellipse, rectangle, regular_pol
 from quasiharmonic.targets.polylines import read_polylines
 from quasiharmonic.targets.specification import outline
 from quasiharmonic.targets.svg import read_svg
+from quasiharmonic.targets.turning import BoundaryLoop, boundary_corners, boundary_turning
 
 __all__ = [
+    "BoundaryLoop",
     "arc_length",
+    "boundary_corners",
     "boundary_to",
+    "boundary_turning",
     "disk",
     "ellipse",
     "filled",
     "flattened_edges",
     "letter",
+    "nearest_on_boundary",
     "nested",
     "outline",
     "outline_curves",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,11 +13,13 @@ from quasiharmonic.exact.loops import judge_loops, listed
 from quasiharmonic.problem import Domain
 from quasiharmonic.targets.chords import chords_of
 from quasiharmonic.targets.contours import from_corner, in_unit
+from quasiharmonic.targets.corner_fit import pins_by_angle
 from quasiharmonic.targets.correspondence import arc, seen_flat
 from quasiharmonic.targets.holes import least_stretch, match_holes
 from quasiharmonic.targets.nesting import Arranged, arranged
 from quasiharmonic.targets.pins import Corners, Pins
 from quasiharmonic.targets.placement import Placement
+from quasiharmonic.targets.turning import boundary_turning, in_space, outermost
 
 
 def boundary_to(
@@ -24,7 +27,7 @@ def boundary_to(
     F: ArrayLike,
     outline: Sequence[ArrayLike] | FloatArray,
     *,
-    corners: Corners | None = None,
+    corners: Corners | Literal["auto"] | None = None,
     corner_angle: float = 20.0,
 ) -> tuple[IntArray, FloatArray]:
     """Lay the whole boundary of a surface along an outline: ``injective_map(V, F, *boundary_to(V, F, outline))``.
@@ -46,12 +49,13 @@ def boundary_to(
     outline : list of (k, 2) float, or one (k, 2) float
         An outer contour and as many holes as the surface has further boundary loops, wound as they like.
         None may cross or touch itself or another.
-    corners : sequence of int, or mapping from int, optional
+    corners : sequence of int, mapping from int, or "auto", optional
         Boundary vertices that go to corners of the outline. In a sequence there is one for every corner
         of its contour, in order from the contour's first (an outline without corners has its first
         point). A mapping says for every vertex which corner, counted from 0, or which point (x, y) on
         the outline. The rest is spread between them, so that every run of the boundary keeps to its
-        own side.
+        own side. ``"auto"`` chooses by angle, on the loop and for the contour outside: see
+        `boundary_corners`, whose corners go to those of the contour that turn alike.
     corner_angle : float
         Degrees by which an outline turns at a corner, at the least. Lesser bends belong to a curve.
 
@@ -82,20 +86,27 @@ def boundary_to(
     contours, exponent = in_unit([one.wound for one in found])
     contours = [from_corner(c, corner_angle, one.reversed) for c, one in zip(contours, found, strict=True)]
     loops = surface.loops
-    space = _in_space(surface.V)
-    pins = Pins(corners, loops, contours, [one.reversed for one in found], corner_angle, exponent)
+    space = in_space(surface.V)
+    if isinstance(corners, str) and corners != "auto":
+        raise ValueError(f'corners are boundary vertices or "auto", not {corners!r}')
+    by_angle = isinstance(corners, str)
+    pins = Pins(None if isinstance(corners, str) else corners, loops, contours, [one.reversed for one in found], corner_angle, exponent)
     to = dict(pins.contour_of)
     if 0 not in to.values():
         # Of the loops that may go anywhere the one around the largest area goes outside.
         free = [i for i in range(len(loops)) if i not in to]
-        to[free[int(np.argmax([np.linalg.norm(_vector_area(space[loops[i]])) for i in free]))]] = 0
+        to[free[outermost([loops[i] for i in free], space)]] = 0
     outer = next(i for i, contour in to.items() if contour == 0)
+    flat = seen_flat(space[loops[outer]], contours[0])
 
     def placement(i: int) -> Placement:
         chords = chords_of(loops[i], surface.edges.interior, count)
-        return Placement(arc(space[loops[i]]), contours[to[i]], pins.along(i, to[i]), chords, loops[i], corner_angle)
+        held = pins.along(i, to[i])
+        if by_angle and i == outer:
+            held = pins_by_angle(boundary_turning(surface.V, surface.F)[i], flat, contours[0], corner_angle)
+        return Placement(arc(space[loops[i]]), contours[to[i]], held, chords, loops[i], corner_angle)
 
-    places = {outer: placement(outer).fitted(seen_flat(space[loops[outer]], contours[0]))}
+    places = {outer: placement(outer).fitted(flat)}
     if len(loops) > 1:
         to |= match_holes(surface, outer, places[outer], contours, to)
         places |= least_stretch(surface, places, {i: placement(i).choices() for i in to if i != outer})
@@ -149,15 +160,3 @@ def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
             "for the shape, or crowd elsewhere: split boundary edges (refine with boundary=True), choose other "
             "corners, or an outline with less detail"
         )
-
-
-def _in_space(V: FloatArray) -> FloatArray:
-    """Positions (n, 3) of about unit size around the origin, so that nothing made of them overflows."""
-    V = np.column_stack([V, np.zeros(len(V))]) if V.shape[1] == 2 else V
-    V = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
-    return np.asarray(V - V.mean(axis=0))
-
-
-def _vector_area(points: FloatArray) -> FloatArray:
-    """Area that a closed curve in space encloses, as a vector normal to it; its shadow's area along any direction."""
-    return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0) / 2)
