@@ -119,6 +119,25 @@ def test_a_letter_is_better_with_its_boundary_sliding(character):
     assert not (steps == 0).any()
 
 
+def test_a_word_slides_along_the_curves_of_its_letters():
+    pytest.importorskip("shapely")
+    V, F, fixed, target, curves = lettered("word:OC")
+    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=Rails(curves))
+    assert result.status is Status.POLISHED
+    assert result.certificate.bijective
+    outer = max(curves, key=lambda curve: curve.length)
+    places = result.uv[fixed]
+    assert np.hypot(*(places - target).T).max() > 0.01
+    assert outer.nearest(places)[1].max() <= np.spacing(1.0)
+    # The first letter is where it is alone.
+    first = places[:, 0] < 0.5
+    assert first.any()
+    assert off_the_glyph(places[first], "O").max() < 1e-8
+    # Held are the corners of the second, and the two where the letters meet.
+    held = outer.position(outer.corners(20.0))
+    assert np.isin(held @ (1, 1j), places @ (1, 1j)).all()
+
+
 def test_a_boundary_on_a_circle_turns_back():
     V, F, uv, loop = turned()
     held = polish(V, F, uv, fixed=loop)
