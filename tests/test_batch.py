@@ -16,14 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic import batch, certify, flatten, io
+from quasiharmonic import batch, certify, distortion, flatten, io
 from quasiharmonic.batch import driver, records, supervisor
 from quasiharmonic.batch import settings as settings_module
 from quasiharmonic.batch.supervisor import Finished
 from quasiharmonic.cli import main
+from quasiharmonic.curves import Curve
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus, cat
-from quasiharmonic.targets import outline, signed_area
+from quasiharmonic.targets import outline, outline_curves, signed_area
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
 pytestmark = pytest.mark.slow
@@ -247,6 +248,29 @@ class TestRun:
             areas = [abs(signed_area(uv[loop])) for loop in boundary_loops(written.F, len(uv))]
             np.testing.assert_allclose(sorted(areas), sorted(abs(signed_area(c)) for c in loops), rtol=0.2)
 
+    def test_boundaries_that_slide(self, stars, tmp_path):
+        energies = []
+        for slide in (False, True):
+            settings = batch.Settings(to="letter:O", polish="symmetric-dirichlet", slide=slide)
+            assert batch.run(stars / "a", tmp_path / f"{slide}", settings, jobs=1).outcomes == {"injective": 1}
+            written = io.read_mesh(tmp_path / f"{slide}" / "results" / "input.obj" / "map.obj")
+            uv = io.map_of(written)
+            energies.append(distortion(written.V, written.F, uv).summary("symmetric_dirichlet").mean)
+        assert energies[1] < 0.95 * energies[0]
+        (loop,) = boundary_loops(written.F, len(uv))
+        # On the font's own curves, and not on chords of theirs.
+        away = np.min([curve.nearest(uv[loop])[1] for curve in outline_curves("letter:O")], axis=0)
+        assert away.max() < 1e-14
+
+    def test_boundaries_slide_along_what_they_are(self, stars, tmp_path):
+        settings = batch.Settings(polish="symmetric-dirichlet", slide=True)
+        assert batch.run(stars / "a", tmp_path / "out", settings, jobs=1).outcomes == {"injective": 1}
+        written = io.read_mesh(tmp_path / "out" / "results" / "a" / "map.obj")
+        loop, target = star_of(5, depth=0.7)[2:]
+        uv = io.map_of(written)
+        assert Curve.polygon(target).nearest(uv[loop])[1].max() < 1e-14
+        assert np.abs(uv[loop] - target).max() > 1e-3
+
     def test_free_boundaries(self, tmp_path):
         V, F = cat(5)
         (tmp_path / "set" / "rings").mkdir(parents=True)
@@ -285,6 +309,8 @@ class TestRun:
         [
             ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
             ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
+            ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),
+            ({"slide": True}, "slides while distortion is lowered: name an energy for that too, by polish"),
             ({"energy": "mips"}, "energy is what flatten lowers"),
             ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
         ],
@@ -473,6 +499,10 @@ class TestCommand:
         assert "the others: 1 input cannot be used" in capsys.readouterr().out
         assert main(["batch", str(stars / "b"), "-o", out, "-j", "1", "--flatten", "--energy", "mips"]) == 0
         assert "2 of 2 problems have a certified bijective map" in capsys.readouterr().out
+        sliding = ["--polish", "mips", "--slide"]
+        assert main(["batch", str(stars / "b"), "-o", out, "-j", "1", "--to", "disk", *sliding]) == 0
+        assert main(["batch", str(stars / "b"), "-o", out, "--slide"]) == 2
+        assert "name an energy" in capsys.readouterr().err
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 

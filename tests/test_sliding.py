@@ -119,6 +119,25 @@ def test_a_letter_is_better_with_its_boundary_sliding(character):
     assert not (steps == 0).any()
 
 
+def test_a_word_slides_along_the_curves_of_its_letters():
+    pytest.importorskip("shapely")
+    V, F, fixed, target, curves = lettered("word:OC")
+    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=Rails(curves))
+    assert result.status is Status.POLISHED
+    assert result.certificate.bijective
+    outer = max(curves, key=lambda curve: curve.length)
+    places = result.uv[fixed]
+    assert np.hypot(*(places - target).T).max() > 0.01
+    assert outer.nearest(places)[1].max() <= np.spacing(1.0)
+    # The first letter is where it is alone.
+    first = places[:, 0] < 0.5
+    assert first.any()
+    assert off_the_glyph(places[first], "O").max() < 1e-8
+    # Held are the corners of the second, and the two where the letters meet.
+    held = outer.position(outer.corners(20.0))
+    assert np.isin(held @ (1, 1j), places @ (1, 1j)).all()
+
+
 def test_a_boundary_on_a_circle_turns_back():
     V, F, uv, loop = turned()
     held = polish(V, F, uv, fixed=loop)
@@ -528,6 +547,50 @@ def test_what_the_command_line_refuses(tmp_path, capsys):
     assert main(["map", str(tmp_path / "in.obj"), "--to", "disk", "--slide", *out]) == 0
     assert main(["polish", str(tmp_path / "out.obj"), "--to", "disk", "-o", str(tmp_path / "b.obj")]) == 2
     assert "add --slide" in capsys.readouterr().err
+
+
+def test_vertices_are_told_their_sides(tmp_path, capsys):
+    V, F = surfaces.grid(10, 10)
+    # The diagonal before the corner (1, 0) turned, there is room beside it for the next vertex of the right side, which
+    # is nearer to the lower one.
+    F[18:20] = (9, 10, 21), (9, 21, 20)
+    uv, moved = V.copy(), 21
+    uv[moved] = 0.9995, 0.0004
+    io.write_obj(tmp_path / "in.obj", io.MeshData(lift(V), F).with_map(uv))
+    pieces, out = tmp_path / "sides.txt", tmp_path / "out.obj"
+    call = ["polish", str(tmp_path / "in.obj"), "--to", "rect:1x1", "--slide", "-o", str(out)]
+    assert main(call) == 2
+    assert "tell vertices theirs" in capsys.readouterr().err
+    pieces.write_text(f"# the right side is the second\n\n{moved}, 1\n")
+    assert main([*call, "--pieces", str(pieces)]) == 0
+    found = io.map_of(io.read_mesh(out))
+    assert found[moved, 0] == 1
+    assert found[moved, 1] > 0.05
+    # The same for a map that is made.
+    right = np.flatnonzero(V[:, 0] == 1)
+    pieces.write_text("".join(f"{v} 1\n" for v in right))
+    corners = [int(np.flatnonzero((place == V).all(axis=1))[0]) for place in SQUARE]
+    call = ["map", str(tmp_path / "in.obj"), "--to", "rect:2x1", "--corners", ",".join(map(str, corners))]
+    call += ["-o", str(out)]
+    assert main([*call, "--slide", "--pieces", str(pieces)]) == 0
+    assert (io.map_of(io.read_mesh(out))[right, 0] == 2).all()
+    pieces.write_text("".join(f"{v} 3\n" for v in right))
+    assert main([*call, "--slide", "--pieces", str(pieces)]) == 2
+    assert "told to be on curve 3, but off it by 2" in capsys.readouterr().err
+    for text, message in (
+        ("3 4", "says side 4, but the outline has only sides 0 … 3 at line 1"),
+        ("3", "is not 'vertex side'"),
+        ("-3 1", "is not 'vertex side'"),
+        ("3 1\n3 1", "names vertex 3 a second time at line 2"),
+        ("9999 1", "on refers to vertex 9999"),
+    ):
+        pieces.write_text(text)
+        assert main([*call, "--slide", "--pieces", str(pieces)]) == 2
+        assert message in capsys.readouterr().err
+    assert main([*call, "--pieces", str(pieces)]) == 2
+    assert "add --slide and --to" in capsys.readouterr().err
+    assert main([*call, "--slide", "--pieces", str(tmp_path / "none")]) == 2
+    assert "cannot be read" in capsys.readouterr().err
 
 
 def test_morph_slides(tmp_path):

@@ -180,6 +180,75 @@ def test_an_outline_is_on_its_curves(text):
         assert curve.nearest(middle)[1].max() < 1.01e-6 * max(1, np.ptp(contour))
 
 
+@pytest.mark.parametrize("text", ["QH", "LOVE", "mesh", "R8", "OOO", "LEEL", "G", "SCAF", "&@", "Wgy"])
+def test_a_word_follows_the_curves_of_its_letters(text):
+    pytest.importorskip("shapely")
+    contours, curves = outline(f"word:{text}"), outline_curves(f"word:{text}")
+    assert len(curves) == len(contours)
+    for contour in contours:
+        away, curve = min(((c.nearest(contour)[1].max(), c) for c in curves), key=lambda pair: pair[0])
+        # Where letters meet, their chords meet a little beside their curves.
+        assert away < 3e-6
+        sides = np.hypot(*np.diff(contour, axis=0, append=contour[:1]).T)
+        assert curve.length == pytest.approx(sides.sum(), rel=1e-4)
+    # What a letter draws is followed as it is drawn: the first letter stands where it stands alone.
+    s = np.concatenate([np.linspace(0, curve.length, 5000) for curve in curves])
+    points = np.concatenate([c.position(part) for c, part in zip(curves, np.split(s, len(curves)), strict=True)])
+    first = outline_curves(f"letter:{text[0]}")
+    away = np.min([one.nearest(points)[1] for one in first], axis=0)
+    left = points[:, 0] < max(one.position(np.linspace(0, one.length, 999))[:, 0].max() for one in first) - 0.2
+    assert left.any()
+    assert away[left].max() < 1e-14
+
+
+def test_letters_of_a_word_meet_where_their_curves_do():
+    pytest.importorskip("shapely")
+    (outer,) = sorted(outline_curves("word:OO"), key=lambda curve: -curve.length)[:1]
+    corners = outer.position(outer.corners(20.0))
+    assert len(corners) == 2
+    (ring,) = sorted(outline_curves("letter:O"), key=lambda curve: -curve.length)[:1]
+    assert ring.nearest(corners)[1].max() < 1e-15
+    # The second letter is the first one moved.
+    right = [c.position(c.corners(0.0))[:, 0].max() for c in (outer, ring)]
+    assert ring.nearest(corners - (right[0] - right[1], 0))[1].max() < 1e-14
+
+
+@pytest.mark.parametrize("curve", [Curve(MIXED), Curve.circle(2.0), Curve([*MIXED[:2]])])
+def test_a_section_is_a_part_of_its_curve(curve, rng):
+    for start, end in np.sort(rng.random((20, 2)), axis=1) * curve.length:
+        part = Curve(curve.section(start, end))
+        assert part.length == pytest.approx(end - start, rel=1e-9)
+        t = np.linspace(0, 1, 40)
+        there = curve.position(start + t * (end - start))
+        np.testing.assert_allclose(part.position(t * part.length), there, rtol=0, atol=1e-12)
+        if curve.closed:
+            rest = Curve(curve.section(end, start))
+            assert rest.length == pytest.approx(curve.length - end + start, rel=1e-9)
+            np.testing.assert_allclose(rest.position(np.zeros(1)), curve.position(np.array([end])), atol=1e-12)
+
+
+def test_sides_lie_between_corners():
+    square = Curve.polygon([(0, 0), (2, 0), (2, 1), (0, 1)])
+    sides = square.sides(20.0)
+    assert [side.position(np.array([0.0, side.length])).tolist() for side in sides] == [
+        [[0, 0], [2, 0]],
+        [[2, 0], [2, 1]],
+        [[2, 1], [0, 1]],
+        [[0, 1], [0, 0]],
+    ]
+    assert not any(side.closed for side in sides)
+    (whole,) = Curve.circle().sides(20.0)
+    assert whole.closed
+    drop = Curve([[(0, 0), (3, 2), (-3, 2), (0, 0)]])
+    (around,) = drop.sides(20.0)
+    assert around.length == pytest.approx(drop.length)
+    half = Curve.polyline([(0, 0), (1, 0), (1, 1)])
+    assert [side.length for side in half.sides(20.0)] == [1, 1]
+    # An arc is taken apart for the sake of its length only: no corner is made by that.
+    arch = Curve([Arc((0, 0), (1, 0), (0, 1), 0, np.pi), [(-1, 0), (1, 0)]])
+    assert [side.corners(0.0).size for side in arch.sides(20.0)] == [2, 2]
+
+
 def test_a_drawing_keeps_its_arcs(tmp_path):
     path = tmp_path / "drawing.svg"
     path.write_text(

@@ -188,6 +188,8 @@ def _checked(settings: Settings) -> Settings:
         if given not in words:
             raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
     _check_flatten(settings)
+    if settings.slide and settings.polish is None:
+        raise ValueError("the boundary slides while distortion is lowered: name an energy for that too, by polish")
     if settings.max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, not {settings.max_iterations}")
     if settings.to is None:
@@ -205,7 +207,7 @@ def _check_flatten(settings: Settings) -> None:
             raise ValueError("energy is what flatten lowers: ask for that, or for polish")
         return
     plain = Settings()
-    for name in ("to", "strategy", "polish", "reference"):
+    for name in ("to", "strategy", "polish", "slide", "reference"):
         if getattr(settings, name) != getattr(plain, name):
             raise ValueError(
                 f"{name} is of maps onto a given boundary, and flatten sets it free: leave one of them out"

@@ -33,6 +33,9 @@ class Settings:
     strategy : {"speed", "quality"}
     polish : str or None
         Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
+    slide : bool
+        Whether boundary vertices glide along the outline meanwhile, its corners held: along the curves of ``to``, or,
+        where problems say themselves where the boundary goes, along the polygon that it is.
     reference : {"equilateral", "rest", "corrected"} or None
     max_iterations : int
     linear_solver : str
@@ -44,6 +47,7 @@ class Settings:
     energy: str | None = None
     strategy: str = "speed"
     polish: str | None = None
+    slide: bool = False
     reference: str | None = None
     max_iterations: int = 2000
     linear_solver: str = "auto"

@@ -30,8 +30,10 @@ from numpy.typing import NDArray
 from quasiharmonic import __version__, io
 from quasiharmonic.batch import records
 from quasiharmonic.batch.records import Record
+from quasiharmonic.curves import Curve, Rails
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.flattened import flatten, flattenable
 from quasiharmonic.mesh.topology import boundary_loops
@@ -161,6 +163,9 @@ def _mapped(
     with _timed(record, "setup"):
         arrays = io.problem_arrays(mesh, fixed) if settings["to"] is None else _onto(settings["to"], mesh)
         problem = Problem(*arrays, reference=settings["reference"])
+        slide = _along(settings["to"]) if settings["slide"] else False
+        if slide is not False:
+            problem = moved_onto(slide, problem)
     record |= {"vertices": problem.n, "triangles": len(problem.F), "fixed": len(problem.fixed)}
     record |= {"pins": len(problem.domain.pins), "loops": len(problem.domain.loops)}
     tell({"facts": record})
@@ -175,7 +180,11 @@ def _mapped(
     if settings["polish"] is not None and result.status is Status.INJECTIVE:
         with _timed(record, "polish"):
             found = polish_map(
-                problem.domain, result.uv, energy=settings["polish"], linear_solver=settings["linear_solver"]
+                problem.domain,
+                result.uv,
+                energy=settings["polish"],
+                linear_solver=settings["linear_solver"],
+                slide=slide,
             )
         stages = stages + found.stages
     record |= _told(found, stages, result.linear_solver)
@@ -225,18 +234,34 @@ def _onto(to: str, mesh: io.MeshData) -> io.ProblemArrays:
     """The problem of laying a plain mesh's boundary along an outline."""
     from quasiharmonic.targets import boundary_to, filled
 
-    contours = _outline(to, os.stat(to).st_mtime_ns if os.path.isfile(to) else 0)
+    contours = _outline(to, _changed(to))
     if len(boundary_loops(mesh.F, len(mesh.V))) == 1:
         contours = filled(contours)
     return io.ProblemArrays(mesh.V, mesh.F, *boundary_to(mesh.V, mesh.F, contours))
 
 
+def _along(to: str | None) -> bool | Rails:
+    """What the boundary slides along."""
+    return True if to is None else Rails(_curves(to, _changed(to)))
+
+
+def _changed(to: str) -> int:
+    """When an outline was changed; files are read anew when they have."""
+    return os.stat(to).st_mtime_ns if os.path.isfile(to) else 0
+
+
 @cache
 def _outline(to: str, _changed: int) -> list[NDArray[np.float64]]:
-    """An outline; a file is read anew when it has changed."""
     from quasiharmonic.targets import outline
 
     return outline(to)
+
+
+@cache
+def _curves(to: str, _changed: int) -> list[Curve]:
+    from quasiharmonic.targets import outline_curves
+
+    return outline_curves(to)
 
 
 def _written(path: Path, mesh: io.MeshData, result: MapResult, wanted: str) -> Record:

@@ -90,6 +90,11 @@ def add_parser(commands: Commands) -> None:
     solver.add_argument(
         "--polish", choices=arguments.ENERGIES, metavar="ENERGY", help="then lower distortion: %(choices)s"
     )
+    solver.add_argument(
+        "--slide",
+        action="store_true",
+        help="let boundary vertices glide along the outline while --polish lowers distortion, its corners held",
+    )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
     arguments.add_linear_solver(solver)
@@ -106,6 +111,7 @@ def run(options: argparse.Namespace) -> int:
         energy=options.energy,
         strategy=options.strategy,
         polish=options.polish,
+        slide=options.slide,
         reference=options.reference,
         max_iterations=options.max_iterations,
         linear_solver=options.linear_solver,

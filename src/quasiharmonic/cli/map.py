@@ -26,7 +26,7 @@ STEPS, LARGEST = 20, 100_000
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, targets
+    from quasiharmonic.cli import arguments, sliding, targets
 
     parser = commands.add_parser(
         "map",
@@ -58,11 +58,7 @@ def add_parser(commands: Commands) -> None:
         "100,000 triangles)",
     )
     distortion.add_argument("--no-polish", action="store_true", help="leave the first injective map as it is found")
-    parser.add_argument(
-        "--slide",
-        action="store_true",
-        help="let boundary vertices glide along the outline while distortion is lowered, its corners held",
-    )
+    sliding.add_options(parser)
     solver = parser.add_argument_group("how it is solved")
     solver.add_argument(
         "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
@@ -76,18 +72,22 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
-    from quasiharmonic.cli import report, targets
+    from quasiharmonic.cli import report, sliding, targets
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
     if options.slide and options.no_polish:
         raise ValueError("--slide moves the boundary while distortion is lowered, which --no-polish forbids")
+    sliding.check_options(options)
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     if options.to is not None:
         # The handles of a folder say which vertices its own vt hold.
         fixed_path = None
     report.check_outputs(
-        options.output, options.plot, options.json, inputs=(mesh_path, fixed_path, *targets.files(options))
+        options.output,
+        options.plot,
+        options.json,
+        inputs=(mesh_path, fixed_path, options.pieces, *targets.files(options)),
     )
     mesh = io.read_mesh(mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))

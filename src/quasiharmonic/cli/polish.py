@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from typing import TypeAlias
 
     import numpy as np
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments
+    from quasiharmonic.cli import arguments, sliding
 
     parser = commands.add_parser(
         "polish",
@@ -41,9 +41,7 @@ def add_parser(commands: Commands) -> None:
         "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"
     )
     parser.add_argument("--max-iterations", type=arguments.count, default=200, metavar="N", help="(default: 200)")
-    parser.add_argument(
-        "--slide", action="store_true", help="let boundary vertices glide along the outline, its corners held"
-    )
+    sliding.add_options(parser)
     parser.add_argument(
         "--to",
         metavar="OUTLINE",
@@ -56,13 +54,14 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, polish, write, judge, report."""
+    from quasiharmonic.cli import sliding
+
     if options.to is not None and not options.slide:
         raise ValueError("--to names the outline to slide along: add --slide")
+    sliding.check_options(options)
 
     def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
-        from quasiharmonic.curves import Rails
         from quasiharmonic.energy.polishing import polish_map
-        from quasiharmonic.targets import outline_curves
 
         return polish_map(
             domain,
@@ -71,20 +70,23 @@ def run(options: argparse.Namespace) -> int:
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
-            slide=options.slide if options.to is None else Rails(outline_curves(options.to)),
+            slide=options.slide if options.to is None else sliding.along(options.to, pieces=options.pieces),
         )
 
-    return improve(options, lower)
+    return improve(options, lower, inputs=(options.pieces,))
 
 
-def improve(options: argparse.Namespace, lower: Lower) -> int:
-    """Read a map, lower its distortion, write, judge, report; for every command that does so."""
+def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = ()) -> int:
+    """Read a map, lower its distortion, write, judge, report; for every command that does so.
+
+    ``inputs`` are files that it reads besides, which no output may replace.
+    """
     from quasiharmonic import io
     from quasiharmonic.cli import map, progress, report
     from quasiharmonic.energy.measures import distortion
     from quasiharmonic.problem import Domain
 
-    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed))
+    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
     mesh = io.read_mesh(options.input)
     uv = io.map_of(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))

@@ -163,16 +163,17 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData) -> tuple[Posed, F
 
 def _slide(options: argparse.Namespace, posed: Posed, held: list[int]) -> None:
     """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
-    from quasiharmonic.curves import Rails
+    from quasiharmonic.cli import sliding
     from quasiharmonic.energy.sliding import moved_onto
-    from quasiharmonic.targets import outline_curves
 
     posed.slide = True
     if options.to is not None:
-        posed.slide = Rails(
-            outline_curves(options.to, font=options.font),
+        posed.slide = sliding.along(
+            options.to,
+            font=options.font,
             held=held,
             corner_angle=20.0 if options.corner_angle is None else options.corner_angle,
+            pieces=options.pieces,
         )
     posed.problem = moved_onto(posed.slide, posed.problem)
     posed.facts["slide"] = True

@@ -8,12 +8,24 @@ may turn: by an angle that makes it a corner, or by less, which is a kink; there
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, named
-from quasiharmonic.curves.pieces import Arc, angle_at, as_complex, chords, gauss, on_bezier, on_ellipse, parts
+from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.curves.pieces import (
+    Arc,
+    angle_at,
+    as_complex,
+    between,
+    chords,
+    gauss,
+    on_bezier,
+    on_ellipse,
+    parts,
+    straight,
+)
 
 # Coordinates between these have squares, and products of four, that neither overflow nor vanish.
 _LARGEST, _SMALLEST = 1e75, 1e-75
@@ -89,12 +101,12 @@ class Curve:
     @classmethod
     def polygon(cls, points: ArrayLike) -> Curve:
         """The closed polygon through (k, 2) points."""
-        return cls(_sides(points, closed=True))
+        return cls(straight(points, closed=True))
 
     @classmethod
     def polyline(cls, points: ArrayLike) -> Curve:
         """The open polyline through (k, 2) points."""
-        return cls(_sides(points, closed=False))
+        return cls(straight(points, closed=False))
 
     @classmethod
     def circle(cls, radius: float = 1.0, centre: ArrayLike = (0.0, 0.0)) -> Curve:
@@ -105,14 +117,43 @@ class Curve:
         """The curve after ``x → matrix @ x + shift``; ``matrix`` (2, 2) or a number, ``shift`` (2,)."""
         matrix = np.asarray(matrix, dtype=np.float64) * (np.eye(2) if np.ndim(matrix) == 0 else 1.0)
         offset = np.asarray(shift, dtype=np.float64)
-        pieces: list[ArrayLike | Arc] = []
-        for degree, control, angles in zip(self._degree, self._control, self._angles, strict=True):
-            points = control.view(np.float64).reshape(-1, 2)
-            if degree:
-                pieces.append(points[: degree + 1] @ matrix.T + offset)
+        return Curve(
+            [
+                piece.transformed(matrix, offset) if isinstance(piece, Arc) else piece @ matrix.T + offset
+                for piece in self.section(0.0, self.length)
+            ]
+        )
+
+    def section(self, start: float, end: float) -> list[FloatArray | Arc]:
+        """The pieces from one length along the curve to another; on from its beginning if ``end`` is not beyond."""
+        m = self._degree.size
+        (first, last), (begin, stop) = self.place(np.array([start, end]))
+        last += m if end <= start else 0
+        found: list[FloatArray | Arc] = []
+        for k in range(first, last + 1):
+            t, u = begin if k == first else 0.0, stop if k == last else 1.0
+            if t == u:
+                continue
+            points = self._control[k % m].view(np.float64).reshape(-1, 2)
+            if self._degree[k % m]:
+                found.append(between(points[: self._degree[k % m] + 1], t, u))
+                continue
+            angles = angle_at(self._angles[[k % m, k % m]], np.array([t, u])).tolist()
+            before = found[-1] if found and self._within[k % m] else None
+            if isinstance(before, Arc):
+                found[-1] = replace(before, last=angles[1])
             else:
-                pieces.append(Arc(*points[:3], *angles).transformed(matrix, offset))
-        return Curve(pieces)
+                found.append(Arc(points[0], points[1], points[2], *angles))
+        return found
+
+    def sides(self, angle: float) -> list[Curve]:
+        """The curves from one corner to the next, the first corner's first; the curve itself where it has none.
+
+        ``angle`` as `corners` has it.
+        """
+        marks = self.corners(angle)
+        ends = np.roll(marks, -1) if self.closed else marks[1:]
+        return [Curve(self.section(*pair)) for pair in zip(marks, ends, strict=False)] or [self]
 
     def position(self, s: FloatArray) -> FloatArray:
         """Points at lengths (k,) along the curve, rounded once from twice the digits; (k, 2) float64."""
@@ -380,16 +421,3 @@ class Curve:
             found = np.abs(self._point(piece, t) - z)
             best, least = np.where(found < least, t, best), np.minimum(found, least)
         return best, least
-
-
-def _sides(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
-    """The straight lines between points."""
-    array = np.array(points, dtype=np.float64)
-    least = 3 if closed else 2
-    if array.ndim != 2 or array.shape[1] != 2 or len(array) < least:
-        raise ValueError(f"points must have shape (k, 2) with k at least {least}, not {array.shape}")
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if bad.size:
-        raise ValueError(f"points is not finite at {named('row', 'rows', bad)}")
-    ends = np.concatenate([array, array[:1]]) if closed else array
-    return list(np.stack([ends[:-1], ends[1:]], axis=1))

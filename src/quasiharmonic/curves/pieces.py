@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, check_finite, real_array
 from quasiharmonic.exact.predicates import two_product, two_sum
 
 # The longest arc, so that few nodes integrate its length to rounding.
@@ -88,6 +88,17 @@ def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
     return [Piece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
 
 
+def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
+    """The straight lines between points."""
+    array = real_array("points", points)
+    least = 3 if closed else 2
+    if array.ndim != 2 or array.shape[1] != 2 or len(array) < least:
+        raise ValueError(f"points must have shape (k, 2) with k at least {least}, not {array.shape}")
+    check_finite("points", "row", "rows", array)
+    ends = np.concatenate([array, array[:1]]) if closed else array
+    return list(np.stack([ends[:-1], ends[1:]], axis=1))
+
+
 def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
     """Chords into which a piece is taken apart so that each bends little."""
     if degree == 1:
@@ -99,6 +110,23 @@ def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
     bends = np.abs(np.angle(sides[1:] / sides[:-1])).sum()
     # The handles' bends are spread unevenly over the parameter.
     return int(max(4, 2 * np.ceil(bends / _FLAT)))
+
+
+def between(control: FloatArray, t: float, u: float) -> FloatArray:
+    """The control points (degree + 1, 2) of a Bézier curve's part from one parameter to another.
+
+    They are the values of its blossom, de Casteljau's construction with a parameter of its own in each round: k of them
+    are ``u`` and the others ``t``.
+    """
+    if (t, u) == (0.0, 1.0):
+        return control
+    degree, found = len(control) - 1, []
+    for k in range(degree + 1):
+        points = control
+        for share in [u] * k + [t] * (degree - k):
+            points = (1 - share) * points[:-1] + share * points[1:]
+        found.append(points[0])
+    return np.array(found)
 
 
 def as_complex(points: ArrayLike) -> ComplexArray:

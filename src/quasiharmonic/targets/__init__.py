@@ -6,13 +6,14 @@ from quasiharmonic.targets.chords import flattened_edges
 from quasiharmonic.targets.contours import signed_area
 from quasiharmonic.targets.correspondence import arc_length
 from quasiharmonic.targets.curves import outline_curves
-from quasiharmonic.targets.glyphs import letter, word
+from quasiharmonic.targets.glyphs import letter
 from quasiharmonic.targets.nesting import filled, nested
 from quasiharmonic.targets.outlines import disk, ellipse, rectangle, regular_polygon, ring, star
 from quasiharmonic.targets.polylines import read_polylines
 from quasiharmonic.targets.specification import outline
 from quasiharmonic.targets.svg import read_svg
 from quasiharmonic.targets.turning import BoundaryLoop, boundary_corners, boundary_turning
+from quasiharmonic.targets.words import word
 
 __all__ = [
     "BoundaryLoop",

@@ -12,8 +12,9 @@ from quasiharmonic.curves.pieces import Arc
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.targets.contours import Pieces
 from quasiharmonic.targets.glyphs import Font, glyph_paths
-from quasiharmonic.targets.specification import outline
+from quasiharmonic.targets.specification import TOLERANCE, outline
 from quasiharmonic.targets.svg import svg_paths
+from quasiharmonic.targets.words import word_curves
 
 
 def outline_curves(specification: str | PathLike[str], *, font: Font | None = None) -> list[Curve]:
@@ -22,8 +23,8 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
     Parameters
     ----------
     specification : str or path
-        As `outline` takes it. Circles and ellipses are such, letters and drawings the lines, arcs and Bézier curves
-        that they are drawn by; words and files of points are polygons.
+        As `outline` takes it. Circles and ellipses are such; letters, words and drawings the lines, arcs and Bézier
+        curves that they are drawn by; files of points are polygons.
     font : str or path, optional
         For letters and words.
 
@@ -35,7 +36,7 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
     Raises
     ------
     ValueError, OSError, ModuleNotFoundError
-        As `outline`.
+        As `outline`; when letters of a word touch so flatly that their curves cannot be joined.
 
     Examples
     --------
@@ -48,6 +49,8 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
     name, _, argument = text.partition(":")
     if name == "letter":
         return _contours(glyph_paths(argument, font))
+    if name == "word":
+        return word_curves(argument, font, tolerance=TOLERANCE)
     if name == "disk":
         return [Curve.circle()]
     if name == "ring":

@@ -9,16 +9,19 @@ from pathlib import Path
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.targets import outlines
 from quasiharmonic.targets.contours import MOST_POINTS
-from quasiharmonic.targets.glyphs import Font, letter, word
+from quasiharmonic.targets.glyphs import Font, letter
 from quasiharmonic.targets.polylines import read_polylines
 from quasiharmonic.targets.svg import read_svg
+from quasiharmonic.targets.words import word
 
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 _POINT_FILES = ".txt", ".csv"
+#: How far contours stray from curves, where nothing else is asked for.
+TOLERANCE = 1e-6
 
 
 def outline(
-    specification: str | PathLike[str], *, font: Font | None = None, tolerance: float = 1e-6
+    specification: str | PathLike[str], *, font: Font | None = None, tolerance: float = TOLERANCE
 ) -> list[FloatArray]:
     """Make the outline that a few words or a file specify.
 
