@@ -82,13 +82,15 @@ def islands(F: ArrayLike, uv: ArrayLike, FT: ArrayLike | None = None) -> list[Is
     return found
 
 
-def fans(F: IntArray) -> tuple[IntArray, IntArray]:
+def fans(F: IntArray, cut: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """Split vertices at which triangles touch without being joined by edges.
 
     Parameters
     ----------
     F : (f, 3) int64
         Triangles, of any kind.
+    cut : (k, 2) int64, optional
+        Edges at which no triangles are joined, either end first.
 
     Returns
     -------
@@ -104,10 +106,13 @@ def fans(F: IntArray) -> tuple[IntArray, IntArray]:
     corner = np.arange(F.size).reshape(-1, 3)
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     ahead = corner[:, (1, 2, 0)].ravel()
-    key = edge_keys(tail, head, int(F.max(initial=0)) + 1)
+    n = int(F.max(initial=0)) + 1
+    key = edge_keys(tail, head, n)
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     first = first[np.diff(first, append=key.size) == 2]
+    if cut is not None:
+        first = first[~np.isin(key[order[first]], edge_keys(cut[:, 0], cut[:, 1], n))]
     one, other = order[first], order[first + 1]
     opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
     one, other = one[opposed], other[opposed]

@@ -30,23 +30,11 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
         With the first offending elements: triangles that use a vertex twice or are repeated, vertices without
         triangle, non-manifold edges, mixed winding, no boundary, several components.
     """
-    collapsed = np.flatnonzero((F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0]))
-    if collapsed.size:
-        raise ValueError(f"{named('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
     used = np.zeros(n, dtype=bool)
     used[F] = True
     if not used.all():
         raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(~used))}: no triangle uses them; remove them")
-    found = edges(F, n)
-    if found.nonmanifold.size or found.inconsistent.size:
-        _repeated(F)
-    if found.nonmanifold.size:
-        raise ValueError(f"{named_edges(found.nonmanifold)} in more than two triangles: not a surface")
-    if found.inconsistent.size:
-        raise ValueError(
-            f"mixed winding: {named_edges(found.inconsistent)} traversed in the same direction by both triangles; "
-            "orient all triangles alike"
-        )
+    found = manifold_edges(F, n)
     if not closed and not found.boundary.size:
         raise ValueError(
             "the surface is closed: it has no boundary to place; cut it open first "
@@ -57,6 +45,42 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
         raise ValueError(
             f"the mesh has {first.size} components, the first ones around {named('vertex', 'vertices', first)}: "
             "map them one at a time"
+        )
+    return found
+
+
+def manifold_edges(F: IntArray, n: int) -> Edges:
+    """The edges of triangles that form any number of surfaces, each consistently oriented.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles among the vertices ``0 … n - 1``.
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    Edges
+
+    Raises
+    ------
+    ValueError
+        With the first offending elements: triangles that use a vertex twice or are repeated, non-manifold edges,
+        mixed winding.
+    """
+    collapsed = np.flatnonzero((F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0]))
+    if collapsed.size:
+        raise ValueError(f"{named('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
+    found = edges(F, n)
+    if found.nonmanifold.size or found.inconsistent.size:
+        _repeated(F)
+    if found.nonmanifold.size:
+        raise ValueError(f"{named_edges(found.nonmanifold)} in more than two triangles: not a surface")
+    if found.inconsistent.size:
+        raise ValueError(
+            f"mixed winding: {named_edges(found.inconsistent)} traversed in the same direction by both triangles; "
+            "orient all triangles alike"
         )
     return found
 
