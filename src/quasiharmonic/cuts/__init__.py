@@ -1,0 +1,1 @@
+"""Where to cut a surface so that it lies flat."""

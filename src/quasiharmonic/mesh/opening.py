@@ -1,0 +1,76 @@
+"""A mesh opened along edges, its own vertices and triangles left as they are.
+
+What is cut gets corners of its own: a second set of triangles, ``FT``, whose indices tell apart what lies on either
+side of a cut. It is to ``F`` what texture corners are to vertices.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from quasiharmonic.arrays import IntArray, check_range, named_edges
+from quasiharmonic.mesh.seams import fans
+from quasiharmonic.mesh.topology import edge_keys
+
+
+class Corners(NamedTuple):
+    """The corners of triangles once a mesh is open along edges.
+
+    Attributes
+    ----------
+    FT : (f, 3) int64
+        The triangles, by copies of vertices. It is ``F`` where a vertex was not split; of a vertex that was, one copy
+        keeps its number and the others come after all vertices.
+    origin : (n + c,) int64
+        The vertex that each copy is of: ``origin[FT]`` is ``F``, and the first ``n`` are themselves.
+    """
+
+    FT: IntArray
+    origin: IntArray
+
+
+def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
+    """Open a mesh along edges.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles, of any kind. Where they touch at a vertex without being joined by edges they come apart, too.
+    cut : (k, 2) int64
+        Edges of the mesh, either end first. Those on the boundary are open already, and one alone, with both ends
+        inside, opens nothing.
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    Corners
+
+    Raises
+    ------
+    ValueError
+        When a cut is no edge of the mesh; the message names the first.
+    """
+    check_edges(F, cut, n)
+    sides = edge_keys(F, np.roll(F, -1, axis=1), n)
+    split, _ = fans(F, np.isin(sides, edge_keys(cut[:, 0], cut[:, 1], n)))
+    # Fans are numbered by first appearance.
+    vertex = F.ravel()[np.unique(split.ravel(), return_index=True)[1]]
+    order = np.argsort(vertex, kind="stable")
+    keeps = np.diff(vertex[order], prepend=-1) > 0
+    kept, copies = order[keeps], order[~keeps]
+    own = np.empty(vertex.size, dtype=np.int64)
+    own[kept] = vertex[kept]
+    own[copies] = np.arange(n, n + copies.size)
+    return Corners(own[split], np.concatenate([np.arange(n), vertex[copies]]))
+
+
+def check_edges(F: IntArray, pairs: IntArray, n: int) -> None:
+    """Raise a ValueError that names the first pairs of vertices, below ``n``, that no edge of the triangles joins."""
+    check_range("edges", pairs, n)
+    there = edge_keys(F, np.roll(F, -1, axis=1), n)
+    strange = ~np.isin(edge_keys(pairs[:, 0], pairs[:, 1], n), there)
+    if strange.any():
+        raise ValueError(f"{named_edges(pairs[strange])}: no triangle has such a side")
