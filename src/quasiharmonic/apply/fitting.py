@@ -1,4 +1,4 @@
-"""What a file holds, made ready for a map onto an outline: cut open, its boundary laid along it, edges split for room."""
+"""What a file holds made ready for a map onto an outline: cut open, its boundary laid along it, edges split."""
 
 from __future__ import annotations
 
@@ -109,9 +109,7 @@ def laid_along(
         # What has no loops is no surface; below it is said why.
         fills = False
     chosen = None if corners is None else corners.on(mesh.V, mesh.F)
-    places = boundary_to(
-        mesh.V, mesh.F, whole if fills else list(contours), corners=chosen, corner_angle=corner_angle
-    )
+    places = boundary_to(mesh.V, mesh.F, whole if fills else list(contours), corners=chosen, corner_angle=corner_angle)
     held = [] if chosen is None or isinstance(chosen, str) else list(chosen)
     problem = Problem(mesh.V, mesh.F, *places, reference=reference)
     return Fitted(mesh, problem, held, holes if fills else 0)

@@ -71,9 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
         "by edge (default: 20)",
     )
-    group.add_argument(
-        "--cut", action="store_true", help="cut a surface that is no disk open first (copies vertices)"
-    )
+    group.add_argument("--cut", action="store_true", help="cut a surface that is no disk open first (copies vertices)")
     group.add_argument(
         "--refine", action="store_true", help="split edges that leave the target no room (adds vertices at the end)"
     )

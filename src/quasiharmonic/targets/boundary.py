@@ -90,7 +90,14 @@ def boundary_to(
     if isinstance(corners, str) and corners != "auto":
         raise ValueError(f'corners are boundary vertices or "auto", not {corners!r}')
     by_angle = isinstance(corners, str)
-    pins = Pins(None if isinstance(corners, str) else corners, loops, contours, [one.reversed for one in found], corner_angle, exponent)
+    pins = Pins(
+        None if isinstance(corners, str) else corners,
+        loops,
+        contours,
+        [one.reversed for one in found],
+        corner_angle,
+        exponent,
+    )
     to = dict(pins.contour_of)
     if 0 not in to.values():
         # Of the loops that may go anywhere the one around the largest area goes outside.
