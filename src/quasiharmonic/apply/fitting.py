@@ -1,4 +1,4 @@
-"""What a file holds, made ready for a map onto an outline: cut open, its boundary laid along it, edges split for room."""
+"""What a file holds made ready for a map onto an outline: cut open, its boundary laid along it, edges split."""
 
 from __future__ import annotations
 

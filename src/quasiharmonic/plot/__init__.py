@@ -1,6 +1,7 @@
 """Pictures of surfaces and maps, drawn with matplotlib but without its global state or a display."""
 
 from quasiharmonic.plot.animation import save_animation, save_figures
+from quasiharmonic.plot.boundary import save_boundary_figure
 from quasiharmonic.plot.distortion import plot_distortion, save_distortion_figure
 from quasiharmonic.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
 from quasiharmonic.plot.texture import plot_texture, save_texture_figure
@@ -12,6 +13,7 @@ __all__ = [
     "plot_surface",
     "plot_texture",
     "save_animation",
+    "save_boundary_figure",
     "save_distortion_figure",
     "save_figures",
     "save_map_figure",

@@ -7,8 +7,8 @@ such that the runs between them are as straight as they can be. With Φ the dire
 leaps at each vertex by the turning there, that is the sum over runs of ∫ (Φ − mean of Φ)² ds, to be least: Φ is
 approached by a function with so many steps.
 
-Corners are taken away one after another, that one for which the sum grows least; its turning goes to its neighbours as a
-load on a beam goes to the ends. Then each moves to the best place between its neighbours until all are there.
+Corners are taken away one after another, that one for which the sum grows least; its turning goes to its neighbours as
+a load on a beam goes to the ends. Then each moves to the best place between its neighbours until all are there.
 """
 
 from __future__ import annotations
@@ -111,9 +111,9 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     Examples
     --------
     >>> from quasiharmonic.surfaces import grid
-    >>> [loop] = boundary_turning(*grid(2, 1))
-    >>> np.degrees(loop.turning).round().tolist()
-    [90.0, 0.0, 90.0, 90.0, 0.0, 90.0]
+    >>> [loop] = boundary_turning(*grid(2, 2))
+    >>> np.degrees(loop.turning).round().astype(int).tolist()
+    [90, 0, 90, 0, 90, 0, 90, 0]
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
