@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     io.write_obj(options.output, replace(mesh, vt=result.uv, FT=result.FT))
     written = io.read_obj(options.output)
     with report.after_writing(options.output):
-        parts = written.seamed.islands
+        parts = io.seamed(written).islands
         injective = bool(parts) and all(is_injective(part.F, part.uv) for part in parts)
         facts = {
             **result.to_dict(),

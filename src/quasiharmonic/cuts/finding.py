@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, index_array, triangle_array, vertex_array
-from quasiharmonic.cuts.graph import edge_graph
+from quasiharmonic.arrays import IntArray, check_range, index_array, triangle_array, vertex_array
+from quasiharmonic.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.cuts.reaching import reached
 from quasiharmonic.cuts.shortening import shortened
 from quasiharmonic.cuts.topological import opening_cuts
@@ -16,8 +17,18 @@ from quasiharmonic.mesh.opening import opened_along
 from quasiharmonic.mesh.surface import manifold_edges
 from quasiharmonic.mesh.topology import components, edge_keys
 
+# An edge that is not to be cut costs so many times its length: more than any way around.
+_DEAR = 1e6
 
-def find_cuts(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain: float = 0.1) -> IntArray:
+
+def find_cuts(
+    V: ArrayLike,
+    F: ArrayLike,
+    *,
+    edges: ArrayLike | None = None,
+    uncut: ArrayLike | None = None,
+    gain: float = 0.1,
+) -> IntArray:
     """Find edges along which to cut a surface so that each of its parts is a disk and lies flat with little distortion.
 
     First comes what topology asks for: handles and further boundary loops are opened, closed surfaces without handles
@@ -34,6 +45,8 @@ def find_cuts(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gai
     edges : (l, 2) array of int, optional
         Edges to be cut in any case. Where they cut a part off, that part is one to be made a disk. One alone with both
         ends inside opens nothing and is ignored.
+    uncut : (d, 2) array of int, optional
+        Edges not to be cut, such as diagonals of faces of four corners; every vertex must have others.
     gain : float
         By how much a cut must lower the mean symmetric Dirichlet energy (0 without distortion), for each piece of
         its length that is as long as the square root of the surface's area. Positive; more of it means fewer cuts,
@@ -65,7 +78,8 @@ def find_cuts(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gai
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    given = _edge_array(edges)
+    given, spared = _edge_array("edges", edges), _edge_array("uncut", uncut)
+    check_range("uncut", spared, len(V))
     if not isinstance(gain, Real) or not float(gain) > 0:
         raise ValueError(f"gain must be a positive number, not {gain!r}")
     inner = manifold_edges(F, len(V)).interior
@@ -76,27 +90,33 @@ def find_cuts(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gai
     for vertices, triangles in _parts(FT, len(origin)):
         number = np.zeros(len(origin), dtype=np.int64)
         number[vertices] = np.arange(vertices.size)
-        cut = _cut_part(V[origin[vertices]], number[FT[triangles]], float(gain))
+        graph = edge_graph(V[origin[vertices]], number[FT[triangles]])
+        ends = origin[vertices[graph.ends]]
+        dear = np.isin(_keys(ends, len(V)), _keys(spared, len(V)))
+        cut = _cut_part(replace(graph, cost=np.where(dear, _DEAR, 1.0) * graph.cost), float(gain))
         found.append(np.sort(origin[vertices[cut]], axis=1))
     return np.unique(np.concatenate(found), axis=0)
 
 
-def _cut_part(V: FloatArray, F: IntArray, gain: float) -> IntArray:
+def _cut_part(graph: EdgeGraph, gain: float) -> IntArray:
     """The edges (k, 2) that a connected surface is cut along."""
-    graph = edge_graph(V, F)
     cut = shortened(graph, opening_cuts(graph))
     if np.isfinite(gain):
         cut = shortened(graph, reached(graph, cut, gain))
     return graph.ends[cut]
 
 
-def _edge_array(edges: ArrayLike | None) -> IntArray:
-    array = index_array("edges", [] if edges is None else edges)
+def _edge_array(name: str, edges: ArrayLike | None) -> IntArray:
+    array = index_array(name, [] if edges is None else edges)
     if array.size == 0:
         return np.zeros((0, 2), dtype=np.int64)
     if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"edges must have shape (k, 2), two vertices each, not {array.shape}")
+        raise ValueError(f"{name} must have shape (k, 2), two vertices each, not {array.shape}")
     return array
+
+
+def _keys(pairs: IntArray, n: int) -> IntArray:
+    return edge_keys(pairs[:, 0], pairs[:, 1], n)
 
 
 def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:

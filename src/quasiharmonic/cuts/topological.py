@@ -92,7 +92,7 @@ def _long_path(graph: EdgeGraph) -> IntArray:
     path = graph.way_back(before, start)
     if path.size == 1:
         # Around a vertex that is a neighbour of both ends.
-        corners = graph.F[(graph.F == start).any(axis=1) & (graph.F == end).any(axis=1)][0]
+        corners = graph.F[(start == graph.F).any(axis=1) & (end == graph.F).any(axis=1)][0]
         around = int(corners[(corners != start) & (corners != end)][0])
         path = graph.numbers(np.array([start, around]), np.array([around, end]))
     return path

@@ -17,7 +17,7 @@ from quasiharmonic.io.off import read_off, write_off
 from quasiharmonic.io.per_triangle import FORMATS as PER_TRIANGLE_FORMATS
 from quasiharmonic.io.per_triangle import write_per_triangle
 from quasiharmonic.io.refined import refined_mesh
-from quasiharmonic.io.seamed import cut_at_seams, without_idle
+from quasiharmonic.io.seamed import cut_at_seams, seamed, without_idle
 
 __all__ = [
     "MAP_WRITERS",
@@ -39,6 +39,7 @@ __all__ = [
     "read_off",
     "read_problem",
     "refined_mesh",
+    "seamed",
     "vertex_places",
     "without_idle",
     "write_map",

@@ -91,11 +91,6 @@ class MeshData:
         """How many faces the file has."""
         return len(self.F) if self.polygons is None else len(self.polygons)
 
-    @property
-    def seamed(self) -> SeamedMesh:
-        """The mesh with the map that it carries, which may have seams; without places where it carries none."""
-        return SeamedMesh(self.V, self.F, self.FT, self.vt if self.FT is not None else None)
-
     def with_map(self, uv: ArrayLike) -> MeshData:
         """Return the same mesh with one texture coordinate for each vertex.
 

@@ -5,7 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.io.meshdata import MeshData, check_mapped, map_of
+from quasiharmonic.io.meshdata import MeshData, check_mapped, map_of, vertex_places
+from quasiharmonic.mesh.seams import SeamedMesh
+
+
+def seamed(mesh: MeshData) -> SeamedMesh:
+    """Return a mesh with the map that it carries, or without places where it carries none.
+
+    Raises
+    ------
+    MeshFileError
+        When it has the map on some faces only, and there are seams. Without seams the vertices that have a place are
+        all that is known, and those without are at NaN.
+    """
+    if mesh.FT is None or mesh.vt is None:
+        return SeamedMesh(mesh.V, mesh.F)
+    if (mesh.FT >= 0).all():
+        return SeamedMesh(mesh.V, mesh.F, mesh.FT, mesh.vt)
+    uv, seam = vertex_places(mesh)
+    if seam.any():
+        check_mapped(mesh)
+    return SeamedMesh(mesh.V, mesh.F, mesh.F, uv)
 
 
 def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -33,7 +53,7 @@ def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
     check_mapped(mesh)
     if mesh.FT is None:
         return mesh.V, mesh.F, map_of(mesh)
-    opened = mesh.seamed.opened()
+    opened = seamed(mesh).opened()
     assert opened.uv is not None
     return opened.V, opened.F, opened.uv
 
