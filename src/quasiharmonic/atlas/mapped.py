@@ -74,6 +74,11 @@ class MappedAtlas:
         found = [island.result.status for island in self.islands]
         return next((status for status in _FURTHEST_LAST if status in found), found[0])
 
+    def places(self) -> list[FloatArray]:
+        """For each island, where its vertices are, in the order in which its result has them."""
+        done = [one.result.uv * _MIRROR if one.mirrored else one.result.uv for one in self.islands]
+        return [*done, *(island.uv for island in self.mesh.islands[len(done) :])]
+
     def verdict(self) -> AtlasVerdict:
         """The exact verdict on the places as they are stored."""
         return certify(self.mesh)
@@ -102,9 +107,10 @@ def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, refle
     mesh : SeamedMesh
         A surface, if it has no seams; those in it may be anything else's edges.
     lower : callable
-        Called with each island; its result has a place for every vertex of it.
+        Called with each island; its result has a place for every vertex of it, and may have further ones at the end.
     reflect : bool
-        Hand islands that are mirrored over as their reflection, and reflect what comes out: they stay mirrored.
+        Of several islands, hand those that are mirrored over as their reflection, and reflect what comes out: they stay
+        mirrored. A single one that is mirrored is inverted, and nobody's purpose.
 
     Returns
     -------
@@ -131,10 +137,11 @@ def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, refle
             if np.isnan(island.uv).any():
                 raise KeyboardInterrupt
             continue
-        mirrored = reflect and is_mirrored(island.F, island.uv)
+        mirrored = reflect and len(islands) > 1 and is_mirrored(island.F, island.uv)
         with naming(island, len(islands)):
             result = lower(replace(island, uv=island.uv * _MIRROR) if mirrored else island)
-        places[k] = result.uv * _MIRROR if mirrored else result.uv
+        # A refinement of the island has further vertices, at the end.
+        places[k] = (result.uv * _MIRROR if mirrored else result.uv)[: len(island.vertices)]
         done.append(MappedIsland(island.triangles, mirrored, result))
     return MappedAtlas(mesh.with_places(places), tuple(done))
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, index_array, map_array, named
 from quasiharmonic.atlas.mapped import MappedAtlas, each_island, in_place_of
+from quasiharmonic.energy.deformation import positive_weights
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.flattening import flattened
 from quasiharmonic.flattening.layout import in_unit_square, side_by_side
@@ -56,12 +57,13 @@ def polish(
     ValueError
         When an island is not injective or no surface, named by its first triangle.
     """
+    weights = None if weights is None else positive_weights(weights, len(mesh.F))
     if free and fixed is not None:
         raise ValueError("with free borders nothing is held: leave fixed out, or free")
     held = _fixed(mesh, fixed)
 
     def lower(island: Island) -> MapResult:
-        own: dict[str, Any] = {} if weights is None else {"weights": np.asarray(weights)[island.triangles]}
+        own: dict[str, Any] = {} if weights is None else {"weights": weights[island.triangles]}
         if free:
             result = flattened.flatten(island.V, island.F, start=island.uv, **own, **rest)
             return replace(result, uv=in_place_of(island, result.uv))
@@ -179,12 +181,13 @@ def flatten(
     MappedAtlas
         In the surface's own unit of length, or in the unit square.
     """
+    weights = None if weights is None else positive_weights(weights, len(mesh.F))
     held = _fixed(mesh, fixed)
     if held is not None and mesh.uv is None:
         raise ValueError("nothing says where the fixed vertices go: the mesh has no places")
 
     def lay(island: Island) -> MapResult:
-        own: dict[str, Any] = {} if weights is None else {"weights": np.asarray(weights)[island.triangles]}
+        own: dict[str, Any] = {} if weights is None else {"weights": weights[island.triangles]}
         if start:
             own["start"] = island.uv
         pins = _held(island, held) if held is not None else np.empty(0, dtype=np.int64)

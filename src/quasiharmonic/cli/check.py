@@ -31,6 +31,11 @@ def add_parser(commands: Commands) -> None:
         help="judge the positions as a reader in this precision sees them (default: float64)",
     )
     parser.add_argument(
+        "--any-triangulation",
+        action="store_true",
+        help="ask too that every face is convex in the plane, so that the verdict holds however it is triangulated",
+    )
+    parser.add_argument(
         "--boundary",
         action="store_true",
         help="judge nothing, but number the boundary of the surface: its loops, and corners for qhm map --corners",
@@ -42,11 +47,10 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, judge, report; or tell of the boundary."""
-    import numpy as np
-
     from quasiharmonic import io
-    from quasiharmonic.cli import boundary, report
-    from quasiharmonic.exact.certificate import certify
+    from quasiharmonic.arrays import counted, named
+    from quasiharmonic.cli import boundary, judging, report
+    from quasiharmonic.exact.convexity import not_convex
 
     report.check_json(options.json, inputs=(options.input,))
     if options.boundary:
@@ -54,21 +58,32 @@ def run(options: argparse.Namespace) -> int:
     if options.plot is not None:
         raise ValueError("--plot draws what --boundary numbers: ask for that too, or for qhm plot")
     mesh = io.read_mesh(options.input)
-    V, F, uv = io.cut_at_seams(mesh)
-    if options.precision == "float32":
-        with np.errstate(over="ignore"):
-            uv = uv.astype(np.float32)
-    certificate = certify(F, uv)
-    further = len(V) - len(mesh.V)
+    judged = judging.judge(mesh, precision=options.precision)
+    further = len(judged.V) - len(mesh.V)
     facts = {
-        **report.verdict(certificate),
+        **judged.to_dict(),
+        # Of the triangles as they lie, mirrored ones included.
+        "injective": judged.certificate.injective,
         "input": str(options.input),
         "precision": options.precision,
         "triangles": len(mesh.F),
         "further_places": further,
     }
-    text = f"{options.input}: {certificate.summary()}"
+    lines = [f"{options.input}: {judged.certificate.summary()}"]
+    if judged.summary() != judged.certificate.summary():
+        lines.append(judged.summary().removeprefix(judged.certificate.summary()).strip())
     if further:
-        text += f"\nThe map has seams: vertices from {len(mesh.V)} on are further places of vertices there."
-    report.emit(facts, options.json, text)
-    return 0 if certificate.injective else 1
+        lines.append(f"The map has seams: vertices from {len(mesh.V)} on are further places of vertices there.")
+    good = judged.certificate.injective
+    if options.any_triangulation:
+        bent = not_convex(mesh.polygons, judged.F, judged.uv)
+        facts["not_convex"] = bent.tolist()
+        good = good and not bent.size
+        lines.append(
+            f"Not injective however it is triangulated: {named('face', 'faces', bent)} not convex in the plane."
+            if bent.size
+            else f"Every one of {counted('face', 'faces', mesh.faces)} is convex in the plane: that holds however they "
+            "are triangulated."
+        )
+    report.emit(facts, options.json, "\n".join(lines))
+    return 0 if good else 1

@@ -29,7 +29,9 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Make, map, write, judge, draw, report."""
     from quasiharmonic import io, surfaces, targets
-    from quasiharmonic.cli import map, report
+    from quasiharmonic.atlas.mapped import each_island
+    from quasiharmonic.cli import judging, map, report
+    from quasiharmonic.mesh.seams import SeamedMesh
     from quasiharmonic.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
 
@@ -41,11 +43,11 @@ def run(options: argparse.Namespace) -> int:
     V, F = surfaces.cat()
     (loop,) = boundary_loops(F, len(V))
     problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
-    result = map.search(problem, "speed", None, 2000, "auto")
-    certificate = map.write(folder / "demo.obj", io.MeshData(V, F), result)
+    mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
+    judged = judging.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(folder / "demo.obj"):
-        map.draw(folder / "demo.png", problem, result, certificate)
-        facts = {**result.to_dict(), **report.verdict(certificate), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), report.of_map(result, certificate, folder / "demo.obj"))
+        map.draw(folder / "demo.png", judged, [problem], mapped)
+        facts = {**mapped.to_dict(), **judged.to_dict(), **report.sizes(problem.domain)}
+        report.emit(facts, str(folder / "demo.json"), report.of_maps(mapped, judged, folder / "demo.obj"))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}")
-    return 0 if certificate.injective else 1
+    return 0 if judged.injective else 1

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from quasiharmonic.atlas import MappedAtlas
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.io import MeshData
-    from quasiharmonic.result import MapResult
 
 
 # Pieces are so many allowances apart: more than two, or these would touch.
@@ -21,7 +19,7 @@ _ROOM = 2.1
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments
+    from quasiharmonic.cli import arguments, seams
 
     parser = commands.add_parser(
         "flatten",
@@ -54,9 +52,7 @@ def add_parser(commands: Commands) -> None:
         help="vertices, 0-based, one a line, that are held where the input's vt have them",
     )
     parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
-    parser.add_argument(
-        "--cut", action="store_true", help="cut a closed surface, or one with handles, open first (copies vertices)"
-    )
+    seams.add_options(parser)
     parser.add_argument(
         "--pattern", type=Path, metavar="FILE", help="draw the outline true to scale too, as .svg or .dxf"
     )
@@ -74,80 +70,78 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, judge, report."""
-    from quasiharmonic import io
-    from quasiharmonic.cli import progress, report
+    from quasiharmonic import atlas, io
+    from quasiharmonic.cli import judging, progress, report, seams
     from quasiharmonic.energy.measures import distortion
-    from quasiharmonic.exact.certificate import certify
     from quasiharmonic.flattening.distances import distance_error
-    from quasiharmonic.flattening.flattened import flatten
     from quasiharmonic.flattening.patterns import write_pattern
 
     began = time.perf_counter()
-    inputs = options.input, options.weights, options.fixed
+    seams.check_options(options)
+    inputs = (
+        options.input,
+        options.weights,
+        options.fixed,
+        None if options.seams in ("file", "none") else Path(options.seams),
+    )
     report.check_outputs(options.output, None, options.json, inputs, pattern=options.pattern)
     _check_pattern(options)
     mesh = io.read_mesh(options.input)
     given: dict[str, Any] = {}
-    if options.start:
-        given["start"] = io.map_of(mesh)
+    if options.start or options.fixed is not None:
+        if options.cut or options.seams != "file":
+            raise ValueError("--start and --fixed are of the input's own map, and new seams leave nothing of it")
+        # Says what is missing of that map.
+        io.mapped(mesh)
     if options.fixed is not None:
-        _, _, given["fixed"], given["target"] = io.problem_arrays(mesh, io.read_handles(options.fixed, len(mesh.V)))
+        given["fixed"] = io.read_handles(options.fixed, len(mesh.V))
     if options.weights is not None:
         given["weights"] = _numbers(options.weights)
-    copies = 0
-    with report.about(options.input):
-        if options.cut:
-            if given:
-                raise ValueError("--cut makes new vertices, to which --start and --fixed say nothing: leave them out")
-            mesh, copies = _opened(mesh)
-        with progress.line() as show:
-            result = flatten(
-                mesh.V,
-                mesh.F,
-                energy=options.energy,
-                unit_square=options.unit_square,
-                rings=options.rings,
-                gap=_ROOM * options.allowance,
-                max_iterations=options.max_iterations,
-                linear_solver=options.linear_solver,
-                callback=show,
-                **given,
-            )
-    io.write_map(options.output, mesh, result.uv)
+    found = seams.surface(options, mesh, disks_too=True)
+    with report.about(options.input), progress.line() as show:
+        mapped = atlas.flatten(
+            found.mesh,
+            start=options.start,
+            energy=options.energy,
+            unit_square=options.unit_square,
+            rings=options.rings,
+            gap=_ROOM * options.allowance,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+            **given,
+        )
+    judged = judging.write(options.output, mesh.with_places(mapped.mesh))
     with report.after_writing(options.output):
-        written = io.read_mesh(options.output)
-        certificate = certify(written.F, io.map_of(written))
-        measured = distortion(mesh.V, mesh.F, result.uv)
+        flat = io.without_idle(judged.V, judged.F, judged.uv)
+        measured = distortion(*flat)
         facts = {
-            **result.to_dict(),
-            **report.verdict(certificate),
+            **mapped.to_dict(),
+            **judged.to_dict(),
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
-            "copied_vertices": copies,
+            **found.facts,
             "energy": options.energy,
-            # Each piece begins anew; of several, none is the energy of all.
-            "mean_energy": _mean_energy(result),
+            # Each island begins anew; of several, none is the energy of all.
+            "mean_energy": _mean_energy(mapped),
             "distortion": measured.to_dict(),
             "input": str(options.input),
             "output": str(options.output),
             "seconds_in_all": time.perf_counter() - began,
         }
         worst = measured.summary("isometric").maximum
-        lines = [report.of_map(result, certificate, options.output)]
-        if copies:
-            lines.append(f"cut open: {copies} vertices along the cut have a copy at the end of the list")
-        lines += [f"stretched {worst:.3g} times at worst"]
+        lines = [report.of_maps(mapped, judged, options.output), *found.notes, f"stretched {worst:.3g} times at worst"]
         if options.energy == "distances":
-            error = distance_error(mesh.V, mesh.F, result.uv, rings=options.rings)
+            error = distance_error(*flat, rings=options.rings)
             facts["distance_error"] = error.to_dict()
             lines.append(error.summary())
         if options.pattern is not None:
             facts["pattern"] = str(options.pattern)
-            write_pattern(options.pattern, mesh.F, result.uv, unit=options.unit, allowance=options.allowance)
+            write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)
             lines.append(f"wrote {options.pattern}, true to scale")
-        lines.append(result.status.value)
+        lines.append(mapped.status.value)
         report.emit(facts, options.json, "\n".join(lines))
-    return 0 if certificate.bijective else 1
+    return 0 if judged.apart else 1
 
 
 def _check_pattern(options: argparse.Namespace) -> None:
@@ -163,24 +157,10 @@ def _check_pattern(options: argparse.Namespace) -> None:
     check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
 
 
-def _mean_energy(result: MapResult) -> float | None:
-    """Of a surface in one piece; JSON has neither infinity nor NaN, which pins far apart may bring about."""
-    whole = sum(not step.iteration for step in result.history) == 1
-    return result.history[-1].energy if whole and isfinite(result.history[-1].energy) else None
-
-
-def _opened(mesh: MeshData) -> tuple[MeshData, int]:
-    """The mesh cut open, if it is closed or has handles, and how many vertices that has copied."""
-    from quasiharmonic.apply.cutting import cut_open
-    from quasiharmonic.mesh.topology import edges, trace_loops
-
-    found = edges(mesh.F, len(mesh.V))
-    euler = len(mesh.V) - len(found.interior) - len(found.boundary) + len(mesh.F)
-    if len(found.boundary) and euler == 2 - len(trace_loops(found.boundary)):
-        return mesh, 0
-    opened = cut_open(mesh.V, mesh.F)
-    extra = None if mesh.extra is None else mesh.extra[opened.origin]
-    return replace(mesh, V=opened.V, F=opened.F, extra=extra), len(opened.V) - len(mesh.V)
+def _mean_energy(mapped: MappedAtlas) -> float | None:
+    """Of one island; JSON has neither infinity nor NaN, which pins far apart may bring about."""
+    energy = mapped.islands[0].result.history[-1].energy
+    return energy if len(mapped.islands) == 1 and isfinite(energy) else None
 
 
 def _numbers(path: Path) -> list[float]:

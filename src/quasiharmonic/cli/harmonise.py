@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.atlas import MappedAtlas, SeamedMesh
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.problem import Domain
-    from quasiharmonic.result import MapResult, Step
+    from quasiharmonic.result import Step
 
 
 def add_parser(commands: Commands) -> None:
@@ -54,12 +54,12 @@ def run(options: argparse.Namespace) -> int:
     """Read, harmonise, write, judge, report."""
     from quasiharmonic.cli import polish
 
-    def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
-        from quasiharmonic.search.harmonising import harmonise_map
+    def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
+        from quasiharmonic import atlas
 
-        return harmonise_map(
-            domain,
-            uv,
+        return atlas.harmonise(
+            mesh,
+            fixed=fixed,
             energy=options.energy,
             eta=options.eta,
             max_iterations=options.max_iterations,

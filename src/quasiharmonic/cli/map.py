@@ -12,10 +12,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.atlas.mapped import MappedAtlas
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.cli.judging import Judged
+    from quasiharmonic.cli.targets import Posed
     from quasiharmonic.curves import Rails
-    from quasiharmonic.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
+    from quasiharmonic.mesh.refinement import Refined
+    from quasiharmonic.mesh.seams import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
 
@@ -72,7 +76,8 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
-    from quasiharmonic.cli import report, sliding, targets
+    from quasiharmonic.atlas.mapped import each_island
+    from quasiharmonic.cli import judging, report, seams, sliding, targets
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
@@ -84,36 +89,54 @@ def run(options: argparse.Namespace) -> int:
         # The handles of a folder say which vertices its own vt hold.
         fixed_path = None
     report.check_outputs(
-        options.output,
-        options.plot,
-        options.json,
-        inputs=(mesh_path, fixed_path, options.pieces, *targets.files(options)),
+        options.output, options.plot, options.json, inputs=(mesh_path, fixed_path, *targets.files(options))
     )
     mesh = io.read_mesh(mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
-    posed = targets.pose(options, mesh, fixed)
-    problem, slide = posed.problem, posed.slide
-    found = options.strategy, options.polish, options.max_iterations, options.linear_solver
-    result = search(problem, *found, slide=slide if options.polish else False)
-    if result.status is Status.INTERRUPTED and not result.history:
-        raise KeyboardInterrupt
-    if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-        result = smoothed(problem, result, slide)
-    certificate = write(options.output, posed.mesh, result)
+    targets.check_options(options, mesh, fixed)
+    found = seams.surface(options, mesh, disks_too=False)
+    islands = found.mesh.islands
+    if len(islands) > 1 and options.slide and options.to is not None:
+        raise ValueError(f"--slide is for one island on the outline, and there are {len(islands)}")
+    posed: list[Posed] = []
+    apart = targets.width(options) if options.to is not None and len(islands) > 1 else 0.0
+
+    def solved(island: Island) -> MapResult:
+        one = targets.pose(options, island, fixed, apart * len(posed))
+        posed.append(one)
+        problem = one.fitted.problem
+        chosen = options.strategy, options.polish, options.max_iterations, options.linear_solver
+        result = search(problem, *chosen, slide=one.slide if options.polish else False)
+        if result.status is Status.INTERRUPTED and not result.history:
+            raise KeyboardInterrupt
+        if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
+            result = smoothed(problem, result, one.slide)
+        return result
+
+    with report.about(mesh_path):
+        mapped = each_island(found.mesh, solved, reflect=options.to is None)
+    refined = [one.fitted.refined for one in posed]
+    written = refined_islands(mesh, mapped, refined) if any(refined) else mesh.with_places(mapped.mesh)
+    judged = judging.write(options.output, written)
     with report.after_writing(options.output):
         if options.plot is not None:
-            draw(options.plot, problem, result, certificate, options.plot_kind)
+            draw(options.plot, judged, [one.fitted.problem for one in posed], mapped, options.plot_kind)
         facts = {
-            **result.to_dict(),
-            **report.verdict(certificate),
-            **report.sizes(problem.domain),
-            **posed.facts,
+            **mapped.to_dict(),
+            **judged.to_dict(),
+            "vertices": len(written.V),
+            "triangles": len(written.F),
+            "fixed": sum(len(one.fitted.problem.fixed) for one in posed),
+            **({} if options.to is None else {"to": options.to}),
+            **found.facts,
+            **summed([one.facts for one in posed]),
             "input": str(options.input),
             "output": str(options.output),
             "seconds_in_all": time.perf_counter() - began,
         }
-        report.emit(facts, options.json, "\n".join([report.of_map(result, certificate, options.output), *posed.notes]))
-    return 0 if certificate.injective else 1
+        notes = [*found.notes, *dict.fromkeys(note for one in posed for note in one.notes)]
+        report.emit(facts, options.json, "\n".join([report.of_maps(mapped, judged, options.output), *notes]))
+    return 0 if judged.injective else 1
 
 
 def search(
@@ -156,36 +179,44 @@ def smoothed(problem: Problem, result: MapResult, slide: bool | Rails = False) -
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)
 
 
-def write(output: Path, mesh: MeshData, result: MapResult) -> Certificate:
-    """Write a map and judge the file as a reader gets it."""
-    from quasiharmonic import io
-    from quasiharmonic.cli import report
-    from quasiharmonic.exact.certificate import certify
+def refined_islands(mesh: MeshData, mapped: MappedAtlas, refined: list[Refined | None]) -> MeshData:
+    """The file with islands of which edges were split, and their maps."""
+    from quasiharmonic.atlas.refined import written_over
 
-    io.write_map(output, mesh, result.uv)
-    with report.after_writing(output):
-        written = io.read_mesh(output)
-        return certify(written.F, io.map_of(written))
+    return written_over(mesh, mapped.mesh.islands, refined, mapped.places())
 
 
-def draw(path: Path, problem: Problem, result: MapResult, certificate: Certificate, kind: str = "map") -> None:
-    """Draw the rest surface, Tutte's embedding and the map; or how it distorts."""
+def summed(facts: list[dict[str, int]]) -> dict[str, int]:
+    """What was done to all islands together."""
+    total: dict[str, int] = {}
+    for one in facts:
+        for name, value in one.items():
+            total[name] = value if isinstance(value, bool) else total.get(name, 0) + value
+    return total
+
+
+def draw(path: Path, judged: Judged, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:
+    """Draw the rest surface, Tutte's embedding of one island, and the map; or how it distorts."""
     import numpy as np
 
     from quasiharmonic.linsolve import NotPositiveDefinite
     from quasiharmonic.plot import save_distortion_figure, save_map_figure
     from quasiharmonic.search.solving import quasi_harmonic_map
 
+    V, F, uv = judged.V, judged.F, judged.uv
+    problem = problems[0]
+
     def framed(uv: NDArray[np.float64]) -> NDArray[np.float64]:
         # Of unit size, so that a picture of coordinates of 1e300 does not overflow.
         return problem.frame.inward(uv).view(np.float64).reshape(-1, 2)
 
-    rest = np.ldexp(problem.V, -int(np.frexp(np.abs(problem.V).max())[1]))
+    rest = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
     if kind == "distortion":
-        return save_distortion_figure(path, rest, problem.F, framed(result.uv))
+        return save_distortion_figure(path, rest, F, framed(uv))
+    if len(problems) > 1:
+        return save_map_figure(path, rest, F, framed(uv), flipped=judged.inverted)
     try:
-        tutte = framed(quasi_harmonic_map(problem, linear_solver=result.linear_solver))
+        tutte = framed(quasi_harmonic_map(problem, linear_solver=mapped.islands[0].result.linear_solver))
     except NotPositiveDefinite:
         tutte = None
-    inverted = np.concatenate([certificate.flipped, certificate.degenerate])
-    save_map_figure(path, rest, problem.F, framed(result.uv), tutte, flipped=inverted, fixed=problem.fixed)
+    save_map_figure(path, rest, F, framed(uv), tutte, flipped=judged.inverted, fixed=problem.fixed)

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from typing import TypeAlias
+    from typing import Any, TypeAlias
 
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.atlas import MappedAtlas, SeamedMesh
     from quasiharmonic.cli.arguments import Commands
     from quasiharmonic.energy.measures import Distortion
-    from quasiharmonic.problem import Domain
-    from quasiharmonic.result import MapResult, Step
+    from quasiharmonic.result import Step
 
-    Lower: TypeAlias = Callable[[Domain, NDArray[np.float64], Callable[[Step], None] | None], MapResult]
+    Lower: TypeAlias = Callable[[SeamedMesh, NDArray[np.int64] | None, Callable[[Step], None] | None], MappedAtlas]
 
 
 def add_parser(commands: Commands) -> None:
@@ -41,6 +41,11 @@ def add_parser(commands: Commands) -> None:
         "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"
     )
     parser.add_argument("--max-iterations", type=arguments.count, default=200, metavar="N", help="(default: 200)")
+    parser.add_argument(
+        "--free",
+        action="store_true",
+        help="let the boundary go where distortion is least, each island staying about where it is",
+    )
     sliding.add_options(parser)
     parser.add_argument(
         "--to",
@@ -58,20 +63,25 @@ def run(options: argparse.Namespace) -> int:
 
     if options.to is not None and not options.slide:
         raise ValueError("--to names the outline to slide along: add --slide")
+    if options.free and (options.slide or options.fixed is not None):
+        raise ValueError("with --free nothing holds the boundary: leave --slide and --fixed out")
     sliding.check_options(options)
 
-    def lower(domain: Domain, uv: NDArray[np.float64], show: Callable[[Step], None] | None) -> MapResult:
-        from quasiharmonic.energy.polishing import polish_map
+    def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
+        from quasiharmonic import atlas
 
-        return polish_map(
-            domain,
-            uv,
-            energy=options.energy,
-            max_iterations=options.max_iterations,
-            linear_solver=options.linear_solver,
-            callback=show,
-            slide=options.slide if options.to is None else sliding.along(options.to, pieces=options.pieces),
-        )
+        given: dict[str, Any] = {
+            "energy": options.energy,
+            "max_iterations": options.max_iterations,
+            "linear_solver": options.linear_solver,
+            "callback": show,
+        }
+        if options.free:
+            return atlas.polish(mesh, free=True, **given)
+        if options.to is not None and len(mesh.islands) > 1:
+            raise ValueError(f"--slide --to is for one island on the outline, and there are {len(mesh.islands)}")
+        slide = options.slide if options.to is None else sliding.along(options.to, pieces=options.pieces)
+        return atlas.polish(mesh, fixed=fixed, slide=slide, **given)
 
     return improve(options, lower, inputs=(options.pieces,))
 
@@ -79,40 +89,38 @@ def run(options: argparse.Namespace) -> int:
 def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = ()) -> int:
     """Read a map, lower its distortion, write, judge, report; for every command that does so.
 
-    ``inputs`` are files that it reads besides, which no output may replace.
+    What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``.
     """
     from quasiharmonic import io
-    from quasiharmonic.cli import map, progress, report
+    from quasiharmonic.cli import judging, progress, report
     from quasiharmonic.energy.measures import distortion
-    from quasiharmonic.problem import Domain
 
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
     mesh = io.read_mesh(options.input)
-    uv = io.map_of(mesh)
+    before = io.mapped(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-    with report.about(options.input):
-        V, F, held, _ = io.problem_arrays(mesh, fixed)
-        domain = Domain(V, F, held)
-        domain.check_boundary_fixed()
-        with progress.line() as show:
-            result = lower(domain, uv, show)
-    certificate = map.write(options.output, mesh, result)
+    with report.about(options.input), progress.line() as show:
+        after = lower(before, fixed, show)
+    judged = judging.write(options.output, mesh.with_places(after.mesh))
     with report.after_writing(options.output):
-        before, after = (distortion(domain.V, domain.F, w) for w in (uv, result.uv))
+        # Each with the vertices that its own seams give it, which may lie in different places.
+        opened = before.opened(), after.mesh.opened()
+        measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
         facts = {
-            **result.to_dict(),
-            **report.verdict(certificate),
-            **report.sizes(domain),
+            **after.to_dict(),
+            **judged.to_dict(),
+            "vertices": len(mesh.V),
+            "triangles": len(mesh.F),
             "input": str(options.input),
             "output": str(options.output),
-            "distortion_before": before.to_dict(),
-            "distortion": after.to_dict(),
+            "distortion_before": measured[0].to_dict(),
+            "distortion": measured[1].to_dict(),
         }
-        lines = [report.of_map(result, certificate, options.output)]
-        if certificate.injective:
-            lines += [_change(before, after), result.status.value]
+        lines = [report.of_maps(after, judged, options.output)]
+        if judged.injective:
+            lines += [_change(*measured), after.status.value]
         report.emit(facts, options.json, "\n".join(lines))
-    return 0 if certificate.injective else 1
+    return 0 if judged.injective else 1
 
 
 def _change(before: Distortion, after: Distortion) -> str:

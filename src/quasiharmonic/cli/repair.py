@@ -51,6 +51,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apply.repairing import repair
     from quasiharmonic.cli import progress, report
     from quasiharmonic.exact.certificate import is_injective
+    from quasiharmonic.mesh.seams import SeamedMesh
 
     if options.output.suffix.lower() != ".obj":
         raise ValueError(f"{options.output}: a map with seams is written as .obj")
@@ -74,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
     io.write_obj(options.output, replace(mesh, vt=result.uv, FT=result.FT))
     written = io.read_obj(options.output)
     with report.after_writing(options.output):
-        parts = io.seamed(written).islands
+        parts = SeamedMesh(written.V, written.F, written.FT, written.vt).islands
         injective = bool(parts) and all(is_injective(part.F, part.uv) for part in parts)
         facts = {
             **result.to_dict(),

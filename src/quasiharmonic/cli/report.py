@@ -10,20 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quasiharmonic.exact.certificate import Certificate
+    from quasiharmonic.atlas.mapped import MappedAtlas
+    from quasiharmonic.cli.judging import Judged
     from quasiharmonic.problem import Domain
-    from quasiharmonic.result import MapResult
-
-
-def verdict(certificate: Certificate) -> dict[str, Any]:
-    """The certificate's answer in the report's first line of keys."""
-    return {
-        "injective": certificate.injective,
-        "bijective": certificate.bijective,
-        "flipped": [int(t) for t in certificate.flipped],
-        "degenerate": [int(t) for t in certificate.degenerate],
-        "certificate": certificate.to_dict(),
-    }
 
 
 def sizes(domain: Domain) -> dict[str, Any]:
@@ -31,15 +20,18 @@ def sizes(domain: Domain) -> dict[str, Any]:
     return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
 
 
-def of_map(result: MapResult, certificate: Certificate, output: Path) -> str:
-    """Sentences about a map that was searched for and written."""
-    lines = [f"wrote {output}: {certificate.summary()}"]
-    if not certificate.injective:
-        lines.append(result.status.value)
-        if result.diagnosis is not None and result.diagnosis.obstructions:
-            lines.append(result.diagnosis.summary())
-    plural = "" if result.iterations == 1 else "s"
-    lines.append(f"{result.iterations} iteration{plural}, {result.seconds:.3g} s, {result.linear_solver}")
+def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
+    """Sentences about a map that was searched for and written, island by island."""
+    from quasiharmonic.arrays import counted
+
+    lines = [f"wrote {output}: {judged.summary()}"]
+    results = [island.result for island in mapped.islands]
+    if not judged.injective:
+        lines.append(mapped.status.value)
+        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
+    iterations = sum(result.iterations for result in results)
+    seconds = sum(result.seconds for result in results)
+    lines.append(f"{counted('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
     return "\n".join(lines)
 
 

@@ -6,7 +6,9 @@ import argparse
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quasiharmonic.cli import seams
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.fitting import Fitted
     from quasiharmonic.curves import Rails
     from quasiharmonic.io import MeshData
+    from quasiharmonic.mesh.seams import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets.asked_corners import AskedCorners
 
@@ -24,24 +27,22 @@ FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, wor
 
 @dataclass
 class Posed:
-    """What became of the input: a mesh, changed if need be, and a problem.
+    """The problem that the options make of an island.
 
     Attributes
     ----------
-    mesh : MeshData
-    problem : Problem
+    fitted : Fitted
         Its boundary on the curves it is to slide along, if it is to.
-    facts : dict
-        What was done, for the report.
+    facts : dict of str to int
+        What was done, for the report; of several islands they add up.
     notes : list of str
         The same in sentences.
     slide : bool or Rails
         Whether the boundary slides, and along what.
     """
 
-    mesh: MeshData
-    problem: Problem
-    facts: dict[str, Any] = field(default_factory=dict)
+    fitted: Fitted
+    facts: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     slide: bool | Rails = False
 
@@ -71,7 +72,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
         "by edge (default: 20)",
     )
-    group.add_argument("--cut", action="store_true", help="cut a surface that is no disk open first (copies vertices)")
+    seams.add_options(group)
     group.add_argument(
         "--refine", action="store_true", help="split edges that leave the target no room (adds vertices at the end)"
     )
@@ -83,55 +84,92 @@ def files(options: argparse.Namespace) -> tuple[Path | None, ...]:
     return tuple(Path(name) if name is not None and os.path.isfile(name) else None for name in names)
 
 
-def pose(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] | None) -> Posed:
-    """Make the problem that the options ask for.
+def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] | None) -> None:
+    """Raise a ValueError where options contradict each other, or the mesh does not say where its boundary goes."""
+    seams.check_options(options)
+    if options.to is not None:
+        return
+    for name in ("font", "corners", "corner_angle", "cut"):
+        value = getattr(options, name)
+        if value is not None and value is not False:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} says how the boundary goes to an outline: name one by --to")
+    if options.seams != "file":
+        raise ValueError("without --to the boundary goes where the input's vt have it, and so do its seams")
+    if mesh.FT is None and fixed is None:
+        raise ValueError(
+            f"{mesh.source}: no face refers to texture coordinates (vt), which would say where the boundary goes: "
+            "write some, or name an outline, as --to disk"
+        )
+    if mesh.FT is None:
+        raise ValueError(
+            f"{mesh.source}: no face refers to texture coordinates (vt), so nothing says where the fixed vertices go: "
+            "write it with uv coordinates, in OBJ vt lines and faces like 1/1 2/2 3/3"
+        )
+
+
+def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None, right: float) -> Posed:
+    """Make the problem that the options ask for of an island.
+
+    Parameters
+    ----------
+    options : Namespace
+    island : Island
+    fixed : (k,) int64 or None
+        The mesh's vertices to hold where their vt are; boundaries, if None.
+    right : float
+        How far the outline is shifted to the right, for its own place beside those of other islands.
 
     Raises
     ------
     ValueError, OSError, ModuleNotFoundError
         When options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
-    from quasiharmonic import io
-    from quasiharmonic.apply.fitting import Fitted, with_room
+    from quasiharmonic.apply.fitting import with_room
     from quasiharmonic.cli import report
-    from quasiharmonic.problem import Problem
 
-    if options.to is None:
-        for name in ("font", "corners", "corner_angle", "cut"):
-            value = getattr(options, name)
-            if value is not None and value is not False:
-                option = name.replace("_", "-")
-                raise ValueError(f"--{option} says how the boundary goes to an outline: name one by --to")
-        if mesh.FT is None and fixed is None:
-            raise ValueError(
-                f"{mesh.source}: no face refers to texture coordinates (vt), which would say where the boundary goes: "
-                "write some, or name an outline, as --to disk"
-            )
-        with report.about(mesh.source):
-            fitted = Fitted(mesh, Problem(*io.problem_arrays(mesh, fixed), reference=options.reference))
-        posed = Posed(mesh, fitted.problem)
-    else:
-        posed, fitted = _onto_outline(options, mesh)
-        if not options.refine:
-            with report.about(mesh.source):
-                _check_room(posed.problem, options.to)
+    posed = Posed(_as_given(options, island, fixed)) if options.to is None else _onto_outline(options, island, right)
+    if options.to is not None and not options.refine:
+        with report.about(options.input):
+            _check_room(posed.fitted.problem, options.to)
     if options.refine:
-        roomy = with_room(fitted)
-        posed.mesh, posed.problem = roomy.mesh, roomy.problem
-        posed.facts["added_vertices"] = roomy.added
-        if roomy.added:
-            edges = "edge" if roomy.added == 1 else "edges"
-            posed.notes.append(f"split {roomy.added} {edges}: new vertices are at the end of the list")
+        posed.fitted = with_room(posed.fitted)
+        posed.facts["added_vertices"] = posed.fitted.added
+        if posed.fitted.added:
+            edges = "edge" if posed.fitted.added == 1 else "edges"
+            posed.notes.append(f"split {posed.fitted.added} {edges}: new vertices are at the end of the list")
     if options.slide:
-        with report.about(mesh.source):
-            _slide(options, posed, fitted.held)
+        _slide(options, posed, island, right)
     return posed
 
 
-def _onto_outline(options: argparse.Namespace, mesh: MeshData) -> tuple[Posed, Fitted]:
+def _as_given(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None) -> Fitted:
+    """The island with its boundary, or what else is to be held, where its vt have it."""
+    import numpy as np
+
+    from quasiharmonic.apply.fitting import Fitted
+    from quasiharmonic.arrays import named
+    from quasiharmonic.mesh.topology import boundary_edges
+    from quasiharmonic.problem import Problem
+
+    if fixed is None:
+        own = np.unique(boundary_edges(island.F, len(island.vertices)))
+        if not own.size:
+            raise ValueError("there is no boundary that could be fixed: cut it open, or name fixed vertices")
+    else:
+        own = np.flatnonzero(np.isin(island.vertices, fixed))
+    nowhere = own[np.isnan(island.uv[own]).any(axis=1)]
+    if nowhere.size:
+        which = named("vertex", "vertices", island.vertices[nowhere])
+        raise ValueError(f"no place in the plane for the fixed {which}: give every fixed vertex a vt")
+    return Fitted(Problem(island.V, island.F, own, island.uv[own], reference=options.reference))
+
+
+def _onto_outline(options: argparse.Namespace, island: Island, right: float) -> Posed:
     """Lay the boundary along an outline."""
-    from quasiharmonic.apply.fitting import laid_along, opened
-    from quasiharmonic.arrays import counted
+    import numpy as np
+
+    from quasiharmonic.apply.fitting import laid_along
     from quasiharmonic.cli import report
     from quasiharmonic.targets import outline
 
@@ -140,27 +178,39 @@ def _onto_outline(options: argparse.Namespace, mesh: MeshData) -> tuple[Posed, F
     except ValueError as error:
         text = str(error)
         raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
-    facts: dict[str, Any] = {"to": options.to}
-    notes = []
-    if options.cut:
-        with report.about(mesh.source):
-            mesh, copies = opened(mesh)
-        facts["copied_vertices"] = copies
-        which = counted("vertex along the cut has", "vertices along the cut have", copies)
-        notes.append(f"cut open: {which} a copy at the end of the list" if copies else "a disk already: nothing to cut")
-    corners = None if options.corners is None else read_corners(options.corners)
+    if right:
+        contours = [contour + np.array([right, 0.0]) for contour in contours]
+    corners = None if options.corners is None else read_corners(options.corners).within(island.vertices)
     angle = 20.0 if options.corner_angle is None else options.corner_angle
-    with report.about(f"{mesh.source} --to {options.to}"):
-        fitted = laid_along(mesh, contours, corners=corners, corner_angle=angle, reference=options.reference)
+    with report.about(f"{options.input} --to {options.to}"):
+        fitted = laid_along(
+            island.V, island.F, contours, corners=corners, corner_angle=angle, reference=options.reference
+        )
+    posed = Posed(fitted)
     if fitted.filled:
-        facts["filled_holes"] = holes = fitted.filled
+        posed.facts["filled_holes"] = holes = fitted.filled
         which = "the hole" if holes == 1 else f"the {holes} holes"
-        notes.append(f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled")
-    return Posed(mesh, fitted.problem, facts, notes), fitted
+        posed.notes.append(
+            f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled"
+        )
+    return posed
 
 
-def _slide(options: argparse.Namespace, posed: Posed, held: list[int]) -> None:
+def width(options: argparse.Namespace) -> float:
+    """How far outlines stand apart, of which every island has one of its own."""
+    from quasiharmonic.targets import outline
+
+    contours = outline(options.to, font=options.font)
+    low, high = (float(pick(c[:, 0])) for pick, c in ((min, contours[0]), (max, contours[0])))
+    for contour in contours:
+        low, high = min(low, float(contour[:, 0].min())), max(high, float(contour[:, 0].max()))
+    return 1.05 * (high - low)
+
+
+def _slide(options: argparse.Namespace, posed: Posed, island: Island, right: float) -> None:
     """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
+    from dataclasses import replace
+
     from quasiharmonic.cli import sliding
     from quasiharmonic.energy.sliding import moved_onto
 
@@ -169,11 +219,11 @@ def _slide(options: argparse.Namespace, posed: Posed, held: list[int]) -> None:
         posed.slide = sliding.along(
             options.to,
             font=options.font,
-            held=held,
+            held=posed.fitted.held,
             corner_angle=20.0 if options.corner_angle is None else options.corner_angle,
             pieces=options.pieces,
         )
-    posed.problem = moved_onto(posed.slide, posed.problem)
+    posed.fitted = replace(posed.fitted, problem=moved_onto(posed.slide, posed.fitted.problem))
     posed.facts["slide"] = True
 
 

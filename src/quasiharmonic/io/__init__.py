@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import MeshFileError, OutputError
 from quasiharmonic.io.handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
-from quasiharmonic.io.meshdata import MeshData, map_of, vertex_places
+from quasiharmonic.io.meshdata import MeshData, in_plane, map_of, vertex_places
 from quasiharmonic.io.obj import read_obj, write_obj
 from quasiharmonic.io.off import read_off, write_off
 from quasiharmonic.io.per_triangle import FORMATS as PER_TRIANGLE_FORMATS
 from quasiharmonic.io.per_triangle import write_per_triangle
 from quasiharmonic.io.refined import refined_mesh
-from quasiharmonic.io.seamed import cut_at_seams, seamed, without_idle
+from quasiharmonic.io.seamed import cut_at_seams, mapped, seamed, without_idle
 
 __all__ = [
     "MAP_WRITERS",
@@ -31,6 +31,7 @@ __all__ = [
     "check_writable",
     "cut_at_seams",
     "map_of",
+    "mapped",
     "problem_arrays",
     "problem_files",
     "read_handles",
@@ -43,6 +44,7 @@ __all__ = [
     "vertex_places",
     "without_idle",
     "write_map",
+    "write_mapped",
     "write_obj",
     "write_off",
     "write_per_triangle",
@@ -53,10 +55,10 @@ __all__ = [
 _Path = str | os.PathLike[str]
 #: What a suffix means, in small letters: how to read a mesh and how to write its map. A new format goes into both.
 READERS: dict[str, Callable[[_Path], MeshData]] = {".obj": read_obj, ".off": read_off}
-MAP_WRITERS: dict[str, Callable[[_Path, MeshData, ArrayLike], None]] = {
-    ".obj": lambda path, mesh, uv: write_obj(path, mesh.with_map(uv)),
-    # OFF has room for one set of coordinates only.
-    ".off": lambda path, mesh, uv: write_off(path, mesh.as_plane(uv)),
+MAP_WRITERS: dict[str, Callable[[_Path, MeshData], None]] = {
+    ".obj": write_obj,
+    # OFF has room for one set of coordinates only, and so for no seams.
+    ".off": lambda path, mesh: write_off(path, in_plane(mesh)),
 }
 
 
@@ -82,11 +84,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
 
 
 def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> None:
-    """Write the map of a mesh, in the format that the suffix of the name says.
-
-    OBJ gets the mesh as it was read, with the map as its texture coordinates; OFF gets the map
-    alone, as a mesh in the plane z = 0. Numbers are written such that reading them gives the same
-    double. The file appears whole or not at all.
+    """Write a mesh with a place for each vertex as its map; as `write_mapped`.
 
     Parameters
     ----------
@@ -99,14 +97,36 @@ def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> No
 
     Raises
     ------
-    MeshFileError
-        When the format is not supported.
-    OutputError
-        When it cannot be written; the old file is then untouched.
+    MeshFileError, OutputError
+        As `write_mapped`.
     ValueError
         When ``uv`` has another shape or is not finite.
     """
-    MAP_WRITERS[_suffix(path, "written")](path, mesh, uv)
+    write_mapped(path, mesh.with_map(uv))
+
+
+def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write the map that a mesh carries, in the format that the suffix of the name says.
+
+    OBJ gets the mesh as it was read, with the map as its texture coordinates; OFF gets the map
+    alone, as a mesh in the plane z = 0. Numbers are written such that reading them gives the same
+    double. The file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Where to.
+    mesh : MeshData
+        The mesh, as `read_mesh` gave it, with a map (`MeshData.with_map`, `MeshData.with_places`).
+
+    Raises
+    ------
+    MeshFileError
+        When the format is not supported, or has no room for seams.
+    OutputError
+        When it cannot be written; the old file is then untouched.
+    """
+    MAP_WRITERS[_suffix(path, "written")](path, mesh)
 
 
 def check_output(path: str | os.PathLike[str]) -> None:

@@ -258,6 +258,20 @@ def map_of(mesh: MeshData) -> FloatArray:
     return uv
 
 
+def in_plane(mesh: MeshData) -> MeshData:
+    """The map that a mesh carries, as a mesh in the plane; vertices that no face uses where a row of their number is.
+
+    Raises
+    ------
+    MeshFileError
+        As `map_of`.
+    """
+    uv = map_of(mesh)
+    idle = np.isnan(uv).any(axis=1)
+    uv[idle] = mesh.vt[idle] if mesh.vt is not None and len(mesh.vt) == len(uv) else 0.0
+    return mesh.as_plane(uv)
+
+
 def is_planar(points: FloatArray) -> bool:
     """Whether points (n, 3) lie in a plane z = constant, up to what rounding to single precision leaves."""
     # In units of their size, a power of two: a difference of the largest doubles is none.

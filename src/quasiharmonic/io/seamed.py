@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.io.meshdata import MeshData, check_mapped, map_of, vertex_places
+from quasiharmonic.io.meshdata import MeshData, check_mapped, vertex_places
 from quasiharmonic.mesh.seams import SeamedMesh
 
 
@@ -26,6 +26,20 @@ def seamed(mesh: MeshData) -> SeamedMesh:
     if seam.any():
         check_mapped(mesh)
     return SeamedMesh(mesh.V, mesh.F, mesh.F, uv)
+
+
+def mapped(mesh: MeshData) -> SeamedMesh:
+    """Return a mesh with the map that it carries: its texture coordinates, or the plane that it lies in without any.
+
+    Raises
+    ------
+    MeshFileError
+        When the mesh has no map, or has it on some faces only.
+    """
+    check_mapped(mesh)
+    if mesh.FT is None:
+        return SeamedMesh(mesh.V, mesh.F, mesh.F, mesh.V[:, :2])
+    return SeamedMesh(mesh.V, mesh.F, mesh.FT, mesh.vt)
 
 
 def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -50,10 +64,7 @@ def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
     MeshFileError
         When the mesh has no map, or has it on some faces only.
     """
-    check_mapped(mesh)
-    if mesh.FT is None:
-        return mesh.V, mesh.F, map_of(mesh)
-    opened = seamed(mesh).opened()
+    opened = mapped(mesh).opened()
     assert opened.uv is not None
     return opened.V, opened.F, opened.uv
 

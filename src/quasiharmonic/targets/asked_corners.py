@@ -35,6 +35,28 @@ class AskedCorners:
 
     entries: tuple[tuple[int | Place, Goal | None], ...] | Literal["auto"]
 
+    def within(self, vertices: IntArray) -> AskedCorners | None:
+        """The corners asked for of an island, by its own numbers.
+
+        Parameters
+        ----------
+        vertices : (m,) int64
+            Which vertex of the mesh each of its own is, ascending; of one that is there twice the first is meant.
+
+        Returns
+        -------
+        AskedCorners or None
+            Without those of other islands; None if none is left.
+        """
+        if isinstance(self.entries, str) or np.array_equal(vertices, np.arange(len(vertices))):
+            return self
+        own = [
+            (int(np.searchsorted(vertices, who)) if isinstance(who, int) else who, goal)
+            for who, goal in self.entries
+            if not isinstance(who, int) or who in vertices
+        ]
+        return AskedCorners(tuple(own)) if own else None
+
     def on(self, V: ArrayLike, F: ArrayLike) -> Corners | Literal["auto"]:
         """The corners of a surface, as `boundary_to` takes them.
 
