@@ -77,16 +77,17 @@ def test_a_test_is_found_wherever_it_is_imported():
 
 
 def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
-    """Every package is of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
+    """Every package is required, of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
     wanted = {
         node.args[0].value
         for path in MODULES
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip"
     }
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
     brought = re.search(r"\[(.*)\]", extras["test"][0]).group(1).split(",")
-    installed = " ".join(line for name in ("test", *brought) for line in extras[name])
+    installed = " ".join(project["dependencies"] + [line for name in ("test", *brought) for line in extras[name]])
     optional = (ROOT / ".ci" / "optional").read_text(encoding="utf-8")
     assert "'.[test,view,cortex]' gmsh vtk" in optional
     assert "scikit-sparse" in optional

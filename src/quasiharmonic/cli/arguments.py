@@ -22,7 +22,7 @@ MEASURES = (
     "area_ratio",
     "shear",
 )
-LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "qdldl", "superlu"
+LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:

@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-            result = smoothed(problem, result, one.slide)
+            result = smoothed(problem, result, options.linear_solver, one.slide)
         return result
 
     with report.about(mesh_path):
@@ -163,7 +163,7 @@ def search(
         )
 
 
-def smoothed(problem: Problem, result: MapResult, slide: bool | Rails = False) -> MapResult:
+def smoothed(problem: Problem, result: MapResult, linear_solver: str, slide: bool | Rails = False) -> MapResult:
     """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
     from quasiharmonic.cli import progress
     from quasiharmonic.energy.polishing import polished
@@ -173,7 +173,15 @@ def smoothed(problem: Problem, result: MapResult, slide: bool | Rails = False) -
     if (len(problem.F) > LARGEST and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
         return result
     with progress.line() as show:
-        smoother = polished(problem, result, energy="blend", max_iterations=STEPS, callback=show, slide=slide)
+        smoother = polished(
+            problem,
+            result,
+            energy="blend",
+            max_iterations=STEPS,
+            linear_solver=linear_solver,
+            callback=show,
+            slide=slide,
+        )
     # Nobody asked for convergence, so it is not missed.
     interrupted = smoother.status is Status.INTERRUPTED
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)

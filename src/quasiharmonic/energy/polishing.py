@@ -219,16 +219,17 @@ def polished(
     *,
     energy: str | Energy,
     max_iterations: int = 200,
+    linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     slide: bool | Rails = False,
 ) -> MapResult:
-    """Polish the injective map of a result, by the linear solver that found it; stages and history are continued."""
+    """Polish the injective map of a result; stages and history are continued."""
     further = polish_map(
         problem.domain,
         result.uv,
         energy=energy,
         max_iterations=max_iterations,
-        linear_solver=result.linear_solver,
+        linear_solver=linear_solver,
         callback=callback,
         slide=slide,
     )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.linsolve.base import LinearSolver
@@ -24,9 +25,12 @@ __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "t
 BACKENDS = {
     "pardiso": ("mkl", "Pardiso"),
     "cholmod": ("cholmod", "Cholmod"),
+    "rslab": ("rslab", "Rslab"),
     "qdldl": ("qdldl", "Qdldl"),
     "superlu": ("superlu", "SuperLU"),
 }
+# Below this many unknowns QDLDL is tried before rslab, whose supernodes then cost more than they save.
+QDLDL_BELOW = 20_000
 
 
 def _backend(name: str) -> type[LinearSolver]:
@@ -35,14 +39,18 @@ def _backend(name: str) -> type[LinearSolver]:
     return backend
 
 
-def available() -> tuple[str, ...]:
-    """Names of the backends whose libraries are installed, best first; none of them is loaded."""
-    return tuple(name for name in BACKENDS if _backend(name).present())
+def available(unknowns: int = QDLDL_BELOW) -> tuple[str, ...]:
+    """Names of the backends whose libraries are installed, best first for so many unknowns; none of them is loaded."""
+    present = [name for name in BACKENDS if _backend(name).present()]
+    if unknowns < QDLDL_BELOW and {"qdldl", "rslab"} <= set(present):
+        young = present.index("rslab")
+        present[young : young + 2] = "qdldl", "rslab"
+    return tuple(present)
 
 
-def takes_order(name: str = "auto") -> bool:
-    """Whether the backend that `make_solver` takes by this name has a use for unknowns in a good order."""
-    chosen = available()[0] if name == "auto" else name
+def takes_order(name: str, unknowns: int) -> bool:
+    """Whether the backend that `make_solver` takes by this name has a use for so many unknowns in a good order."""
+    chosen = available(unknowns)[0] if name == "auto" else name
     return chosen in BACKENDS and _backend(chosen).takes_order
 
 
@@ -54,8 +62,8 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
     indptr, indices : (n+1,) and (nnz,) integer arrays
         Upper triangle of the pattern in compressed sparse rows: columns ascending within each row, every row starting
         with its diagonal entry.
-    name : {"auto", "pardiso", "cholmod", "qdldl", "superlu"}
-        Which backend to use. "auto" takes the first in this order that is installed and loads.
+    name : {"auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"}
+        Which backend to use. "auto" takes the first of `available` for this many unknowns that loads.
     ordered : bool
         The unknowns are numbered such that eliminating them in turn leaves a sparse factor, as
         `quasiharmonic.mesh.dissection` numbers them. A backend then looks for no order of its own, if it can be told.
@@ -73,13 +81,11 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
         The backend named is not installed, or its library does not load.
     """
     if name == "auto":
-        for candidate in BACKENDS:
-            backend = _backend(candidate)
-            if backend.present():
-                try:
-                    return backend(indptr, indices, ordered=ordered)
-                except ImportError:
-                    continue  # installed but broken; the last candidate comes with SciPy and always loads
+        for candidate in available(np.size(indptr) - 1):
+            try:
+                return _backend(candidate)(indptr, indices, ordered=ordered)
+            except ImportError:
+                continue  # installed but broken; the last candidate comes with SciPy and always loads
     if name not in BACKENDS:
         raise ValueError(
             f"there is no linear solver {name!r}; the names are 'auto', {', '.join(map(repr, BACKENDS))}, "

@@ -186,7 +186,7 @@ def solve(
         reference=search.best_reference,
     )
     if lower is not None and status is Status.INJECTIVE:
-        result = polished(problem, result, energy=lower, callback=callback, slide=slide)
+        result = polished(problem, result, energy=lower, linear_solver=linear_solver, callback=callback, slide=slide)
     return replace(result, seconds=time.perf_counter() - began)
 
 

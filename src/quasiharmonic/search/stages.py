@@ -106,9 +106,9 @@ class Search:
     ) -> None:
         self.problem = problem
         self._first = first
+        self.linear_solver = self._asked = linear_solver
         # Where rounding defeats one backend's factorisation, another's order of elimination may do.
-        self.linear_solver = linear_solver
-        self._spare = available() if linear_solver == "auto" else ()
+        self._spare: tuple[str, ...] | None = None if linear_solver == "auto" else ()
         self.callback = callback
         self.budget = budget
         self.record = record
@@ -171,7 +171,7 @@ class Search:
         """Run one stage, by another linear solver where one has failed; how it ended, or else the search so far."""
         status = self._descend(stage)
         while status is Status.UNSOLVABLE and self._spare and self._left > 0:
-            self.linear_solver = self._spare[0]
+            self._asked = self._spare[0]
             status = self._descend(replace(stage, resume=True))
         # That vertices got nowhere does not mean that tensors had settled.
         if status is not Status.INJECTIVE and stage.moves_vertices and before is Status.UNSOLVABLE:
@@ -186,9 +186,7 @@ class Search:
             return before
         done, began, best = max(len(self.history), 1), time.perf_counter(), self.best
         problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
-        status, uv, self.linear_solver = _on_coarse(
-            problem, stage.begins_with, self.linear_solver, self._left, self._note
-        )
+        status, uv, self.linear_solver = _on_coarse(problem, stage.begins_with, self._asked, self._left, self._note)
         if status in (Status.INJECTIVE, Status.INTERRUPTED):
             w = coarse.prolong(problem.frame.inward(uv))
             mesh = self.problem.domain.mesh("equilateral")
@@ -246,8 +244,11 @@ class Search:
         before, done, began = None, max(len(self.history), 1), time.perf_counter()
         status = Status.INTERRUPTED
         try:
-            objective = stage.objective(self.problem, self.linear_solver)
-            self.linear_solver = objective.laplacian.solver.name
+            objective = stage.objective(self.problem, self._asked)
+            solver = objective.laplacian.solver
+            self.linear_solver = solver.name
+            if self._spare is None:
+                self._spare = available(solver.n)
             if self.linear_solver in self._spare:
                 self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
             given = None if self.history else self._first
@@ -330,6 +331,6 @@ def _on_coarse(
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
         # Fine vertices crowd where coarse triangles are thin: a few steps against that pay many times over.
-        polish = polish_map(problem.domain, uv, energy="mips", max_iterations=10, linear_solver=search.linear_solver)
+        polish = polish_map(problem.domain, uv, energy="mips", max_iterations=10, linear_solver=linear_solver)
         uv = polish.uv
     return status, uv, search.linear_solver
