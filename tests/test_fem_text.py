@@ -279,7 +279,10 @@ def test_nothing_is_unpacked_beyond_what_there_is_room_for(tmp_path, form, coder
     zeros = bytes(32 << 20)
     claims = "compressed data are of 33554528 bytes, and there is room for 96"
     for data, message in (
-        (vtu(form, coder=lambda d: pack(d + zeros if len(d) == 48 else d), name=name), "not the 48 bytes that they should be"),
+        (
+            vtu(form, coder=lambda d: pack(d + zeros if len(d) == 48 else d), name=name),
+            "not the 48 bytes that they should be",
+        ),
         (vtu(form, points=np.concatenate([POINTS.ravel(), np.frombuffer(zeros)]), coder=pack, name=name), claims),
         (vtu(form, coder=lambda d: pack(d[:-1]), name=name), "not the 48 bytes that they should be"),
     ):

@@ -30,6 +30,7 @@ from quasiharmonic.cli import (
     repair,
     view,
 )
+from quasiharmonic.cli.interrupts import Interrupts
 from quasiharmonic.cli.report import ReportError
 
 COMMANDS = (
@@ -63,17 +64,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         # A terminal that cannot show a sign gets another; a report must not fail for that.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    options = _parser().parse_args(argv)
-    run: Callable[[argparse.Namespace], int] = options.run
-    try:
-        return run(options)
-    except ReportError as error:
-        return _fail(options.command, str(error), 1)
-    except (ValueError, OSError, ImportError, ArithmeticError, RuntimeError) as error:
-        # Wrong input of any kind: the library's messages name the elements and what to do.
-        return _fail(options.command, str(error), 2)
-    except KeyboardInterrupt:
-        return _fail(options.command, "interrupted, nothing was written", 2)
+    with Interrupts() as interrupts:
+        options = _parser().parse_args(argv)
+        run: Callable[[argparse.Namespace], int] = options.run
+        try:
+            return run(options)
+        except ReportError as error:
+            return _fail(options.command, str(error), 1)
+        except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            # Wrong input of any kind: the library's messages name the elements and what to do.
+            return _fail(options.command, str(error), 2)
+        except KeyboardInterrupt:
+            return _fail(options.command, "interrupted, nothing was written", 2)
+        except Exception as error:
+            if interrupts.happened:
+                return _fail(options.command, "interrupted, nothing was written", 2)
+            if isinstance(error, ImportError):
+                return _fail(options.command, str(error), 2)
+            raise
 
 
 def _fail(command: str, message: str, status: int) -> int:
