@@ -86,6 +86,28 @@ class TestFinding:
         ]  # fmt: skip
         assert names(stars / "a" / "input.obj") == ["input.obj"]
 
+    def test_a_list_names_no_folder_in_vain(self, stars):
+        (stars / "empty").mkdir()
+        (stars / "notes").mkdir()
+        (stars / "notes" / "other.obj").write_text("no problem by itself")
+        for name in ("empty", "notes"):
+            (stars / "list.txt").write_text(f"a\n{name}\nz\n")
+            with pytest.raises(ValueError, match=rf"list.txt: line 2: there is no problem in the folder '{name}'"):
+                names(stars / "list.txt")
+        assert names(stars / "list.txt", plain=True)[1] == "notes/other.obj"
+        # Named twice is not named in vain.
+        (stars / "list.txt").write_text("b/c\nb\nb\n")
+        assert names(stars / "list.txt") == ["b/c", "b/d/e"]
+
+    @pytest.mark.skipif(os.name != "posix", reason="makes links")
+    def test_links_that_lead_in_circles_hold_nobody_up(self, stars):
+        (stars / "one").symlink_to("two")
+        (stars / "two").symlink_to("one")
+        (stars / "b" / "self").symlink_to("self")
+        (stars / "b" / "nowhere").symlink_to("missing")
+        (stars / "b" / "up").symlink_to("..")
+        assert names(stars) == ["a", "b/c", "b/d/e", "z"]
+
     def test_lists(self, stars, tmp_path):
         elsewhere = write_stars(tmp_path / "elsewhere", ["y"])
         text = f"# a list\n\nz # the last\nb\n{elsewhere}/y\nb/c\na/input.obj\n"

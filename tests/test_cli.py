@@ -207,8 +207,18 @@ class TestReportFails:
         command = [sys.executable, "-m", "quasiharmonic", "map", str(star), "-o", str(tmp_path / "o.obj")]
         with open("/dev/full", "w") as full:
             done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
-        assert done.returncode == 1
+        assert done.returncode == 3
         assert "is written, but the report failed" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert run("check", tmp_path / "o.obj") == 0
+
+    @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
+    @pytest.mark.parametrize(("more", "status"), [("| true", 3), (">&-", 0), ("--json - >&-", 3)])
+    def test_closed_standard_output(self, star, tmp_path, more, status):
+        command = f"set -o pipefail; {sys.executable} -m quasiharmonic map {star} -o {tmp_path / 'o.obj'} {more}"
+        done = subprocess.run(["bash", "-c", command], stderr=subprocess.PIPE, text=True)
+        assert done.returncode == status
+        assert ("is written, but the report failed" in done.stderr) == (status == 3)
         assert "Traceback" not in done.stderr
         assert run("check", tmp_path / "o.obj") == 0
 
@@ -217,7 +227,7 @@ class TestReportFails:
             raise KeyboardInterrupt
 
         monkeypatch.setattr("quasiharmonic.plot.save_map_figure", interrupt)
-        assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 1
+        assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 3
         assert "o.obj is written; interrupted" in capsys.readouterr().err
 
     def test_interrupt_while_what_was_written_is_judged(self, star, tmp_path, capsys, monkeypatch):
@@ -225,7 +235,7 @@ class TestReportFails:
             raise KeyboardInterrupt
 
         monkeypatch.setattr("quasiharmonic.io.cut_at_seams", interrupt)
-        assert run("map", star, "-o", tmp_path / "o.obj") == 1
+        assert run("map", star, "-o", tmp_path / "o.obj") == 3
         assert "o.obj is written; interrupted" in capsys.readouterr().err
         assert (tmp_path / "o.obj").exists()
 

@@ -11,6 +11,7 @@ import pytest
 from quasiharmonic.exact.diagnosis import Kind, diagnose, examine, shortcuts
 from quasiharmonic.exact.diagnosis.clearance import clear
 from quasiharmonic.exact.diagnosis.clipping import Lattice
+from quasiharmonic.exact.diagnosis.effort import Effort
 from quasiharmonic.exact.diagnosis.triangulation import triangulate
 from quasiharmonic.exact.diagnosis.views import Views
 from quasiharmonic.exact.loops import contacts, winding
@@ -20,6 +21,7 @@ from quasiharmonic.surfaces import annulus, disk, grid
 from shared.meshes import boundary_of
 from shared.obstructed import OBSTRUCTED, onto
 from shared.polygons import U, circle, random_polygon, spiral
+from shared.small_meshes import loose_wheel, wheel
 
 
 def polygons():
@@ -92,9 +94,9 @@ def seen(here, eye, corners):
 def test_wedges_hold_what_is_seen_and_no_more(corners, rng):
     n = len(corners)
     k = np.arange(n)
-    views = Views(
-        np.stack([k, (k + 1) % n], axis=1), corners, Lattice(corners), np.stack([(k + 1) % n, (k - 1) % n], axis=1)
-    )
+    after, before = (k + 1) % n, (k - 1) % n
+    sides, beside = np.stack([k, after], axis=1), np.stack([after, before], axis=1)
+    views = Views(sides, corners, Lattice(corners), beside, Effort(10**9))
     low, high = corners.min(axis=0), corners.max(axis=0)
     points = low + (high - low) * rng.random((40, 2))
     for eye in range(n):
@@ -119,9 +121,9 @@ def test_directions_that_differ_by_a_rounding_are_sorted_exactly():
     corners = np.array([[0, 0], *([1 + 0.1 * k, 1e-30 * k] for k in range(9)), [0.5, 1.0]])
     n = len(corners)
     k = np.arange(n)
-    views = Views(
-        np.stack([k, (k + 1) % n], axis=1), corners, Lattice(corners), np.stack([(k + 1) % n, (k - 1) % n], axis=1)
-    )
+    after, before = (k + 1) % n, (k - 1) % n
+    sides, beside = np.stack([k, after], axis=1), np.stack([after, before], axis=1)
+    views = Views(sides, corners, Lattice(corners), beside, Effort(10**9))
     wedges = views.wedges(0)
     # Each wall but the two at the eye is seen, from right to left.
     assert wedges.wall.tolist() == [[j, j + 1] for j in range(1, n - 1)]
@@ -228,6 +230,46 @@ def test_what_takes_too_long_is_said_to_be_unchecked(monkeypatch):
     diagnosis = diagnose(problem)
     assert not diagnosis.obstructions
     assert "the fixed neighbours of vertex 8" in diagnosis.unchecked[0]
+
+
+def crooked_wheel(n, mesh=wheel):
+    """A hub that sees all of a star whose corners are at very different distances from the middle only."""
+    return onto(mesh(n), circle(n) * np.exp(2 * np.random.default_rng(0).normal(size=n))[:, None])
+
+
+@pytest.mark.parametrize("mesh", [wheel, loose_wheel])
+def test_hubs_of_thousands_of_neighbours_are_placed(mesh):
+    problem = crooked_wheel(2_000, mesh)
+    began = time.process_time()
+    diagnosis = diagnose(problem)
+    # A second or less where nothing else runs.
+    assert time.process_time() - began < 10
+    assert diagnosis.obstructions == ()
+    assert not any("sees" in words for words in diagnosis.unchecked)
+
+
+@pytest.mark.slow
+def test_a_place_is_looked_for_however_many_neighbours_there_are(monkeypatch):
+    # More views within views than functions may be called within functions.
+    monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
+    monkeypatch.setattr(examine, "MOST_EFFORT", 10**9)
+    assert diagnose(crooked_wheel(1_100)).obstructions == ()
+
+
+def test_effort_ends_within_one_star(monkeypatch):
+    monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
+    monkeypatch.setattr(examine, "MOST_EFFORT", 2_000)
+    diagnosis = diagnose(crooked_wheel(100))
+    assert diagnosis.obstructions == ()
+    assert "the fixed neighbours of vertex 100" in diagnosis.unchecked[0]
+
+
+@pytest.mark.slow
+def test_five_thousand_neighbours_take_some_seconds():
+    began = time.process_time()
+    assert diagnose(crooked_wheel(5_000)).obstructions == ()
+    # Five where nothing else runs.
+    assert time.process_time() - began < 40
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import lzma
 import struct
+import tracemalloc
 import zlib
 
 import numpy as np
@@ -269,6 +270,27 @@ def test_what_is_wrong_with_a_vtu_file_is_said(tmp_path, data, message):
     mesh = read_fem(tmp_path / "bad.vtu")
     with pytest.raises(MeshFileError, match="refers to what should be appended, but is not"):
         mesh.point_field("u", [0])
+
+
+@pytest.mark.parametrize("coder", [ZLIB, LZMA], ids=["zlib", "lzma"])
+@pytest.mark.parametrize("form", ["inline", "raw"])
+def test_nothing_is_unpacked_beyond_what_there_is_room_for(tmp_path, form, coder):
+    pack, name = coder
+    zeros = bytes(32 << 20)
+    claims = "compressed data are of 33554528 bytes, and there is room for 96"
+    for data, message in (
+        (
+            vtu(form, coder=lambda d: pack(d + zeros if len(d) == 48 else d), name=name),
+            "not the 48 bytes that they should be",
+        ),
+        (vtu(form, points=np.concatenate([POINTS.ravel(), np.frombuffer(zeros)]), coder=pack, name=name), claims),
+        (vtu(form, coder=lambda d: pack(d[:-1]), name=name), "not the 48 bytes that they should be"),
+    ):
+        tracemalloc.start()
+        refused(tmp_path / "bomb.vtu", data, message)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 16 << 20
 
 
 @pytest.mark.parametrize("form", ["ascii", "raw"])

@@ -18,6 +18,7 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.result import Status
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
 from shared.meshes import bend, boundary_of, lift
+from shared.polygons import circle
 
 
 def twisted(V, turns=0.2):
@@ -115,6 +116,29 @@ def test_an_area_lost_in_rounding(energy):
     result = polish(V, F, uv, fixed=[0, 1, 2], energy=energy)
     assert result.status is Status.POLISHED
     assert distortion(V, F, result.uv).area_ratio.min() > 0.1
+
+
+def nested_triangles(inner):
+    """A triangle (3, 4, 5) within another, and what is between them; positions with the inner one of such a size."""
+    corners = circle(3)
+    F = np.array([[3, 4, 5], [0, 1, 3], [1, 4, 3], [1, 2, 4], [2, 5, 4], [2, 0, 5], [0, 3, 5]])
+    return np.concatenate([corners, inner * corners]), F
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("iterations", [0, 5])
+@pytest.mark.parametrize(
+    ("outer", "inner", "slide"), [(1e300, 1e-25, False), (1e300, 1e-300, False), (3, 1e-320, True)]
+)
+def test_coordinates_that_span_more_than_a_unit_holds(energy, iterations, outer, inner, slide):
+    V, F = nested_triangles(0.3)
+    uv = nested_triangles(1.0)[0] * np.repeat([[outer], [inner]], 3, axis=0)
+    assert is_injective(F, uv)
+    result = polish(V, F, uv, fixed=[0, 1, 2], energy=energy, max_iterations=iterations, slide=slide)
+    assert result.injective
+    assert is_injective(F, result.uv)
+    if iterations == 0:
+        np.testing.assert_array_equal(result.uv, uv)
 
 
 def test_a_perfect_map_stays():

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import quasiharmonic
 import quasiharmonic.linsolve
-from quasiharmonic import Problem, Status, injective_map, quasi_harmonic_map, solve
+from quasiharmonic import InverseMap, Problem, Status, injective_map, quasi_harmonic_map, solve
 from quasiharmonic.descent import LBFGS, Alternating, Newton, Patches, RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.descent.untangling import untangled
 from quasiharmonic.energy.newton_system import NewtonSystem
@@ -502,3 +504,27 @@ def test_public_names_are_lazy_and_complete():
     assert set(quasiharmonic.__all__) <= set(dir(quasiharmonic))
     with pytest.raises(AttributeError, match="no attribute 'magic'"):
         quasiharmonic.magic  # noqa: B018
+
+
+@pytest.mark.parametrize("again", [lambda x: pickle.loads(pickle.dumps(x)), copy.deepcopy, copy.copy])
+def test_what_is_read_only_stays_so_when_copied(again):
+    problem, _ = OBSTRUCTED["nothing sees all"]
+    V, F, fixed, target = star_problem(n=60)
+    found = injective_map(V, F, fixed, target)
+    result = solve(problem)
+    for thing, names in (
+        (problem, ["target"]),
+        (problem.domain, ["V", "F", "fixed"]),
+        (found.certificate, ["flipped", "degenerate", "nonfinite", "crossings", "overwound", "loops"]),
+        (result.diagnosis.obstructions[0], ["vertices", "edges", "triangles", "loops", "split"]),
+        (InverseMap(V, F, found.uv), ["V", "F", "uv"]),
+    ):
+        other = again(thing)
+        for name in names:
+            for one in (thing, other):
+                value = getattr(one, name)
+                arrays = value if isinstance(value, tuple) else [value]
+                assert not any(array.flags.writeable for array in arrays), (type(thing), name)
+    once = again(replace(found, diagnosis=result.diagnosis))
+    assert not once.certificate.flipped.flags.writeable
+    assert not once.diagnosis.obstructions[0].split.flags.writeable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 import numpy as np
 import pytest
@@ -260,6 +261,32 @@ def test_huge_drawings(read, tmp_path, monkeypatch):
         read(drawing(""), tolerance=0)
     with pytest.raises(ValueError, match="there is no such file"):
         targets.read_svg(tmp_path / "none.svg")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<path d="M0 0' + "h1v1" * 500_001 + '"/>', "1,000,000 pieces"),
+        ('<path d="M0 0' + "c1 1 2 2 3 0" * 1_000_001 + '"/>', "1,000,000 pieces"),
+        ('<path d="M0 0c' + "1 1 2 2 3 0 " * 1_000_001 + '"/>', "1,000,000 pieces"),
+        ('<path d="M0 0' + "a9 9 0 015 1" * 1_500_000 + '"/>', "1,000,000 pieces"),
+        ('<path d="M0 0h1v1' + "z" * 9_000_000 + '"/>', "1,000,000 pieces"),
+        ('<circle r="1"/>' * 100_000, "1,000,000 pieces"),
+        ('<path d="M0 0h1v1z"/>' * 300_000, "1,000,000 pieces"),
+        ('<path d="M' + " " * 9_000_000 + '"/>', "a number is needed"),
+        ('<g transform="' + "scale(1)" * 9_000 + ' "/>', "more than 1,000 transforms"),
+        ("<g/>" * 1_000_001, "more than 1,000,000 elements"),
+    ],
+    ids=["lines", "curves", "unlettered", "arcs", "closings", "circles", "paths", "blanks", "transforms", "groups"],
+)
+def test_what_is_too_much_is_refused_soon(read, text, message):
+    text = drawing(text)
+    began = time.process_time()
+    with pytest.raises(ValueError, match=message):
+        read(text)
+    # Two seconds at most where nothing else runs.
+    assert time.process_time() - began < 6
 
 
 SAMPLE = drawing(

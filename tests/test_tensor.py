@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.field.tensor import PARAMETERISATIONS, SI_LOG, TANH
+from quasiharmonic.field.tensor import PARAMETERISATIONS, SI_LOG, TANH, own_tensor
 
 BOTH = list(PARAMETERISATIONS.values())
 
@@ -90,3 +90,8 @@ def test_defect_keeps_its_digits_where_mu_rounds_to_one():
     field = TANH.field(np.array([9.0 + 0j]))
     assert field.defect[0] == pytest.approx(1 / np.cosh(9.0) ** 2, rel=1e-13)
     assert SI_LOG.field(np.array([1e90 + 0j])).defect[0] > 0
+
+
+def test_a_derivative_next_to_nothing_divides_nothing():
+    p, q = np.array([[5e-324, 1e-310j, 1e-300, 2.0, 0], [5e-324, 1e-309, 5e-301, 1j, 0]], dtype=complex)
+    np.testing.assert_allclose(own_tensor(p, q), [0, 0, 0.5, 0.5j, 0])

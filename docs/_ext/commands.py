@@ -18,7 +18,9 @@ def _write(app: Sphinx) -> None:
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     lines = ["# The command `qhm`", "", str(parser.description), ""]
     lines += ["Exit status: 0 what was asked for holds; 1 a map was written or judged that is not injective;", ""]
-    lines[-2] += " 2 the input or the call is wrong, and nothing was written."
+    lines[-2] += (
+        " 2 the input or the call is wrong, and nothing was written; 3 a map was written, but not the report about it."
+    )
     for name, command in commands.choices.items():
         lines += [f"## qhm {name}", "", "```text", command.format_help().rstrip(), "```", ""]
     Path(app.srcdir, "command.md").write_text("\n".join(lines), encoding="utf-8")

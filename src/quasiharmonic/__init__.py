@@ -6,9 +6,13 @@ The public names are imported when they are first used, so that ``import quasiha
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+
+# As of `typing`, whose import would take longer than all else here.
+TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from quasiharmonic.apply.airmesh import AirMesh, Moment
     from quasiharmonic.apply.cutting import Opened, cut_open
     from quasiharmonic.apply.inverse import InverseMap, SurfacePoints

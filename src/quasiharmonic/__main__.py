@@ -1,5 +1,26 @@
-"""``python -m quasiharmonic``: the command `qhm`."""
+"""The command ``qhm``, which is ``python -m quasiharmonic``, as a process.
 
-from quasiharmonic.cli import main
+Nothing is imported before it is seen to that Ctrl-C ends the process in a sentence.
+"""
 
-raise SystemExit(main())
+
+def main() -> int:
+    """Run the command with the arguments of the process, which then ends; its exit status."""
+    try:
+        from quasiharmonic.cli import main as run
+
+        return run()
+    except KeyboardInterrupt:
+        import sys
+
+        print("qhm: interrupted, nothing was written", file=sys.stderr)
+        return 2
+    finally:
+        import signal
+
+        # What has been said stays true: all that is left to do is to end.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

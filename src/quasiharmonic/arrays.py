@@ -5,7 +5,7 @@ One wording for each error: whoever takes ``V``, ``F`` or rows of coordinates ta
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from numbers import Integral, Real
 from typing import Any
 
@@ -16,6 +16,22 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+class ReadOnly:
+    """What has arrays that nobody may change, in a copy or out of a pickle neither: NumPy forgets it there."""
+
+    def _read_only(self) -> Iterable[NDArray[Any]]:
+        """The arrays."""
+        raise NotImplementedError
+
+    def _seal(self) -> None:
+        for array in self._read_only():
+            array.flags.writeable = False
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._seal()
 
 
 def real_array(name: str, values: ArrayLike) -> FloatArray:

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_choice, check_range, vertex_array
+from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_choice, check_range, vertex_array
 from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.exact.point_location import PointLocator
 
@@ -50,7 +50,7 @@ class SurfacePoints:
         return self.triangle >= 0
 
 
-class InverseMap:
+class InverseMap(ReadOnly):
     """The inverse of a bijective map of a surface into the plane.
 
     Parameters
@@ -118,9 +118,11 @@ class InverseMap:
         self.uv = np.array(uv, dtype=np.float64)
         if len(self.V) != len(self.uv):
             raise ValueError(f"V must have as many rows as uv, {len(self.uv)}, not {len(self.V)}")
-        for array in (self.V, self.F, self.uv):
-            array.flags.writeable = False
+        self._seal()
         self._locator = PointLocator(self.uv[self.F])
+
+    def _read_only(self) -> tuple[FloatArray, IntArray, FloatArray]:
+        return self.V, self.F, self.uv
 
     def locate(self, points: ArrayLike) -> SurfacePoints:
         """The points of the surface that lie at places of the plane.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Iterator
@@ -56,7 +57,7 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
     Raises
     ------
     ValueError
-        When nothing is there, or a line of a list names nothing.
+        When nothing is there, or a line of a list names nothing, or a folder without problems.
     OSError
         When a folder or the list cannot be read.
     """
@@ -79,7 +80,7 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
         if here in above:
             return
         with os.scandir(folder) as entries:
-            kinds = sorted((entry.name, entry.is_dir()) for entry in entries)
+            kinds = sorted((entry.name, _is_folder(entry)) for entry in entries)
     except OSError as error:
         # Passing it over would lose the problems in it, and nobody would know.
         raise OSError(f"{folder}: the folder cannot be read: {error.strerror or error}") from error
@@ -95,6 +96,16 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
             yield from _below(folder / entry, inner, plain, above | {here})
         elif plain and os.path.splitext(entry)[1].lower() in READERS:
             yield ProblemFiles(inner, folder / entry, None)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Whether an entry of a folder is one; links that lead in a circle lead to none."""
+    try:
+        return entry.is_dir()
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        return False
 
 
 def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
@@ -116,7 +127,15 @@ def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
                 found = _below(place, "" if name == "." else name, plain, frozenset())
             else:
                 found = iter([ProblemFiles(name, place, None)])
+            none = True
             for problem in found:
+                none = False
                 if problem.name not in seen:
                     seen.add(problem.name)
                     yield problem
+            if none:
+                wanted = "a mesh" if plain else "a folder with input.obj"
+                raise ValueError(
+                    f"{path}: line {number}: there is no problem in the folder {text[:100]!r}: name {wanted}, or a "
+                    "folder above one"
+                )

@@ -1,8 +1,8 @@
 """The command ``qhm``.
 
 Exit status 0: what was asked for holds, and a written file is certified injective. 1: a map was written
-or judged that is not injective, or a map was written and the report about it failed. 2: the input or the
-call is wrong, and nothing was written.
+or judged that is not injective. 2: the input or the call is wrong, and nothing was written. 3: a map was
+written, but what should be told about it could not be, the verdict perhaps included.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from quasiharmonic.cli import (
     repair,
     view,
 )
+from quasiharmonic.cli.interrupts import Interrupts
 from quasiharmonic.cli.report import ReportError
 
 COMMANDS = (
@@ -63,17 +64,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         # A terminal that cannot show a sign gets another; a report must not fail for that.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    options = _parser().parse_args(argv)
-    run: Callable[[argparse.Namespace], int] = options.run
-    try:
-        return run(options)
-    except ReportError as error:
-        return _fail(options.command, str(error), 1)
-    except (ValueError, OSError, ImportError, ArithmeticError, RuntimeError) as error:
-        # Wrong input of any kind: the library's messages name the elements and what to do.
-        return _fail(options.command, str(error), 2)
-    except KeyboardInterrupt:
-        return _fail(options.command, "interrupted, nothing was written", 2)
+    with Interrupts() as interrupts:
+        options = _parser().parse_args(argv)
+        run: Callable[[argparse.Namespace], int] = options.run
+        try:
+            return run(options)
+        except ReportError as error:
+            return _fail(options.command, str(error), 3)
+        except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            # Wrong input of any kind: the library's messages name the elements and what to do.
+            return _fail(options.command, str(error), 2)
+        except KeyboardInterrupt:
+            return _fail(options.command, "interrupted, nothing was written", 2)
+        except Exception as error:
+            if interrupts.happened:
+                return _fail(options.command, "interrupted, nothing was written", 2)
+            if isinstance(error, ImportError):
+                return _fail(options.command, str(error), 2)
+            raise
 
 
 def _fail(command: str, message: str, status: int) -> int:
@@ -92,7 +100,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
-        epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written).",
+        epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written), 3 "
+        "written, but not what should be told about it.",
     )
     parser.add_argument("--version", action="version", version=f"qhm {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

@@ -34,10 +34,12 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the page."""
+    from quasiharmonic.cli import report
     from quasiharmonic.report import write_report
 
     folder: Path = options.records if options.records.is_dir() else options.records.parent
     output = options.output or folder / "report.html"
     write_report(output, options.records, options.against)
-    print(f"wrote {output}")
+    with report.after_writing(output):
+        print(f"wrote {output}", flush=True)
     return 0

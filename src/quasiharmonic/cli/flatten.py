@@ -27,7 +27,7 @@ def add_parser(commands: Commands) -> None:
         description="Map a surface with a boundary into the plane, its boundary going where distortion is least. No "
         "triangle is inverted, and nothing overlaps.",
         epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
-        "written. Ctrl-C writes the best map so far.",
+        "written; 3 written, but not what should be told about it. Ctrl-C writes the best map so far.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ or OFF file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")

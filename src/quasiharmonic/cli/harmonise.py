@@ -27,7 +27,8 @@ def add_parser(commands: Commands) -> None:
         description="Lower the distortion of the map that the input's texture coordinates (vt) give, by an energy that "
         "need not mind inversions, and keep it injective or make it so. Where polish has the energy it is faster.",
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips "
-        "and symmetric-dirichlet, a map that is not injective included), nothing written.",
+        "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but not what "
+        "should be told about it.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with a map")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")

@@ -38,7 +38,7 @@ def add_parser(commands: Commands) -> None:
         description="Place the free vertices of a mesh such that no triangle is inverted. Where the fixed vertices "
         "go is read from the input's texture coordinates (vt), or chosen by --to.",
         epilog="Exit status: 0 the written file is certified injective; 1 a map was written that is not; "
-        "2 wrong input or call, nothing written.",
+        "2 wrong input or call, nothing written; 3 a map was written, but not what should be told about it.",
     )
     parser.add_argument(
         "input", type=Path, help="OBJ file, or a folder with input.obj and handles.txt", metavar="INPUT"

@@ -25,7 +25,7 @@ def add_parser(commands: Commands) -> None:
         "inverted. Boundary vertices that are not moved stay. Positions are changed within the file; every other byte "
         "of it stays, data, times and physical groups included.",
         epilog="Exit status: 0 every triangle of the written mesh is positive, decided exactly; 1 not so; 2 wrong "
-        "input or call, nothing written.",
+        "input or call, nothing written; 3 written, but not what should be told about it.",
     )
     parser.add_argument(
         "input", type=Path, metavar="MESH", help="Gmsh .msh (2 or 4), legacy .vtk or .vtu; text or binary"

@@ -55,5 +55,6 @@ def run(options: argparse.Namespace) -> int:
             save_texture_figure(options.output, V, F, uv)
         else:
             save_map_figure(options.output, V, F, uv, flipped=flipped_triangles(F, uv))
-    print(f"wrote {options.output}")
+    with report.after_writing(options.output):
+        print(f"wrote {options.output}", flush=True)
     return 0

@@ -30,7 +30,7 @@ def add_parser(commands: Commands) -> None:
         help="lower the distortion of an injective map, which stays injective",
         description="Lower the distortion of the injective map that the input's texture coordinates (vt) give.",
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
-        "that is not injective included), nothing written.",
+        "that is not injective included), nothing written; 3 written, but not what should be told about it.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with an injective map")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")

@@ -27,7 +27,8 @@ def add_parser(commands: Commands) -> None:
         "with its first guess (vt), which qhm map then takes, the fixed vertices are written to OUTPUT.handles, and "
         "how the new mesh came from the old one to OUTPUT.origin.json (OUTPUT without its suffix).",
         epilog="Exit status: 0 written, and nothing known forbids an injective map any more; 1 written, but something "
-        "does that no refinement cures; 2 wrong input or call, nothing written.",
+        "does that no refinement cures; 2 wrong input or call, nothing written; 3 written, but not what should be told "
+        "about it.",
     )
     parser.add_argument(
         "input", type=Path, metavar="INPUT", help="OBJ file, or a folder with input.obj and handles.txt"

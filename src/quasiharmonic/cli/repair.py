@@ -21,7 +21,7 @@ def add_parser(commands: Commands) -> None:
         "may have seams; each of its islands is repaired on its own. Boundaries stay, and so does every vertex that "
         "need not move.",
         epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
-        "or call, nothing written.",
+        "or call, nothing written; 3 written, but not what should be told about it.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with texture coordinates")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")

@@ -38,6 +38,8 @@ def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
 def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
     """Print the sentences, write the JSON; with ``--json -`` standard output holds the JSON alone."""
     if destination == "-":
+        if sys.stdout is None:
+            raise OSError("standard output is closed")
         print(json.dumps(facts, allow_nan=False), flush=True)
         print(text, file=sys.stderr, flush=True)
         return

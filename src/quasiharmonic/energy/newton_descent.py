@@ -44,6 +44,11 @@ def in_units(uv: FloatArray, exponent: int) -> ComplexArray:
     return np.ldexp(uv, -exponent).view(np.complex128).ravel()
 
 
+def _out_of_units(w: ComplexArray, exponent: int) -> FloatArray:
+    """The way back."""
+    return np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
+
+
 class NewtonDescent:
     """The map at hand and how to get to the next.
 
@@ -78,6 +83,9 @@ class NewtonDescent:
         self.fixed, self._pinned = fixed, uv[fixed]
         self.exponent = exponent
         self.w: ComplexArray = in_units(uv, exponent)
+        # What is too small for the unit does not come back from it.
+        self._faint = np.flatnonzero((_out_of_units(self.w, exponent) != uv).any(axis=1))
+        self._faint_uv, self._faint_w = uv[self._faint], self.w[self._faint]
         self.system = self._system(len(uv), linear_solver)
         self._deformation = self.energy.deform(self.w)
         self.value = self.first = self.energy.value_of(self._deformation)
@@ -91,8 +99,10 @@ class NewtonDescent:
         return self.first, self.value
 
     def positions(self, w: ComplexArray) -> FloatArray:
-        """A map as the caller gets it, the fixed vertices to the last bit."""
-        uv = np.ldexp(w.view(np.float64).reshape(-1, 2), self.exponent)
+        """A map as the caller gets it, the fixed vertices and those that have not moved to the last bit."""
+        uv = _out_of_units(w, self.exponent)
+        still = w[self._faint] == self._faint_w
+        uv[self._faint[still]] = self._faint_uv[still]
         uv[self.fixed] = self._pinned
         return uv
 

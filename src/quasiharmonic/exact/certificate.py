@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_range, map_array, named, triangle_rows
+from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_range, map_array, named, triangle_rows
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.mesh.topology import edges, trace_loops
@@ -49,7 +49,7 @@ TRIANGLE_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(ReadOnly):
     """What was decided exactly about a map; made by `certify`.
 
     Attributes
@@ -83,8 +83,10 @@ class Certificate:
     overwound: IntArray
 
     def __post_init__(self) -> None:
-        for array in (self.flipped, self.degenerate, self.nonfinite, self.crossings, self.overwound, *self.loops):
-            array.flags.writeable = False
+        self._seal()
+
+    def _read_only(self) -> tuple[IntArray, ...]:
+        return self.flipped, self.degenerate, self.nonfinite, self.crossings, self.overwound, *self.loops
 
     @property
     def injective(self) -> bool:

@@ -193,11 +193,11 @@ def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:
     Returns
     -------
     (f,) complex128
-        Of modulus 1 where a triangle has no area.
+        Of modulus 1 where a triangle has no area, and 0 where its sides have no length, or none to divide by.
     """
     inverted = np.abs(q) > np.abs(p)
     small, large = np.where(inverted, p.conj(), q), np.where(inverted, q.conj(), p)
-    return np.divide(small, large, out=np.zeros_like(p), where=large != 0)
+    return np.divide(small, large, out=np.zeros_like(p), where=np.abs(large) >= np.finfo(np.float64).tiny)
 
 
 def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -37,10 +37,13 @@ _KINDS = {
 _APPENDED = re.compile(rb"<AppendedData[^>]*>")
 _OFFSET = re.compile(rb"""(\soffset\s*=\s*["'])\s*(\d+)\s*(["'])""")
 _TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
-_Coder = tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]
+# What unpacking may take beside what is unpacked, bytes; the densest preset takes half of it.
+_LZMA_MEMORY = 128 << 20
+# From bytes to packed ones, and what takes a part of the way back.
+_Coder = tuple[Callable[[bytes], bytes], Callable[[], Any]]
 _CODERS: dict[str, _Coder] = {
-    "vtkZLibDataCompressor": (zlib.compress, zlib.decompress),
-    "vtkLZMADataCompressor": (lzma.compress, lzma.decompress),
+    "vtkZLibDataCompressor": (zlib.compress, zlib.decompressobj),
+    "vtkLZMADataCompressor": (lzma.compress, partial(lzma.LZMADecompressor, memlimit=_LZMA_MEMORY)),
 }
 
 
@@ -72,9 +75,10 @@ def read_vtu(data: bytes) -> MeshParts:
     precision = points.attributes.get("type")
     if precision not in ("Float32", "Float64") or points.attributes.get("NumberOfComponents") != "3":
         raise ValueError(f"its positions are not three Float32 or Float64 each but {precision}")
-    place = file.values(points).reshape(-1, 3)
-    lists = [file.values(file.only("Cells", name)).astype(np.int64) for name in ("connectivity", "offsets", "types")]
-    F = triangles(lists[0], np.concatenate([[0], lists[1]]), lists[2], len(place))
+    place = file.values(points, 3 * file.points).reshape(-1, 3)
+    ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
+    connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
+    F = triangles(connectivity, np.concatenate([[0], ends]), kinds, len(place))
     fields = {name: partial(_rows, file, array) for name, array in file.point_data.items()}
     kind = np.dtype(_KINDS[precision])
     return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replaced, points))
@@ -82,7 +86,7 @@ def read_vtu(data: bytes) -> MeshParts:
 
 def _rows(file: _VtuFile, array: _Array) -> FloatArray:
     components = int(array.attributes.get("NumberOfComponents", "1"))
-    return file.values(array).astype(np.float64).reshape(-1, components)
+    return file.values(array, file.points * components).astype(np.float64).reshape(-1, components)
 
 
 class _VtuFile:
@@ -97,7 +101,7 @@ class _VtuFile:
         self._path: list[str] = []
         self._open: tuple[dict[str, str], int] | None = None
         self._file: dict[str, str] = {}
-        self._pieces = 0
+        self._pieces: list[dict[str, str]] = []
         tag = _APPENDED.search(data)
         # What is appended need not be XML.
         head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
@@ -110,8 +114,9 @@ class _VtuFile:
             raise ValueError(f"it is not the XML of a VTU file: {error}") from error
         if self._file.get("type") != "UnstructuredGrid":
             raise ValueError("it is not a VTU file of an unstructured grid")
-        if self._pieces != 1:
-            raise ValueError(f"it has {self._pieces} pieces: merge them into one")
+        if len(self._pieces) != 1:
+            raise ValueError(f"it has {len(self._pieces)} pieces: merge them into one")
+        self.points, self.cells = (int(self._pieces[0].get(f"NumberOf{what}", "0")) for what in ("Points", "Cells"))
         self._order = {"LittleEndian": "<", "BigEndian": ">"}.get(self._file.get("byte_order", "LittleEndian"), "<")
         self._word = np.dtype(self._order + _KINDS[self._file.get("header_type", "UInt32")])
         compressor = self._file.get("compressor")
@@ -136,15 +141,16 @@ class _VtuFile:
             raise ValueError(f"it has {len(found)} arrays of {what}: one is needed, of one time")
         return found[0]
 
-    def values(self, array: _Array) -> NDArray[Any]:
-        """The numbers of an array."""
+    def values(self, array: _Array, most: int) -> NDArray[Any]:
+        """The numbers of an array, of which there may be so many."""
         kind = _KINDS.get(array.attributes.get("type", ""))
         if kind is None:
             raise ValueError(f"arrays of {array.attributes.get('type')} are no numbers")
         if array.attributes.get("format") == "ascii":
             text = self._data[array.begin : array.end].split()
             return np.array(text, dtype=np.bytes_).astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)
-        return np.frombuffer(self._block(array)[0], np.dtype(self._order + kind))
+        number = np.dtype(self._order + kind)
+        return np.frombuffer(self._block(array, most * number.itemsize)[0], number)
 
     def replaced(self, array: _Array, points: FloatArray) -> bytes:
         """The file with the first two of every three numbers of an array changed."""
@@ -152,8 +158,9 @@ class _VtuFile:
             reader = TableReader(self._data, array.begin, array.end, None)
             table = reader.tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
             return replaced(self._data, table, points)
-        block, begin, end = self._block(array)
-        numbers = np.frombuffer(block, np.dtype(self._order + _KINDS[array.attributes["type"]])).reshape(-1, 3).copy()
+        number = np.dtype(self._order + _KINDS[array.attributes["type"]])
+        block, begin, end = self._block(array, 3 * self.points * number.itemsize)
+        numbers = np.frombuffer(block, number).reshape(-1, 3).copy()
         with np.errstate(over="ignore"):
             numbers[:, :2] = points
         if numbers.tobytes() == block:
@@ -175,7 +182,7 @@ class _VtuFile:
         if name == "VTKFile":
             self._file = attributes
         elif name == "Piece":
-            self._pieces += attributes.get("NumberOfPoints") != "0"
+            self._pieces += [attributes] * (attributes.get("NumberOfPoints") != "0")
         elif name in ("DataArray", "Array"):
             self._open = attributes, self._parser.CurrentByteIndex
         self._path.append(name)
@@ -191,8 +198,8 @@ class _VtuFile:
             self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
             self._open = None
 
-    def _block(self, array: _Array) -> tuple[bytes, int, int]:
-        """The bytes of an array, and where they stand in the file, coded as they are there."""
+    def _block(self, array: _Array, most: int) -> tuple[bytes, int, int]:
+        """The bytes of an array, so many at most, and where they stand in the file, coded as they are there."""
         begin, raw = self._where(array)
         take = _take_raw if raw else _take_base64
         size = self._word.itemsize
@@ -202,14 +209,27 @@ class _VtuFile:
             return block[size:], begin, end
         (count,) = np.frombuffer(take(self._data, begin, size)[0], self._word).tolist()
         header, at = take(self._data, begin, size * (3 + count))
-        lengths = np.frombuffer(header, self._word)[3:].tolist()
+        part, last, *lengths = np.frombuffer(header, self._word)[1:].tolist()
+        sizes = [part] * (count - 1) + [last or part] * (count > 0)
+        if sum(sizes) > most:
+            raise ValueError(f"compressed data are of {sum(sizes)} bytes, and there is room for {most}")
         packed, end = take(self._data, at, sum(lengths))
-        ends = np.cumsum([0, *lengths]).tolist()
-        try:
-            whole = b"".join(self._coder[1](packed[a:b]) for a, b in pairwise(ends))
-        except (zlib.error, lzma.LZMAError) as error:
-            raise ValueError(f"compressed data are damaged: {error}") from error
+        ends = accumulate(lengths, initial=0)
+        whole = b"".join(self._unpacked(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True))
         return whole, begin, end
+
+    def _unpacked(self, packed: bytes, size: int) -> bytes:
+        """Bytes as they were before they were compressed to those given."""
+        assert self._coder is not None
+        coder = self._coder[1]()
+        try:
+            # One byte more would be one too many, and what it is does not matter.
+            whole: bytes = coder.decompress(packed, size + 1)
+        except (zlib.error, lzma.LZMAError, OverflowError) as error:
+            raise ValueError(f"compressed data are damaged: {error}") from error
+        if len(whole) != size or not coder.eof:
+            raise ValueError(f"compressed data are damaged: they are not the {size} bytes that they should be")
+        return whole
 
     def _coded(self, block: bytes, array: _Array) -> bytes:
         """Bytes coded as those of an array of the same length are in the file."""

@@ -10,14 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import IntArray, check_range, index_array, named, triangle_array, vertex_array
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    ReadOnly,
+    check_range,
+    index_array,
+    named,
+    triangle_array,
+    vertex_array,
+)
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh, rest_frames
 from quasiharmonic.mesh.surface import surface_edges
 from quasiharmonic.mesh.topology import trace_loops
 
 
-class Domain:
+class Domain(ReadOnly):
     """A surface with some of its vertices held: all that does not change while they move.
 
     Parameters
@@ -57,9 +66,11 @@ class Domain:
         self.edges = surface_edges(self.F, len(self.V))
         self.loops = trace_loops(self.edges.boundary)
         self.fixed = _fixed(fixed, len(self.V))
-        for array in (self.V, self.F, self.fixed):
-            array.flags.writeable = False
+        self._seal()
         self._empty_caches()
+
+    def _read_only(self) -> tuple[FloatArray, IntArray, IntArray]:
+        return self.V, self.F, self.fixed
 
     def _empty_caches(self) -> None:
         """Nothing made yet of what is made when it is first asked for, and kept."""
@@ -72,7 +83,7 @@ class Domain:
         return {name: getattr(self, name) for name in ("V", "F", "edges", "loops", "fixed")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
+        super().__setstate__(state)
         self._empty_caches()
 
     @contextmanager

@@ -10,13 +10,13 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_choice, check_finite, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, check_finite, real_array
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.frame import Frame
 
 
-class Problem:
+class Problem(ReadOnly):
     """A mesh with positions in the plane for its boundary and any pinned interior vertices.
 
     What is malformed raises; what is merely hard or hopeless (a target that crosses itself, is wound
@@ -99,8 +99,11 @@ class Problem:
     def _pose(self, domain: Domain, target: ArrayLike, reference: Reference | None) -> None:
         self.domain = domain
         self.target = _target(target, len(domain.fixed))
-        self.target.flags.writeable = False
         self.reference = reference
+        self._seal()
+
+    def _read_only(self) -> tuple[FloatArray]:
+        return (self.target,)
 
     def moved(self, target: ArrayLike) -> Problem:
         """The same problem with its fixed vertices elsewhere.

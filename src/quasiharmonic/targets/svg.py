@@ -22,11 +22,13 @@ from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.textual import read_text
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces, as_complex, flatten
 from quasiharmonic.targets.nesting import arranged
-from quasiharmonic.targets.svgpath import parse_path
+from quasiharmonic.targets.svgpath import commands, parse_path
 
 _SVG = "http://www.w3.org/2000/svg"
 MOST_BYTES = 64 << 20
 _DEEPEST = 200
+_MOST_TRANSFORMS = 1000
+_TOO_MANY = f"more than {MOST_POINTS:,} pieces in all"
 # Squares of coordinates, and their sums, must neither overflow nor vanish.
 _LARGEST = 1e150
 _CONTAINERS = "svg", "g", "a", "switch"
@@ -119,8 +121,9 @@ class _Drawing:
 
     def __init__(self, path: str | os.PathLike[str], arcs: bool) -> None:
         self.path, self.arcs = path, arcs
-        self.subpaths: list[list[Any]] = []
-        self.count = 0
+        # Shapes as path data, with their elements, lines and transforms; read when all has been counted.
+        self.shapes: list[tuple[str, int, str, FloatArray]] = []
+        self.elements = self.commands = 0
         # A transform of homogeneous points for every open container.
         self.transforms = [np.diag([1.0, -1.0, 1.0])]
         self.depth = 0
@@ -140,7 +143,18 @@ class _Drawing:
         except expat.ExpatError as error:
             what = f"is not well-formed XML: {expat.ErrorString(error.code)}"
             raise MeshFileError(self.path, what, error.lineno) from None
-        return self.subpaths
+        drawn: list[tuple[list[Any], FloatArray]] = []
+        count = 0
+        for tag, line, d, transform in self.shapes:
+            try:
+                for pieces in parse_path(d, arcs=self.arcs):
+                    count += len(pieces)
+                    if count > MOST_POINTS:
+                        raise ValueError(_TOO_MANY)
+                    drawn.append((pieces, transform))
+            except ValueError as error:
+                raise MeshFileError(self.path, f"<{tag}>: {error}", line) from None
+        return [_transformed(pieces, transform) for pieces, transform in drawn]
 
     def _error(self, what: str, remedy: str = "") -> MeshFileError:
         return MeshFileError(self.path, what, self.parser.CurrentLineNumber, remedy)
@@ -159,6 +173,9 @@ class _Drawing:
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self.depth += 1
+        self.elements += 1
+        if self.elements > MOST_POINTS:
+            raise self._error(f"more than {MOST_POINTS:,} elements")
         if self.depth > _DEEPEST:
             raise self._error(f"elements nested more than {_DEEPEST} deep")
         namespace, _, tag = name.rpartition(" ")
@@ -179,13 +196,15 @@ class _Drawing:
         if "transform" in attributes and "transform-origin" in attributes:
             raise self._error(f"<{tag}>: transform-origin is not read", "apply the transform in a drawing program")
         try:
-            transform = self.transforms[-1] @ _transform(attributes.get("transform", ""))
+            transform = self.transforms[-1]
+            if "transform" in attributes:
+                transform = transform @ _transform(attributes["transform"])
             if tag == "svg" and self.depth > 1:
                 if "viewBox" in attributes:
                     raise ValueError("an inner <svg> with a viewBox")
                 transform = transform @ _affine(1, 0, 0, 1, _length(attributes, "x"), _length(attributes, "y"))
             if tag in _SHAPES:
-                self._add(_SHAPES[tag](attributes), transform)
+                self._note(tag, _SHAPES[tag](attributes), transform)
                 # Titles and animations within a shape draw nothing.
                 self.skipped = self.depth
             else:
@@ -203,15 +222,16 @@ class _Drawing:
             self.transforms.pop()
         self.depth -= 1
 
-    def _add(self, d: str, transform: FloatArray) -> None:
-        matrix, shift = transform[:2, :2], transform[:2, 2]
-        for pieces in parse_path(d, arcs=self.arcs):
-            self.count += len(pieces)
-            if self.count > MOST_POINTS:
-                raise ValueError(f"more than {MOST_POINTS:,} pieces in all")
-            self.subpaths.append(
-                [p.transformed(matrix, shift) if isinstance(p, Arc) else p @ matrix.T + shift for p in pieces]
-            )
+    def _note(self, tag: str, d: str, transform: FloatArray) -> None:
+        self.commands += commands(d, MOST_POINTS - self.commands)
+        if self.commands > MOST_POINTS:
+            raise ValueError(_TOO_MANY)
+        self.shapes.append((tag, self.parser.CurrentLineNumber, d, transform))
+
+
+def _transformed(pieces: list[Any], transform: FloatArray) -> list[Any]:
+    matrix, shift = transform[:2, :2], transform[:2, 2]
+    return [p.transformed(matrix, shift) if isinstance(p, Arc) else p @ matrix.T + shift for p in pieces]
 
 
 def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> FloatArray:
@@ -221,9 +241,13 @@ def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> Float
 
 def _transform(text: str) -> FloatArray:
     """Read the attribute ``transform``: a product of matrix, translate, scale, rotate, skewX and skewY."""
-    product, at = np.eye(3), 0
-    while at < len(text.rstrip()):
+    text = text.rstrip()
+    product, at, count = np.eye(3), 0, 0
+    while at < len(text):
         found = _TRANSFORM.match(text, at)
+        count += 1
+        if count > _MOST_TRANSFORMS:
+            raise ValueError(f"more than {_MOST_TRANSFORMS:,} transforms of one element")
         if found is None:
             raise ValueError(f"the transform {text[at : at + 40]!a} is not understood")
         name, at = found.group(1), found.end()

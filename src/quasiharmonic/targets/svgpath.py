@@ -8,6 +8,7 @@ from __future__ import annotations
 import cmath
 import math
 import re
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,16 @@ import numpy as np
 from quasiharmonic.curves.pieces import Arc
 from quasiharmonic.targets.contours import MOST_POINTS, Pieces
 
-_BLANKS = " \t\r\n\f"
+_BLANKS = re.compile(r"[ \t\r\n\f]*")
+_COMMA = re.compile(r"[ \t\r\n\f]*,?[ \t\r\n\f]*")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 # Numbers that each command takes at a time; F is a flag, a single 0 or 1.
 _ARGUMENTS = {"M": "xx", "L": "xx", "H": "x", "V": "x", "C": "x" * 6, "S": "x" * 4, "Q": "x" * 4, "T": "xx"}
 _ARGUMENTS |= {"A": "xxxFFxx", "Z": ""}
+# Cubic curves in half a turn of an arc: each strays from a circle by 6.6e-8 of the radius.
+_HALF_TURN = 8
+# A letter, other than that of an exponent, and what follows up to the next one.
+_COMMAND = re.compile(r"([A-DF-Za-df-z])([^A-DF-Za-df-z]*)")
 
 
 def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
@@ -57,6 +63,32 @@ def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
         if pen.count > MOST_POINTS:
             raise scan.error(f"more than {MOST_POINTS:,} pieces")
     return [subpath for subpath in pen.subpaths if subpath]
+
+
+def commands(d: str, most: int) -> int:
+    """How many commands there are in path data, counted in a small part of the time that reading them takes.
+
+    An arc counts for as many as half a turn is curves.
+
+    Parameters
+    ----------
+    d : str
+    most : int
+        More of them are not counted.
+
+    Returns
+    -------
+    int
+        Too few only where the flags of arcs are written together with what follows them.
+    """
+    total = 0
+    for letter, numbers in map(re.Match.groups, _COMMAND.finditer(d)):
+        width = len(_ARGUMENTS.get(letter.upper(), "")) or 1
+        count = sum(1 for _ in islice(_NUMBER.finditer(numbers), width * (most + 1 - total)))
+        total += max(1, count // width) * (_HALF_TURN if letter in "Aa" else 1)
+        if total > most:
+            break
+    return total
 
 
 class _Scanner:
@@ -98,9 +130,8 @@ class _Scanner:
         return value
 
     def _skip(self, comma: bool = False) -> None:
-        while self.at < len(self.text) and (self.text[self.at] in _BLANKS or (comma and self.text[self.at] == ",")):
-            comma = comma and self.text[self.at] != ","
-            self.at += 1
+        found = (_COMMA if comma else _BLANKS).match(self.text, self.at)
+        self.at = self.at if found is None else found.end()
 
     def error(self, what: str) -> ValueError:
         near = self.text[max(0, self.at - 10) : self.at + 10]
@@ -186,19 +217,18 @@ class _Pen:
         # Unit circle to ellipse, moved so that the arc's ends are where they are to be.
         centre = (self.here + end) / 2 + axis * complex(middle.real * rx, middle.imag * ry)
 
-        def outward(z: complex) -> complex:
-            return centre + axis * complex(z.real * rx, z.imag * ry)
-
         if self.arcs:
             rows = np.array([centre, axis * rx, 1j * axis * ry]).view(np.float64).reshape(-1, 2)
             self.subpaths[-1].append(Arc(rows[0], rows[1], rows[2], first, first + angle))
             self.here = end
             self.count += 1
             return
-        # A cubic curve strays from a circle by 6.6e-8 of the radius on a sixteenth of it.
-        steps = max(1, math.ceil(abs(angle) / (math.pi / 8)))
+        steps = max(1, math.ceil(abs(angle) / (math.pi / _HALF_TURN)))
         lever = 1j * 4 / 3 * math.tan(angle / steps / 4)
-        for k in range(steps):
-            a, b = (cmath.exp(1j * (first + angle * j / steps)) for j in (k, k + 1))
-            point = end if k == steps - 1 else outward(b)
-            self._piece([outward(a * (1 + lever)), outward(b * (1 - lever)), point])
+        at = np.exp(1j * (first + angle * np.arange(steps + 1) / steps))
+        circle = np.stack([at[:-1], at[:-1] * (1 + lever), at[1:] * (1 - lever), at[1:]], axis=1)
+        pieces = centre + axis * (circle.real * rx + 1j * (circle.imag * ry))
+        pieces[0, 0], pieces[-1, -1] = self.here, end
+        self.subpaths[-1].extend(pieces.view(np.float64).reshape(steps, 4, 2))
+        self.here = end
+        self.count += steps

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.exact.diagnosis.effort import Effort
 
 Point = tuple[int, int]
 Line = tuple[int, int, int]
@@ -113,6 +115,7 @@ class Lattice:
         shift = np.where(mantissa != 0, exponent - lowest, 0)
         whole = [m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)]
         self.points: list[Point] = list(zip(whole[::2], whole[1::2], strict=True))
+        self._lowest = lowest - 53
         xs, ys = whole[::2], whole[1::2]
         self.low, self.high = (min(xs), min(ys)), (max(xs), max(ys))
         self._centre = (self.low[0] + self.high[0]) // 2, (self.low[1] + self.high[1]) // 2
@@ -128,6 +131,13 @@ class Lattice:
         """Corners of a polygon in the coordinates of ``near``; (r, 2) float64."""
         return self._near(area.corners)
 
+    def middle(self, area: Convex) -> tuple[float, float]:
+        """A position in the middle of a polygon, rounded only once: that of three corners far apart."""
+        r, unit = len(area.corners), Fraction(2) ** self._lowest
+        three = [area.corners[k] for k in (0, r // 3, 2 * r // 3)]
+        x, y = (sum(Fraction(corner[axis], corner[2]) for corner in three) * unit / 3 for axis in (0, 1))
+        return float(x), float(y)
+
 
 class Walls:
     """Segments that block the view, and what can be seen past them.
@@ -137,10 +147,12 @@ class Walls:
     ends : (m, 2) int64
         The segments, as pairs of points of the lattice.
     lattice : Lattice
+    effort : Effort
+        Of which looking takes.
     """
 
-    def __init__(self, ends: IntArray, lattice: Lattice) -> None:
-        self._ends, self._lattice = ends, lattice
+    def __init__(self, ends: IntArray, lattice: Lattice, effort: Effort) -> None:
+        self._ends, self._lattice, self._effort = ends, lattice, effort
         corners = lattice.near[ends.T].transpose(2, 0, 1)  # coordinate, end, wall
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
 
@@ -206,6 +218,7 @@ class Walls:
         walls : (m, 2) int64
             The walls that may still be in the way of these parts.
         """
+        self._effort.spend(100 + len(walls) * len(near) // 20)
         here = self._lattice.near[eye]
         p, q = self._lattice.near[walls.T]
         right, left = cross((p - here)[:, None], near - here), cross((q - here)[:, None], near - here)

@@ -8,6 +8,7 @@ import numpy as np
 
 from quasiharmonic.arrays import IntArray, named, named_edges
 from quasiharmonic.exact.diagnosis.curves import BoundaryCurves, Corners
+from quasiharmonic.exact.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.exact.diagnosis.elements import (
     collapsed_edges,
     half_planes,
@@ -23,7 +24,7 @@ from quasiharmonic.exact.diagnosis.witness import unplaced
 from quasiharmonic.exact.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
 
-# What is spent on vertices that see too little, in about microseconds, before those left are passed over.
+# What is spent on vertices that see too little, in about microseconds; where it ends, the rest are passed over.
 MOST_EFFORT = 3_000_000
 
 
@@ -120,15 +121,15 @@ def _unplaced(
     """Free vertices for which there is no place, and what was left unchecked about them."""
     around = stars(problem, fixture, curves.folds)
     around = around.take(unplaced(around, fixture, corners, walls))
-    sight = None if corners is None else Sight(problem, fixture, corners, walls)
+    sight = None if corners is None else Sight(problem, fixture, corners, walls, Effort(MOST_EFFORT))
     found = []
     passed_over = []
     for star in map(around.__getitem__, range(len(around))):
         obstruction = half_planes(star, fixture)
         if obstruction is None and sight is not None:
-            if sight.effort < MOST_EFFORT:
+            try:
                 obstruction = sight.hidden(star)
-            else:
+            except EffortSpentError:
                 passed_over.append(star.vertex)
         if obstruction is not None:
             found.append(obstruction)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import IntArray, named
+from quasiharmonic.arrays import IntArray, ReadOnly, named
 
 
 class Forbids(Enum):
@@ -44,13 +44,11 @@ class Kind(Enum):
 
 
 def _ints(values: ArrayLike, *shape: int) -> IntArray:
-    array = np.asarray(values, dtype=np.int64).reshape(shape)
-    array.flags.writeable = False
-    return array
+    return np.array(values, dtype=np.int64).reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
-class Obstruction:
+class Obstruction(ReadOnly):
     """One reason why there is no map.
 
     Attributes
@@ -88,6 +86,10 @@ class Obstruction:
             object.__setattr__(self, name, _ints(getattr(self, name), -1))
         for name in ("edges", "split"):
             object.__setattr__(self, name, _ints(getattr(self, name), -1, 2))
+        self._seal()
+
+    def _read_only(self) -> tuple[IntArray, ...]:
+        return self.vertices, self.edges, self.triangles, self.loops, self.split
 
     @property
     def advice(self) -> str:

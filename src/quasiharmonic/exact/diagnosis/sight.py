@@ -8,12 +8,14 @@ an edge between fixed vertices where it is given, any other where its free end s
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from quasiharmonic.arrays import IntArray, named_edges
 from quasiharmonic.exact.diagnosis.clipping import Convex, Walls
 from quasiharmonic.exact.diagnosis.curves import MOST_CONTACTS, BoundaryCurves, Corners
+from quasiharmonic.exact.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.exact.diagnosis.fixture import Fixture, Star
 from quasiharmonic.exact.diagnosis.obstruction import (
     Forbids,
@@ -23,7 +25,6 @@ from quasiharmonic.exact.diagnosis.obstruction import (
     smallest_conflict,
 )
 from quasiharmonic.exact.diagnosis.views import Views
-from quasiharmonic.exact.diagnosis.wedges import Wedges
 from quasiharmonic.exact.loops import contacts
 from quasiharmonic.problem import Problem
 
@@ -74,31 +75,37 @@ class Sight:
         Of a target that is simple and properly nested.
     walls : (m, 2) int64
         Edges that nothing sees through: of the boundary, and interior ones with both ends fixed.
+    effort : Effort
+        What may be spent on all that is asked.
     """
 
-    def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray) -> None:
+    def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray, effort: Effort) -> None:
         self._fixture = fixture
         ends = fixture.row[walls]
         beside = np.stack([corners.after, corners.before], axis=1)[problem.fixed]
         beside = np.where(beside >= 0, fixture.row[beside], -1)
-        self._walls = Walls(ends, fixture.lattice)
-        self._views = Views(ends, problem.target, fixture.lattice, beside)
-
-    @property
-    def effort(self) -> int:
-        """What has been spent so far, in about microseconds."""
-        return self._views.effort.spent
+        self._walls = Walls(ends, fixture.lattice, effort)
+        self._views = Views(ends, problem.target, fixture.lattice, beside, effort)
 
     def hidden(self, star: Star) -> Obstruction | None:
-        """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it."""
+        """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it.
+
+        Raises
+        ------
+        EffortSpentError
+            When to decide it takes more than may be spent.
+        """
         neighbours, opposite = self._apart_first(star.neighbours), star.opposite
         if self._place(neighbours, opposite):
             return None
-        edges = opposite[smallest_conflict(len(opposite), lambda some: self._place(neighbours, opposite[some]))]
-        # Without anything to be seen, half-planes alone leave room: otherwise they were the reason.
-        seen = neighbours[
-            smallest_conflict(len(neighbours), lambda some: not some or self._place(neighbours[some], edges))
-        ]
+        edges, seen = opposite, neighbours
+        # Where the effort ends before a smallest reason is found, a larger one is as true.
+        with suppress(EffortSpentError):
+            edges = opposite[smallest_conflict(len(opposite), lambda some: self._place(neighbours, opposite[some]))]
+            # Without anything to be seen, half-planes alone leave room: otherwise they were the reason.
+            seen = neighbours[
+                smallest_conflict(len(neighbours), lambda some: not some or self._place(neighbours[some], edges))
+            ]
         vertex = np.array([star.vertex])
         beside = f", from the left of {named_edges(edges)}" if len(edges) else ""
         ends = np.unique(np.concatenate([seen, edges.ravel()]))
@@ -128,41 +135,47 @@ class Sight:
 
     def _place(self, neighbours: IntArray, edges: IntArray) -> bool:
         """Whether some point inside sees the neighbours and lies to the left of the edges."""
-        eyes = [self._views.wedges(row) for row in self._fixture.row[neighbours].tolist()]
-        eyes, overlaps = _least_in_common(eyes)
+        eyes, overlaps = self._least_in_common(self._fixture.row[neighbours].tolist())
         if overlaps is not None and not len(overlaps):
             return False
         area = self._fixture.left_of(self._fixture.extent(), edges)
         return area is not None and any(
-            self._walls.seeing(part, [wedges.eye for wedges in eyes]) is not None
-            for part in _in_view(area, eyes, overlaps)
+            self._walls.seeing(part, eyes) is not None for part in self._in_view(area, eyes, overlaps)
         )
 
+    def _least_in_common(self, eyes: list[int]) -> tuple[list[int], IntArray | None]:
+        """Eyes in an order in which the first two have little in common, and their wedges that may overlap."""
+        order, least = eyes, None
+        for k in range(1, len(eyes)):
+            if least is not None and not len(least):
+                break
+            overlaps = self._views.wedges(eyes[0]).overlapping(self._views.wedges(eyes[k]))
+            if overlaps is not None and (least is None or len(overlaps) < len(least)):
+                order, least = [eyes[0], eyes[k], *eyes[1:k], *eyes[k + 1 :]], overlaps
+        return order, least
 
-def _least_in_common(eyes: list[Wedges]) -> tuple[list[Wedges], IntArray | None]:
-    """Views in an order in which the first two have little in common, and their wedges that may overlap."""
-    order, least = eyes, None
-    for k in range(1, len(eyes)):
-        if least is not None and not len(least):
-            break
-        overlaps = eyes[0].overlapping(eyes[k])
-        if overlaps is not None and (least is None or len(overlaps) < len(least)):
-            order, least = [eyes[0], eyes[k], *eyes[1:k], *eyes[k + 1 :]], overlaps
-    return order, least
+    def _in_view(self, area: Convex, eyes: list[int], overlaps: IntArray | None) -> Iterator[Convex]:
+        """The parts of an area in wedges of all eyes; ``overlaps`` are those of the first two that may overlap."""
+        if not eyes:
+            yield area
+            return
+        # One eye within the other, however many there are.
+        ways = [self._parts(area, eyes[0], None if overlaps is None else overlaps[:, 0])]
+        while ways:
+            k, part = next(ways[-1], (-1, None))
+            if part is None:
+                ways.pop()
+            elif len(ways) == len(eyes):
+                yield part
+            else:
+                few = overlaps[overlaps[:, 0] == k, 1] if overlaps is not None and len(ways) == 1 else None
+                ways.append(self._parts(part, eyes[len(ways)], few))
 
-
-def _in_view(area: Convex, eyes: list[Wedges], overlaps: IntArray | None = None) -> Iterator[Convex]:
-    """The parts of an area in wedges of all views; ``overlaps`` are those of the first two that may overlap."""
-    if not eyes:
-        yield area
-    elif overlaps is None:
-        for _, part in eyes[0].parts(area):
-            yield from _in_view(part, eyes[1:])
-    else:
-        one, two = (np.zeros(len(wedges), dtype=bool) for wedges in eyes[:2])
-        one[overlaps[:, 0]] = True
-        for k, part in eyes[0].parts(area, one):
-            two[:] = False
-            two[overlaps[overlaps[:, 0] == k, 1]] = True
-            for _, rest in eyes[1].parts(part, two):
-                yield from _in_view(rest, eyes[2:])
+    def _parts(self, area: Convex, eye: int, wedges: IntArray | None) -> Iterator[tuple[int, Convex]]:
+        """The parts of an area in the wedges of an eye, or some of them, each with the index of its wedge."""
+        view = self._views.wedges(eye)
+        if wedges is None:
+            return view.parts(area)
+        some = np.zeros(len(view), dtype=bool)
+        some[wedges] = True
+        return view.parts(area, some)

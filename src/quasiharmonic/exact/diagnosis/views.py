@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.diagnosis.clipping import Lattice, cross
-from quasiharmonic.exact.diagnosis.wedges import Effort, Wedges
+from quasiharmonic.exact.diagnosis.effort import Effort
+from quasiharmonic.exact.diagnosis.wedges import Wedges
 from quasiharmonic.exact.predicates import orientation
 
 SignArray = NDArray[np.int8]
@@ -39,19 +40,18 @@ class Views:
         The same.
     corner : (k, 2) int64
         For each point that is a corner of the target the next one and the one before, else -1.
-
-    Attributes
-    ----------
     effort : Effort
-        What looking, and what was done with the views, has taken so far.
+        Of which looking, and what is done with the views, takes.
     """
 
-    def __init__(self, ends: IntArray, positions: FloatArray, lattice: Lattice, corner: IntArray) -> None:
+    def __init__(
+        self, ends: IntArray, positions: FloatArray, lattice: Lattice, corner: IntArray, effort: Effort
+    ) -> None:
         self._ends, self._positions, self._lattice, self._corner = ends, positions, lattice, corner
         # For what need not be exact: of magnitude one, so that nothing is too large.
         self._scaled = np.ldexp(positions, -int(np.frexp(np.abs(positions).max())[1]))
         self._kept: dict[int, Wedges] = {}
-        self.effort = Effort()
+        self._effort = effort
 
     def wedges(self, eye: int) -> Wedges:
         """What is seen from a point, from a corner to the inside only.
@@ -66,7 +66,7 @@ class Views:
 
     def _look(self, eye: int) -> Wedges:
         """Wedges of an eye; see `wedges`."""
-        self.effort.spent += 500 + len(self._ends)
+        self._effort.spend(500 + len(self._ends))
         here, where = self._positions[eye], self._positions
         turn = orientation(here, where[self._ends[:, 0]], where[self._ends[:, 1]])
         turn[(self._ends == eye).any(axis=1)] = 0
@@ -93,7 +93,7 @@ class Views:
         end = np.append(begin[1:], 0)
         seen = nearest[begin] >= 0
         return Wedges(
-            self._lattice, eye, around[begin[seen]], around[end[seen]], walls[owner[nearest[begin[seen]]]], self.effort
+            self._lattice, eye, around[begin[seen]], around[end[seen]], walls[owner[nearest[begin[seen]]]], self._effort
         )
 
     def _sorted(self, eye: int, points: IntArray) -> tuple[IntArray, IntArray]:

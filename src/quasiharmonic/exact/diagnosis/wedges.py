@@ -10,24 +10,12 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.diagnosis.clipping import MARGIN, Convex, Lattice, cross, line
+from quasiharmonic.exact.diagnosis.effort import Effort
 
 # Wedges in a row that are compared with others as one first.
 _ROW = 16
 # Pairs of rows that are compared wedge by wedge at most.
 _MOST_ROWS = 1024
-
-
-@dataclass
-class Effort:
-    """A measure of the time spent.
-
-    Attributes
-    ----------
-    spent : int
-        About as many microseconds.
-    """
-
-    spent: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +31,7 @@ class Wedges:
     wall : (c, 2) int64
         Ends of the wall on which it stands, from right to left.
     effort : Effort
-        Raised by what is done with them.
+        Of which what is done with them takes.
     """
 
     lattice: Lattice
@@ -58,12 +46,12 @@ class Wedges:
 
     def parts(self, area: Convex, only: BoolArray | None = None) -> Iterator[tuple[int, Convex]]:
         """The parts of an area in the wedges (of those named, if any), each with the index of its wedge."""
+        self.effort.spend(100 + len(self) // 10)
         reached = self._may_reach(np.arange(len(self)), self.lattice.corners(area)[None])
-        self.effort.spent += 100 + len(self) // 10
         points = self.lattice.points
         eye = points[self.eye]
         for k in np.flatnonzero(reached if only is None else reached & only).tolist():
-            self.effort.spent += 30
+            self.effort.spend(30)
             p, q = self.wall[k].tolist()
             part = area.cut(line(eye, points[self.right[k]]))
             part = part and part.cut(line(points[self.left[k]], eye))
@@ -73,11 +61,11 @@ class Wedges:
 
     def overlapping(self, other: Wedges) -> IntArray | None:
         """Pairs of wedges that may overlap; (m, 2) int64, or None where there are too many to tell."""
-        self.effort.spent += 300
+        self.effort.spend(300)
         rows = np.argwhere(self._rows_may_reach(other) & other._rows_may_reach(self).T)
         if len(rows) > _MOST_ROWS:
             return None
-        self.effort.spent += len(rows) * _ROW**2 // 10
+        self.effort.spend(len(rows) * _ROW**2 // 10)
         in_row = np.stack(np.divmod(np.arange(_ROW**2), _ROW), axis=1)
         i, j = (_ROW * rows[:, None] + in_row).reshape(-1, 2).T
         there = (i < len(self)) & (j < len(other))

@@ -6,6 +6,8 @@ less than showing that there is none.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
@@ -42,9 +44,11 @@ def unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls: Int
     """
     waiting = np.arange(len(stars))
     places = _middles(stars, fixture)
-    for margin in (None, *_MARGINS):
+    for margin in (0.0, *_MARGINS, None):
         some = stars.take(waiting)
-        if margin is not None:
+        if margin is None:
+            places = _middles_of_rooms(some, fixture, corners)
+        elif margin > 0:
             places = _shifted(some, places, fixture, corners, margin)
         left = ~_suits(some, places, fixture, corners, walls)
         waiting, places = waiting[left], places[left]
@@ -63,15 +67,7 @@ def _middles(stars: Stars, fixture: Fixture) -> FloatArray:
 def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, margin: float) -> FloatArray:
     """Places moved to the left of the edges that they are to be left of, one edge after another."""
     where = fixture.positions
-    of, edge = stars.of_opposite, stars.opposite
-    if corners is not None:
-        # What a vertex sees from a convex corner is to the left of both edges there.
-        known = corners.known[stars.neighbours]
-        v, star = stars.neighbours[known], stars.of_neighbour[known]
-        convex = ~corners.reflex(v, where)
-        v, star = v[convex], star[convex]
-        of = np.concatenate([of, star, star])
-        edge = np.concatenate([edge, np.stack([corners.before[v], v], 1), np.stack([v, corners.after[v]], 1)])
+    of, edge = _sides(stars, fixture, corners)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         along = where[edge[:, 1]] - where[edge[:, 0]]
         inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
@@ -87,6 +83,33 @@ def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corner
             places = places.copy()
             places[of[worst]] += lacking[worst, None] * inward[worst]
     return places
+
+
+def _middles_of_rooms(stars: Stars, fixture: Fixture, corners: Corners | None) -> FloatArray:
+    """The middle of what lies to the left of the edges that each star is to be left of, NaN where nothing does."""
+    places = np.full((len(stars), 2), np.nan)
+    of, edge = _sides(stars, fixture, corners)
+    edge = edge[np.argsort(of, kind="stable")]
+    ends = np.cumsum(np.bincount(of, minlength=len(stars)))
+    for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()])):
+        room = fixture.left_of(fixture.extent(), edge[begin:end])
+        if room is not None:
+            places[k] = fixture.lattice.middle(room)
+    return places
+
+
+def _sides(stars: Stars, fixture: Fixture, corners: Corners | None) -> tuple[IntArray, IntArray]:
+    """Edges that stars are to be left of: the index of the star (h,) and the edge (h, 2)."""
+    of, edge = stars.of_opposite, stars.opposite
+    if corners is None:
+        return of, edge
+    # What a vertex sees from a convex corner is to the left of both edges there.
+    known = corners.known[stars.neighbours]
+    v, star = stars.neighbours[known], stars.of_neighbour[known]
+    convex = ~corners.reflex(v, fixture.positions)
+    v, star = v[convex], star[convex]
+    of = np.concatenate([of, star, star])
+    return of, np.concatenate([edge, np.stack([corners.before[v], v], 1), np.stack([v, corners.after[v]], 1)])
 
 
 def _suits(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, walls: IntArray) -> BoolArray:
