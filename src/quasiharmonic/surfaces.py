@@ -1,8 +1,8 @@
-"""Rest meshes made on the spot: planar ones with known numbers, and a curved one to look at.
+"""Rest meshes made on the spot: planar ones with known numbers, and curved ones to look at.
 
 Every function returns ``V, F``: vertices (n, 2) or (n, 3) float64 and triangles (f, 3) int64, a
 connected manifold without unused vertices, its triangles counterclockwise in the plane or seen from
-outside. The same arguments give the same mesh.
+outside. The same arguments give the same mesh. One of them is closed, `starfish`.
 
 The boundaries have no *chords*, interior edges that join two boundary vertices. A chord must fit
 inside the target in one piece, and a triangle with all its vertices on the boundary (an "ear") goes
@@ -235,6 +235,44 @@ def _cat_point(direction: FloatArray) -> FloatArray:
             away = np.linalg.norm((direction - (side, y, z)) / (wide, high, 0.4), axis=1)
             radius += height * np.exp(-(away**sharpness))
     return np.asarray(direction * radius[:, None])
+
+
+def starfish(arms: int = 5, rings: int = 40) -> tuple[FloatArray, IntArray]:
+    """Model a starfish, a closed surface that lies flat only if cuts reach the ends of its arms.
+
+    A ball, flattened, whose equator is drawn out into arms.
+
+    Parameters
+    ----------
+    arms : int
+        How many, evenly around, at least 1.
+    rings : int
+        Rings of triangles from the middle of either side to the equator, at least 2; each arm should have a dozen of
+        the equator's ``6 rings`` vertices.
+
+    Returns
+    -------
+    V : (6 rings² + 2, 3) float64
+        The upper side from the middle outwards, with the equator, and then the lower side.
+    F : (12 rings², 3) int64
+        Counterclockwise seen from outside.
+
+    Raises
+    ------
+    ValueError
+        When there is no arm, or fewer than two rings.
+    """
+    if arms < 1 or rings < 2:
+        raise ValueError(f"a starfish needs at least 1 arm and 2 rings, not {arms} and {rings}")
+    flat, upper = disk(rings)
+    inside = len(flat) - 6 * rings
+    r = np.hypot(*flat.T)[:, None]
+    across = flat * np.sinc(r / 2) * (np.pi / 2)
+    drawn_out = (0.5 + 0.5 * np.cos(arms * np.arctan2(*flat.T[::-1])[:, None])) ** 3 * np.sin(r * (np.pi / 2)) ** 6
+    V = np.concatenate([across * (1 + 3 * drawn_out), 0.45 * np.cos(r * (np.pi / 2))], axis=1)
+    # The lower side is the upper one's mirror image, with the same equator.
+    lower = np.concatenate([len(flat) + np.arange(inside), np.arange(inside, len(flat))])
+    return np.concatenate([V, V[:inside] * (1, 1, -1)]), np.concatenate([upper, lower[upper[:, ::-1]]])
 
 
 def refine(V: NDArray[np.floating], F: NDArray[np.integer]) -> tuple[FloatArray, IntArray]:

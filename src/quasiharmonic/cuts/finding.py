@@ -102,7 +102,7 @@ def _cut_part(graph: EdgeGraph, gain: float) -> IntArray:
     """The edges (k, 2) that a connected surface is cut along."""
     cut = shortened(graph, opening_cuts(graph))
     if np.isfinite(gain):
-        cut = shortened(graph, reached(graph, cut, gain))
+        cut = reached(graph, cut, gain)
     return graph.ends[cut]
 
 

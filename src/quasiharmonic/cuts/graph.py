@@ -7,6 +7,7 @@ curvature that a cut sets free. Halved at most, so that no path is longer than t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -52,7 +53,7 @@ class EdgeGraph:
         """Number of vertices."""
         return len(self.V)
 
-    @property
+    @cached_property
     def rim_vertices(self) -> BoolArray:
         """Which vertices are on the boundary; (n,)."""
         return self.touched(self.rim)

@@ -8,6 +8,8 @@ end, and gets the cheapest way from there to the other cuts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -22,32 +24,44 @@ _SAVES = 1e-6
 _ROUNDS = 8
 
 
-def shortened(graph: EdgeGraph, cut: BoolArray) -> BoolArray:
+def shortened(graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], float] | None = None) -> BoolArray:
     """Exchange stretches of cuts for cheaper ones until there is none.
 
     Parameters
     ----------
     graph : EdgeGraph
     cut : (e,) bool
-        Edges whose cutting leaves every component a disk.
+        Edges whose cutting makes a connected surface a disk.
+    price : callable, optional
+        Of cuts (e,) as a whole; no exchange may raise it.
 
     Returns
     -------
     (e,) bool
         Such edges again, with the same loose ends.
     """
-    cut = cut.copy()
+    lowest = np.inf if price is None else price(cut)
+    disk = _Disk(graph, cut)
     for _ in range(_ROUNDS):
-        before, tried = cut.copy(), set[bytes]()
+        before, tried = disk, set[bytes]()
         # The costliest first. What an exchange does to the others is seen before they are tried.
-        while fresh := [way for way in stretches(graph, cut) if way.tobytes() not in tried]:
+        while fresh := [way for way in stretches(graph, disk.cut) if way.tobytes() not in tried]:
             way = max(fresh, key=lambda way: (graph.cost[way].sum(), -way[0]))
             tried.add(way.tobytes())
-            cut[way] = False
-            cut[_cheapest(graph, cut, way)] = True
-        if np.array_equal(cut, before):
+            instead = disk.cheapest(way)
+            if instead is None:
+                continue
+            exchanged = disk.cut.copy()
+            exchanged[way] = False
+            exchanged[instead] = True
+            if price is not None:
+                if not (now := price(exchanged)) < lowest:
+                    continue
+                lowest = now
+            disk = _Disk(graph, exchanged)
+        if disk is before:
             break
-    return cut
+    return disk.cut
 
 
 def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
@@ -73,42 +87,72 @@ def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
     return found
 
 
-def _cheapest(graph: EdgeGraph, others: BoolArray, way: IntArray) -> IntArray:
-    """What may take a stretch's place, or the stretch itself, the other cuts (e,) given."""
-    cost = float(graph.cost[way].sum())
-    degree = np.bincount(graph.ends[way].ravel(), minlength=graph.n)
-    held = graph.touched(others) | graph.rim_vertices
-    ends = np.flatnonzero((degree == 1) & ~held)
-    if ends.size == 2:
-        return way
-    if ends.size == 1:
-        distance, before = graph.distances(np.flatnonzero(held), graph.cost, limit=cost)
-        better = distance[ends[0]] < (1 - _SAVES) * cost
-        return graph.way_back(before, int(ends[0])) if better else way
+class _Disk:
+    """A surface cut into a disk, to be sewn up along a stretch and opened elsewhere.
 
-    # The ring: its vertices, its sides, and the edges within.
-    FT, origin = opened_along(graph.F, graph.ends[others], graph.n)
-    tail, head = np.empty(len(graph.ends), dtype=np.int64), np.empty(len(graph.ends), dtype=np.int64)
-    tail[graph.side], head[graph.side] = FT.T, FT.T[(1, 2, 0), :]
-    inner = ~(others | graph.rim)
-    border = ~inner[graph.side]
-    ends = FT.T[border], FT.T[(1, 2, 0), :][border]
-    m = origin.size
-    ones = np.ones(ends[0].size, dtype=np.int8)
-    loop = connected_components(csr_array((ones, ends), shape=(m, m)), directed=False)[1]
-    on_loop = np.zeros(m, dtype=bool)
-    on_loop[ends[0]] = True
-    start = next(v for v in (int(tail[way[0]]), int(head[way[0]])) if held[origin[v]])
-    near = on_loop & (loop == loop[start])
-    inside = csr_array((graph.cost[inner], (tail[inner], head[inner])), shape=(m, m))
-    distance, before, _ = dijkstra(
-        inside, directed=False, indices=np.flatnonzero(near), return_predecessors=True, min_only=True, limit=cost
-    )
-    distance[near | ~on_loop] = np.inf
-    end = int(np.argmin(distance))
-    if not distance[end] < (1 - _SAVES) * cost:
-        return way
-    path = [end]
-    while before[path[-1]] >= 0:
-        path.append(int(before[path[-1]]))
-    return graph.numbers(origin[path[:-1]], origin[path[1:]])
+    Every edge has its ends on its left, seen from the smaller to the larger, and on its right, as copies; -1 where the
+    surface ends.
+    """
+
+    def __init__(self, graph: EdgeGraph, cut: BoolArray) -> None:
+        self.graph = graph
+        self.cut = cut
+        FT, self._origin = opened_along(graph.F, graph.ends[cut], graph.n)
+        copies = np.stack([FT.T, FT.T[(1, 2, 0), :]], axis=2)
+        leads_up = graph.F.T < graph.F.T[(1, 2, 0), :]
+        self._left = np.full(graph.ends.shape, -1)
+        self._right = np.full(graph.ends.shape, -1)
+        self._left[graph.side[leads_up]] = copies[leads_up]
+        self._right[graph.side[~leads_up]] = copies[~leads_up][:, ::-1]
+
+    def cheapest(self, way: IntArray) -> IntArray | None:
+        """What may take a stretch's place, as edges; None if nothing is cheaper."""
+        graph = self.graph
+        others = self.cut.copy()
+        others[way] = False
+        held = graph.touched(others) | graph.rim_vertices
+        degree = np.bincount(graph.ends[way].ravel(), minlength=graph.n)
+        loose = np.flatnonzero((degree == 1) & ~held)
+        limit = (1 - _SAVES) * float(graph.cost[way].sum())
+        if loose.size == 0:
+            return self._across(way, others, held, limit)
+        if loose.size == 2:
+            return None
+        distance, before = graph.distances(np.flatnonzero(held), graph.cost, limit=limit)
+        return graph.way_back(before, int(loose[0])) if np.isfinite(distance[loose[0]]) else None
+
+    def _across(self, way: IntArray, others: BoolArray, held: BoolArray, limit: float) -> IntArray | None:
+        """The cheapest way across the ring that is left without a stretch; None if none is cheaper than a limit."""
+        graph, m = self.graph, self._origin.size
+        sewn = _joined(np.concatenate([self._left[way], self._right[way]], axis=1)[:, [0, 2, 1, 3]].reshape(-1, 2), m)
+        border = others | graph.rim
+        sides = np.concatenate([self._left[border], self._right[border]])
+        sides = sewn[sides[sides[:, 0] >= 0]]
+        loop = _joined(sides, m)
+        on_border = np.zeros(m, dtype=bool)
+        on_border[sides] = True
+        # An end of the stretch is on the one loop, and its other end on the other.
+        first = graph.ends[way[0]]
+        start = sewn[self._left[way[0], int(np.argmax(held[first]))]]
+        near = on_border & (loop == loop[start])
+        inner = sewn[self._left[~border]]
+        ring = csr_array((graph.cost[~border], (inner[:, 0], inner[:, 1])), shape=(m, m))
+        distance, before, _ = dijkstra(
+            ring, directed=False, indices=np.flatnonzero(near), return_predecessors=True, min_only=True, limit=limit
+        )
+        distance[near | ~on_border] = np.inf
+        end = int(np.argmin(distance))
+        if np.isinf(distance[end]):
+            return None
+        path = [end]
+        while before[path[-1]] >= 0:
+            path.append(int(before[path[-1]]))
+        origin = np.empty(m, dtype=np.int64)
+        origin[sewn] = self._origin
+        return graph.numbers(origin[path[:-1]], origin[path[1:]])
+
+
+def _joined(pairs: IntArray, m: int) -> IntArray:
+    """Labels below ``m`` of as many elements, those of a pair alike."""
+    ones = np.ones(len(pairs), dtype=np.int8)
+    return connected_components(csr_array((ones, pairs.T), shape=(m, m)), directed=False)[1].astype(np.int64)

@@ -53,11 +53,14 @@ def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     ValueError
         When a cut is no edge of the mesh; the message names the first.
     """
-    check_edges(F, cut, n)
-    sides = edge_keys(F, np.roll(F, -1, axis=1), n)
-    split, _ = fans(F, np.isin(sides, edge_keys(cut[:, 0], cut[:, 1], n)))
-    # Fans are numbered by first appearance.
-    vertex = F.ravel()[np.unique(split.ravel(), return_index=True)[1]]
+    check_range("edges", cut, n)
+    sides, wanted = edge_keys(F, np.roll(F, -1, axis=1), n), edge_keys(cut[:, 0], cut[:, 1], n)
+    strange = ~np.isin(wanted, sides)
+    if strange.any():
+        raise ValueError(f"{named_edges(cut[strange])}: no triangle has such a side")
+    split, _ = fans(F, np.isin(sides, wanted))
+    # Fans are numbered by first appearance, so each is first met where the numbers seen so far grow.
+    vertex = F.ravel()[np.diff(np.maximum.accumulate(split.ravel()), prepend=-1) > 0]
     order = np.argsort(vertex, kind="stable")
     keeps = np.diff(vertex[order], prepend=-1) > 0
     kept, copies = order[keeps], order[~keeps]
@@ -65,12 +68,3 @@ def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     own[kept] = vertex[kept]
     own[copies] = np.arange(n, n + copies.size)
     return Corners(own[split], np.concatenate([np.arange(n), vertex[copies]]))
-
-
-def check_edges(F: IntArray, pairs: IntArray, n: int) -> None:
-    """Raise a ValueError that names the first pairs of vertices, below ``n``, that no edge of the triangles joins."""
-    check_range("edges", pairs, n)
-    there = edge_keys(F, np.roll(F, -1, axis=1), n)
-    strange = ~np.isin(edge_keys(pairs[:, 0], pairs[:, 1], n), there)
-    if strange.any():
-        raise ValueError(f"{named_edges(pairs[strange])}: no triangle has such a side")

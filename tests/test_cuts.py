@@ -1,0 +1,352 @@
+"""Cuts: what they leave are disks, they are short, and they go where they do good."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import flatten, surfaces
+from quasiharmonic.cuts.finding import find_cuts
+from quasiharmonic.cuts.graph import edge_graph
+from quasiharmonic.cuts.shortening import shortened, stretches
+from quasiharmonic.cuts.shrinking import Shrinking
+from quasiharmonic.cuts.topological import opening_cuts, without_loose_ends
+from quasiharmonic.mesh.opening import opened_along
+from quasiharmonic.mesh.topology import boundary_loops, components, edge_keys, edges
+from shared.closed import TETRAHEDRON, blocks, double_torus, torus
+from shared.meshes import lift
+
+
+def parts(V, F, cut):
+    """Euler's number and the number of loops of every part, by a mesh of its own."""
+    FT, origin = opened_along(F, cut, len(V))
+    assert np.array_equal(origin[FT], F)
+    label = components(FT, len(origin))[FT[:, 0]]
+    found = []
+    for one in np.unique(label):
+        used, T = np.unique(FT[label == one], return_inverse=True)
+        T = T.reshape(-1, 3)
+        there = edges(T, used.size)
+        assert not there.nonmanifold.size
+        assert not there.inconsistent.size
+        sides = len(there.interior) + len(there.boundary)
+        found.append((used.size - sides + len(T), len(boundary_loops(T, used.size))))
+    return found
+
+
+def length_of(V, cut):
+    return float(np.linalg.norm(V[cut[:, 0]] - V[cut[:, 1]], axis=1).sum())
+
+
+def energy_of(V, F, cut):
+    """The mean symmetric Dirichlet energy of the map."""
+    FT, origin = opened_along(F, cut, len(V))
+    return flatten(V[origin], FT).history[-1].energy
+
+
+def jittered(V, seed=0, size=2e-3):
+    """No two lengths alike, so that nothing depends on rounding."""
+    return V + size * np.random.default_rng(seed).standard_normal(V.shape)
+
+
+def without(F, *rows):
+    return np.delete(F, rows, axis=0)
+
+
+TORUS = torus()
+CUBE = blocks(np.ones((1, 1, 1)), rounds=0)
+SURFACES = {
+    "tetrahedron": TETRAHEDRON,
+    "cube": CUBE,
+    "two triangles": (np.eye(3), np.array([[0, 1, 2], [0, 2, 1]])),
+    "starfish": surfaces.starfish(3, 12),
+    "torus": TORUS,
+    "smallest torus": torus(3, 3),
+    "torus with a hole": (TORUS[0], without(TORUS[1], 7)),
+    "torus with holes": (TORUS[0], without(TORUS[1], 7, 200, 201, 400)),
+    "two handles": double_torus(),
+    "annulus": surfaces.annulus(12),
+    "curved annulus": (lift(surfaces.annulus(12)[0]), surfaces.annulus(12)[1]),
+    "disk": surfaces.disk(5),
+    "cat": surfaces.cat(15),
+}
+
+
+class TestDisks:
+    @pytest.mark.parametrize("gain", [0.02, 0.1, np.inf])
+    @pytest.mark.parametrize("name", SURFACES)
+    def test_of_every_surface(self, name, gain):
+        V, F = SURFACES[name]
+        before = V.copy(), F.copy()
+        cut = find_cuts(V, F, gain=gain)
+        assert parts(V, F, cut) == [(1, 1)]
+        assert cut.dtype == np.int64
+        assert np.array_equal(cut, np.unique(np.sort(cut, axis=1), axis=0))
+        inner = edges(F, len(V)).interior
+        assert np.isin(edge_keys(*cut.T, len(V)), edge_keys(*inner.T, len(V))).all()
+        assert np.array_equal(V, before[0])
+        assert np.array_equal(F, before[1])
+
+    def test_of_several_surfaces_as_of_each(self):
+        (V, F), (W, G) = surfaces.starfish(3, 12), torus(12, 8)
+        V = jittered(V)
+        both = np.concatenate([V, [[9, 9, 9]], 100 * W]), np.concatenate([F, G + len(V) + 1])
+        found = find_cuts(*both)
+        assert parts(*both, found) == [(1, 1), (1, 1)]
+        own = find_cuts(V, F)
+        assert np.array_equal(found[found[:, 0] < len(V)], own)
+
+    def test_where_two_surfaces_touch_each_is_its_own(self):
+        V, F = TETRAHEDRON
+        V, F = np.concatenate([V, -V[1:]]), np.concatenate([F, np.where(F, F + 3, 0)[:, ::-1]])
+        assert parts(V, F, find_cuts(V, F)) == [(1, 1), (1, 1)]
+
+    @pytest.mark.parametrize("scale", [0, 1e-310, 1e-200, 1e200, 1e300])
+    def test_at_any_size(self, scale):
+        V, F = torus(12, 8)
+        assert parts(V, F, find_cuts(scale * V, F)) == [(1, 1)]
+
+    def test_with_slivers_and_triangles_without_area(self):
+        V, F = surfaces.starfish(3, 12)
+        V = V * (1, 1e-5, 1)
+        V[F[100, 1]] = V[F[100, 0]]
+        assert parts(V, F, find_cuts(V, F)) == [(1, 1)]
+
+
+class TestShortest:
+    def test_two_edges_of_a_tetrahedron(self):
+        assert len(find_cuts(*TETRAHEDRON, gain=np.inf)) == 2
+
+    @pytest.mark.parametrize(("hole", "width"), [((-0.5, -0.5, 0.5, 0.75), 0.25), ((-0.9, -0.2, 0.1, 0.25), 0.1)])
+    def test_across_the_narrowest_strip(self, hole, width):
+        V, F = surfaces.annulus(12, hole=hole)
+        assert length_of(V, find_cuts(V, F, gain=np.inf)) == pytest.approx(width)
+
+    def test_a_ring_and_the_inner_equator_of_a_torus(self):
+        V, F = torus(40, 20, radius=3)
+        ring, equator = np.arange(20), 10 + 20 * np.arange(40)
+        shortest = sum(np.linalg.norm(V[loop] - V[np.roll(loop, 1)], axis=1).sum() for loop in (ring, equator))
+        assert length_of(V, find_cuts(V, F, gain=np.inf)) == pytest.approx(shortest, rel=1e-3)
+
+    def test_no_cut_where_nothing_is_gained(self):
+        assert find_cuts(*surfaces.disk(8)).shape == (0, 2)
+        assert find_cuts(*surfaces.grid(30, 3)).shape == (0, 2)
+
+    @pytest.mark.parametrize("seed", range(6))
+    @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
+    def test_a_random_cut_gets_shorter_and_stays_one(self, name, seed):
+        V, F = SURFACES[name]
+        graph = edge_graph(V, F)
+        cut = random_cut(graph, seed)
+        assert parts(V, F, graph.ends[cut]) == [(1, 1)]
+        better = shortened(graph, cut)
+        assert parts(V, F, graph.ends[better]) == [(1, 1)]
+        assert graph.cost[better].sum() < 0.9 * graph.cost[cut].sum()
+        assert sum(way.size for way in stretches(graph, better)) == better.sum()
+        # No worse than twice the cut that topology begins with.
+        if name != "starfish":
+            assert graph.cost[better].sum() < 2 * graph.cost[shortened(graph, opening_cuts(graph))].sum()
+
+    def test_creases_are_preferred(self):
+        """The way around a bar is as long along its edges as beside them."""
+        V, F = blocks(np.ones((12, 4, 4)), rounds=0)
+        graph = edge_graph(V, F)
+        corner = np.isin(V[graph.ends][..., 1:], (1, 5)).all(axis=(1, 2))
+        assert corner.any()
+        assert np.allclose(graph.cost[corner], 0.75 * graph.length[corner])
+        # Seen from within the bar's edges are folded inwards.
+        inside_out = edge_graph(V, F[:, ::-1])
+        assert np.allclose(inside_out.cost[corner], 0.5 * graph.length[corner])
+        flat = np.isclose(graph.cost, graph.length)
+        assert flat.sum() > corner.sum()
+        cut = find_cuts(V, F, gain=np.inf)
+        number = graph.numbers(*cut.T)
+        assert graph.cost[number].sum() < 0.9 * graph.length[number].sum()
+
+
+def random_cut(graph, seed):
+    """The edges that a random tree of triangles does not cross, less loose ends but for some."""
+    rng = np.random.default_rng(seed)
+    order, joined, root = rng.permutation(len(graph.ends)), np.arange(len(graph.F)), {}
+    for t, numbers in enumerate(graph.side.T.tolist()):
+        for number in numbers:
+            root.setdefault(number, []).append(t)
+
+    def find(t):
+        while joined[t] != t:
+            t = joined[t]
+        return t
+
+    cut = ~graph.rim
+    for number in order.tolist():
+        if len(root[number]) == 2:
+            one, other = (find(t) for t in root[number])
+            if one != other:
+                joined[one] = other
+                cut[number] = False
+    bare = without_loose_ends(graph, cut)
+    if bare.any():
+        return bare
+    # A sphere has nothing but loose ends: a path and a branch of the tree are left.
+    for _ in range(12):
+        degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
+        loose = cut & (degree == 1)[graph.ends].any(axis=1)
+        if loose.sum() + 2 > cut.sum():
+            break
+        cut = cut & ~loose
+    return cut
+
+
+class TestWorth:
+    def test_of_a_cap_as_stereographic_projection_has_it(self):
+        """On a sphere, e⁻ʷ is (1 + cos θ₀) / (1 + cos θ), with lengths kept at θ₀."""
+        flat, F = surfaces.disk(40)
+        theta = 1.3 * np.hypot(*flat.T)
+        turn = np.arctan2(flat[:, 1], flat[:, 0])
+        V = np.stack([np.sin(theta) * np.cos(turn), np.sin(theta) * np.sin(turn), np.cos(theta)], axis=1)
+        graph = edge_graph(V, F)
+        w = Shrinking(graph).of(graph.rim_vertices)
+        np.testing.assert_allclose(w, np.log((1 + np.cos(theta)) / (1 + np.cos(1.3))), atol=3e-3)
+
+    def test_of_a_tube_by_its_length_and_width(self):
+        """Closed at one end: half a sphere's curvature flows out along the tube, w grows by 1 for each radius."""
+        around, along = 48, 60
+        i, j = np.divmod(np.arange(around * along), around)
+        V = np.stack([np.cos(2 * np.pi * j / around), np.sin(2 * np.pi * j / around), 2 * np.pi * i / around], axis=1)
+        ahead = i * around + (j + 1) % around
+        here = np.arange(around * along)
+        lower = here[here < around * (along - 1)]
+        tube = np.concatenate([
+            np.stack([lower, ahead[lower], lower + around], axis=1),
+            np.stack([ahead[lower], ahead[lower] + around, lower + around], axis=1),
+        ])  # fmt: skip
+        top = np.arange(around) + around * (along - 1)
+        lid = np.stack([top, np.roll(top, -1), np.full(around, len(V))], axis=1)
+        V, F = np.vstack([V, [0, 0, V[-1, 2]]]), np.concatenate([tube, lid])
+        graph = edge_graph(V, F)
+        w = Shrinking(graph).of(graph.rim_vertices)
+        np.testing.assert_allclose(w[:-1], V[:-1, 2], rtol=5e-3, atol=1e-9)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("gain", [0.1, np.inf])
+    def test_the_energy_is_about_that_of_the_map(self, gain):
+        for V, F in (surfaces.starfish(5, 24), surfaces.starfish(3, 24), double_torus()):
+            cut = find_cuts(V, F, gain=gain)
+            graph, shrinking = edge_graph(V, F), Shrinking(edge_graph(V, F))
+            open_at = np.zeros(len(V), dtype=bool)
+            open_at[cut] = True
+            told, true = shrinking.energy(shrinking.of(open_at | graph.rim_vertices)), energy_of(V, F, cut)
+            assert 0.4 * true < told < 2.5 * true + 0.2
+
+    def test_arms_are_reached(self):
+        V, F = surfaces.starfish(5, 24)
+        cut = find_cuts(V, F)
+        V = V / V[:, 0].max()
+        for turn in 2 * np.pi * np.arange(5) / 5:
+            tip = np.array([np.cos(turn), np.sin(turn), 0])
+            assert np.linalg.norm(V[np.unique(cut)] - tip, axis=1).min() < 0.15
+        # Little more than arms and the middle are long.
+        assert length_of(V, cut) < 5 * 1.1
+        assert energy_of(V, F, cut) < 0.1 * energy_of(V, F, find_cuts(V, F, gain=np.inf))
+
+    def test_more_gain_asked_for_makes_cuts_shorter(self):
+        V, F = surfaces.starfish(5, 24)
+        lengths = [length_of(V, find_cuts(V, F, gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
+        assert lengths == sorted(lengths, reverse=True)
+        assert lengths[0] > 1.5 * lengths[-1]
+
+    def test_the_same_whatever_the_unit_the_place_and_the_view(self):
+        V, F = surfaces.starfish(4, 16)
+        V = jittered(V)
+        cut = find_cuts(V, F)
+        assert np.array_equal(cut, find_cuts(V, F))
+        assert np.array_equal(cut, find_cuts(2.0**-40 * V, F))
+        rotation = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+        rotation *= np.linalg.det(rotation)
+        assert np.array_equal(cut, find_cuts(1000.3 * V @ rotation.T + (5, -700, 30), F))
+
+
+class TestGiven:
+    RING = np.stack([np.arange(14), (np.arange(14) + 1) % 14], axis=1)
+
+    @pytest.mark.parametrize("gain", [0.1, np.inf])
+    def test_a_ring_is_completed(self, gain):
+        V, F = TORUS
+        cut = find_cuts(V, F, edges=self.RING, gain=gain)
+        assert parts(V, F, cut) == [(1, 1)]
+        assert {tuple(pair) for pair in np.sort(self.RING, axis=1).tolist()} <= {tuple(pair) for pair in cut.tolist()}
+
+    def test_parts_are_disks_each(self):
+        V, F = TORUS
+        cut = find_cuts(V, F, edges=np.concatenate([self.RING, self.RING + 14 * 18]), gain=np.inf)
+        assert parts(V, F, cut) == [(1, 1), (1, 1)]
+        assert length_of(V, cut) < length_of(V, self.RING) * 2 + 2 * np.pi
+
+    def test_enough_is_enough(self):
+        V, F = TORUS
+        enough = find_cuts(V, F, gain=np.inf)
+        assert np.array_equal(find_cuts(V, F, edges=enough[::-1, ::-1], gain=np.inf), enough)
+
+    def test_one_edge_inside_opens_nothing(self):
+        V, F = TORUS
+        lone = np.setdiff1d(np.arange(len(V)), find_cuts(V, F))[0]
+        end = F[(lone == F).any(axis=1)][0]
+        edge = [lone, next(v for v in end if v != lone)]
+        assert np.array_equal(find_cuts(V, F, edges=[edge]), find_cuts(V, F))
+        assert parts(*TETRAHEDRON, find_cuts(*TETRAHEDRON, edges=[[0, 1]])) == [(1, 1)]
+
+    def test_the_boundary_is_open_already(self):
+        V, F = surfaces.disk(4)
+        (loop,) = boundary_loops(F, len(V))
+        assert find_cuts(V, F, edges=np.stack([loop, np.roll(loop, 1)], axis=1)).shape == (0, 2)
+
+    def test_diagonals_are_spared(self):
+        V, F = TORUS
+        half = len(F) // 2
+        diagonals = F[:half, [0, 2]]
+        cut = find_cuts(V, F, uncut=diagonals)
+        assert parts(V, F, cut) == [(1, 1)]
+        assert not np.isin(edge_keys(*cut.T, len(V)), edge_keys(*diagonals.T, len(V))).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"F": np.vstack([TETRAHEDRON[1], [[0, 1, 2]]])}, r"in more than two triangles|repeated"),
+        ({"F": np.vstack([TETRAHEDRON[1], [[0, 1, 4]]])}, r"edge \(0, 1\) in more than two triangles"),
+        ({"F": np.array([[0, 1, 2], [0, 1, 3]])}, r"mixed winding: edge \(0, 1\)"),
+        ({"F": np.array([[0, 1, 1]])}, "triangle 0: a vertex is used twice"),
+        ({"F": np.array([[0, 1, 9]])}, "refers to vertex 9"),
+        ({"F": np.zeros((0, 3), dtype=int)}, "no triangles"),
+        ({"V": np.full((5, 3), np.nan)}, "V is not finite at vertices 0, 1"),
+        ({"edges": [0, 1]}, r"edges must have shape \(k, 2\)"),
+        ({"edges": [[0, 4]]}, r"edge \(0, 4\): no triangle has such a side"),
+        ({"edges": [[0, 7]]}, "refers to vertex 7"),
+        ({"edges": [[0.5, 1]]}, "edges must hold integer indices"),
+        ({"uncut": [[0, 7]]}, "uncut refers to vertex 7"),
+        ({"gain": 0}, "gain must be a positive number, not 0"),
+        ({"gain": np.nan}, "gain must be a positive number, not nan"),
+        ({"gain": "much"}, "gain must be a positive number, not 'much'"),
+    ],
+)
+def test_wrong_calls_are_refused(change, message):
+    V, F = TETRAHEDRON
+    arguments = {"V": np.vstack([V, [2, 2, 2]]), "F": F} | change
+    with pytest.raises(ValueError, match=message):
+        find_cuts(**arguments)
+
+
+class TestOpening:
+    def test_copies_come_last_and_the_rest_keeps_its_number(self):
+        V, F = surfaces.disk(3)
+        FT, origin = opened_along(F, np.array([[0, 1], [1, 7], [7, 19]]), len(V))
+        assert np.array_equal(origin, [*range(len(V)), 1, 7, 19])
+        assert np.array_equal(origin[FT], F)
+        assert set(F[FT != F]) == {1, 7, 19}
+        assert parts(V, F, np.array([[0, 1], [1, 7], [7, 19]])) == [(1, 1)]
+
+    def test_nothing_cut_is_nothing_changed(self):
+        V, F = surfaces.annulus(6)
+        FT, origin = opened_along(F, np.zeros((0, 2), dtype=np.int64), len(V))
+        assert np.array_equal(FT, F)
+        assert np.array_equal(origin, np.arange(len(V)))
