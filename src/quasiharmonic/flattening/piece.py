@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,6 +101,19 @@ class Piece:
         corners = self.V[self.F]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+
+    @classmethod
+    def united(cls, pieces: Sequence[Piece]) -> Piece:
+        """Several pieces as one that is not connected, their elements piece after piece, in the largest one's unit."""
+        made = object.__new__(cls)
+        first = np.cumsum([0, *(len(piece.V) for piece in pieces)])[:-1].tolist()
+        made.F = np.concatenate([piece.F + k for piece, k in zip(pieces, first, strict=True)])
+        made.loops = [loop + k for piece, k in zip(pieces, first, strict=True) for loop in piece.loops]
+        made.exponent = max(piece.exponent for piece in pieces)
+        smaller = [piece.exponent - made.exponent for piece in pieces]
+        made.V = np.concatenate([np.ldexp(piece.V, down) for piece, down in zip(pieces, smaller, strict=True)])
+        made.area = float(sum(np.ldexp(piece.area, 2 * down) for piece, down in zip(pieces, smaller, strict=True)))
+        return made
 
     @staticmethod
     def _missing(domain: Domain) -> int:
