@@ -16,6 +16,7 @@ from quasiharmonic.apply.island_repair import IslandRepair
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
+    check_callback,
     check_range,
     counted,
     map_array,
@@ -202,6 +203,7 @@ def repair(
     (2, True, [0])
     """
     whole_number("max_iterations", max_iterations, least=1)
+    check_callback(callback)
     surface, triangles = vertex_array(V), triangle_rows(F)
     check_range("F", triangles, len(surface))
     places = map_array("uv", uv, finite=False)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, counted
+from quasiharmonic.arrays import FloatArray, check_callback, counted
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.newton_descent import in_units
@@ -58,6 +58,9 @@ class Settings:
     linear_solver: str
     callback: Callable[[Step], object] | None
     record: int
+
+    def __post_init__(self) -> None:
+        check_callback(self.callback)
 
 
 class Piece:
