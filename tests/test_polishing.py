@@ -16,7 +16,7 @@ from quasiharmonic.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem import Domain
 from quasiharmonic.result import Status
-from quasiharmonic.surfaces import annulus, disk, random_delaunay
+from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import bend, boundary_of, lift
 from shared.polygons import circle
 
@@ -139,6 +139,24 @@ def test_coordinates_that_span_more_than_a_unit_holds(energy, iterations, outer,
     assert is_injective(F, result.uv)
     if iterations == 0:
         np.testing.assert_array_equal(result.uv, uv)
+
+
+@pytest.mark.parametrize("thin", [1e-2, 1e-4, 1e-6, 1e-7, 1e-8, 1e-10])
+def test_a_square_pressed_thin(thin):
+    V, F = grid(10, 10)
+    x, y = V.T
+    bump = x * (1 - x) * y * (1 - y)
+    uv = np.stack([x + bump, thin * (y + bump)], axis=1)
+    result = polish(V, F, uv, fixed=boundary_of(F))
+    # The best is to press all of it alike.
+    least = 2 * thin + 2 / thin - 4
+    if thin >= 1e-7:
+        assert result.status is Status.POLISHED
+        assert result.history[-1].energy < (1 + 1e-4) * least
+    else:
+        # What is left to gain along the rectangle is lost in the rounding of what holds across it, and that is said.
+        assert result.status is Status.EXHAUSTED
+    assert result.injective
 
 
 def test_a_perfect_map_stays():

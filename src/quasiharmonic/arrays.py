@@ -186,6 +186,12 @@ def not_negative(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a finite number of at least 0, not {value!r}")
 
 
+def check_callback(callback: Any) -> None:
+    """Raise a ValueError for what is neither callable nor None, before anything is computed that would call it."""
+    if callback is not None and not callable(callback):
+        raise ValueError(f"callback must be callable, or None, not {callback!r}")
+
+
 def work(force: ComplexArray, displacement: ComplexArray) -> float:
     """Real inner product ``Re forceᴴ displacement``; not by BLAS, whose threads cost more to wake than this takes."""
     return float((force.real * displacement.real + force.imag * displacement.imag).sum())

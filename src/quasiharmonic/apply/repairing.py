@@ -16,6 +16,7 @@ from quasiharmonic.apply.island_repair import IslandRepair
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
+    check_callback,
     counted,
     named,
     whole_number,
@@ -198,6 +199,7 @@ def repair(
     (2, True, [0])
     """
     whole_number("max_iterations", max_iterations, least=1)
+    check_callback(callback)
     mesh = SeamedMesh(V, F, FT, uv)
     done = []
     for island in mesh.islands:

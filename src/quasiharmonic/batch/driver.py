@@ -14,6 +14,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, get_args
 
 from quasiharmonic import __version__
+from quasiharmonic.arrays import check_callback
 from quasiharmonic.batch import records
 from quasiharmonic.batch.lock import alone
 from quasiharmonic.batch.problems import MARKER, ProblemFiles, find_problems
@@ -139,6 +140,7 @@ def run(
     WorkerError
         When processes cannot be started.
     """
+    check_callback(callback)
     settings = _checked(settings or Settings())
     _check(jobs, threads, time_limit, memory_limit, scheduler)
     folder = Path(os.path.abspath(output))

@@ -31,12 +31,15 @@ FRACTION = 0.9
 HALVINGS = 30
 # Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
 # by the first, and where triangles span many orders of magnitude they are as small as that.
-_SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
+SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
 # A step that lowers the energy by less than this part of the tolerance is idle; after so many in a row the
 # map has come to rest short of convergence.
 _IDLE, _PATIENCE = 1e-2, 3
 # A mean energy this small is rounding: the map is an isometry, or a similarity.
 _NOTHING = 1e-12
+# Where maps stretch as much as this mean energy says, what clamping adds to the second derivatives may be so much that
+# a long way down looks like a short one: by about the energy, a thousand times where maps are stretched thirty times.
+_STRETCHED = 100.0
 
 
 def in_units(uv: FloatArray, exponent: int) -> ComplexArray:
@@ -115,6 +118,13 @@ class NewtonDescent:
             small = newton and 0.5 * promise <= tolerance * (self.value + _NOTHING)
             if small and negative < 0 and self._cut:
                 continue  # the reflected model is pessimistic: only the clamped one may declare an end
+            if small and negative == 0 and self.value > _STRETCHED:
+                # The model as it is has the last word, if it has a lowest point that doubles can tell.
+                true, further, newton = self._direction(gradient, 1.0, SHIFTS[:1])
+                if not newton:
+                    self._search(direction, promise)
+                    return Status.EXHAUSTED
+                direction, promise, small = true, further, 0.5 * further <= tolerance * self.value
             before = self.value
             moved = self._search(direction, promise)
             if small and negative == 0:
@@ -132,14 +142,16 @@ class NewtonDescent:
         """The energy's derivative by the unknowns."""
         return self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
 
-    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
+    def _direction(
+        self, gradient: ComplexArray, negative: float, shifts: tuple[float, ...] = SHIFTS
+    ) -> tuple[ComplexArray, float, bool]:
         """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
         or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
         """
         self.assemble(negative)
         # While steps are cut short, what was too little for the last matrix is for this one.
-        skipped = self._shift if self._cut else 0
-        found = self.system.descent(gradient, _SHIFTS[skipped:], self.solve)
+        skipped = self._shift if self._cut and shifts is SHIFTS else 0
+        found = self.system.descent(gradient, shifts[skipped:], self.solve)
         if found is not None:
             direction, promise, tried = found
             self._shift = skipped + tried

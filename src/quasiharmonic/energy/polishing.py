@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, map_array, named, not_negative, whole_number
+from quasiharmonic.arrays import FloatArray, check_callback, map_array, named, not_negative, whole_number
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
 from quasiharmonic.energy.energies import (
@@ -155,6 +155,7 @@ def polish_map(
     chosen = energy_named(energy)
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)
+    check_callback(callback)
     start = _start(domain, uv)
     track = lay_boundary(slide, domain, start) if slide is not False else None
     if track is not None:

@@ -29,7 +29,7 @@ from quasiharmonic.curves.straying import Straying
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import Deformation, QuadraticForm, damped
 from quasiharmonic.energy.line_search import Trial, backtrack, extend
-from quasiharmonic.energy.newton_descent import FRACTION, HALVINGS, NewtonDescent, in_units
+from quasiharmonic.energy.newton_descent import FRACTION, HALVINGS, SHIFTS, NewtonDescent, in_units
 from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.exact.certificate import flipped_triangles, is_injective
 from quasiharmonic.exact.loops import judge_loops
@@ -227,7 +227,9 @@ class SlidingDescent(NewtonDescent):
             np.add.at(slopes, number[number >= 0], unit * by_ends[number >= 0, end])
         return slopes, unit * 2.0**self.exponent * by_both
 
-    def _direction(self, gradient: ComplexArray, negative: float) -> tuple[ComplexArray, float, bool]:
+    def _direction(
+        self, gradient: ComplexArray, negative: float, shifts: tuple[float, ...] = SHIFTS
+    ) -> tuple[ComplexArray, float, bool]:
         system = self.system
         system.bend = damped(self.forces, negative)
         for end in (0, 1):
@@ -235,7 +237,7 @@ class SlidingDescent(NewtonDescent):
             np.add.at(system.bend, number[number >= 0], self._bends[number >= 0, end, end])
         moves = (system.tangent[self.straying.pairs[self._both]] != 0).all(axis=1)
         system.coupling = np.where(moves, self._bends[self._both, 0, 1], 0)
-        direction, promise, newton = super()._direction(gradient, negative)
+        direction, promise, newton = super()._direction(gradient, negative, shifts)
         wrong = direction[system.at].real * self._side < 0
         if wrong.any():
             promise += float(np.sum((gradient[system.at] * direction[system.at]).real[wrong]))

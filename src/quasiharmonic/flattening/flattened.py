@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
-    check_range,
     index_array,
     map_array,
     named,
@@ -34,14 +33,12 @@ from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.flattening.distance_descent import kept
 from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
+from quasiharmonic.flattening.parts import Part, furthest_last, parts_of
 from quasiharmonic.flattening.piece import Flattening, Piece, Settings
-from quasiharmonic.mesh.topology import components
 from quasiharmonic.result import MapResult, Status, Step
 
 # A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
 _SAMPLED = 10.0
-# Several pieces together are as far as the one that comes first here.
-_FURTHEST_LAST = Status.INTERRUPTED, Status.STILL_FALLING, Status.EXHAUSTED, Status.POLISHED
 
 
 def flatten(
@@ -71,7 +68,8 @@ def flatten(
     F : (f, 3) array of int
         Triangles of one or several surfaces, each with at least one boundary loop, holes welcome, and no handles.
     fixed : (k,) array of int, optional
-        Vertices held at ``target``, to the last bit, of one connected surface. The map then stays where they put it.
+        Vertices held at ``target``, to the last bit. Surfaces with one stay where theirs put them, those with none are
+        laid beside.
     target : (k, 2) array, optional
         Their positions.
     energy : str or Energy
@@ -158,14 +156,23 @@ def flatten(
     V, F = real_array("V", V), index_array("F", F)
     weights = None if weights is None else positive_weights(weights, len(F))
     given = None if start is None else _injective(start, V, F)
-    if fixed is not None and target is not None:
-        from quasiharmonic.flattening.pins import pinned
-
-        return replace(pinned(V, F, fixed, target, settings, weights, given), seconds=time.perf_counter() - began)
-    parts = _parts(V, F)
-    pieces = _pieces(V, F, parts)
+    parts = parts_of(V, F)
     results: list[MapResult] = []
-    for piece, (vertices, triangles) in zip(pieces, parts, strict=True):
+    held: list[Part] = []
+    free = parts
+    if fixed is not None and target is not None:
+        from quasiharmonic.flattening.pinned_parts import pinned_parts
+        from quasiharmonic.flattening.pins import checked_pins, pinned
+
+        pins = checked_pins(fixed, target, len(V))
+        if len(parts) == 1:
+            result = pinned(parts[0].piece, *pins, settings, weights, given)
+            return replace(result, seconds=time.perf_counter() - began)
+        has_pins = [bool(np.isin(pins[0], part.vertices).any()) for part in parts]
+        held = [part for part, has in zip(parts, has_pins, strict=True) if has]
+        free = [part for part, has in zip(parts, has_pins, strict=True) if not has]
+        results.append(pinned_parts(F, held, *pins, settings, weights, given))
+    for piece, vertices, triangles in free:
         if results and results[-1].status is Status.INTERRUPTED:
             # The others still need a place, if not their best one.
             settings = replace(settings, max_iterations=0, callback=None)
@@ -175,23 +182,37 @@ def flatten(
         if of_distances and result.status is not Status.INTERRUPTED:
             result = _with_distances(piece, result, rings, replace(settings, tolerance=_SAMPLED * tolerance))
         results.append(result)
+    # Where pins have put something, that stays.
+    first = len(results) - len(free)
+    placed = [result.uv for result in results[:first]]
+    low = placed[0].min(axis=0) if placed else 0.0
+    boxes = [uv - low for uv in placed]
+    boxes += [_laid_out(part.piece, result.uv) for part, result in zip(free, results[first:], strict=True)]
+    beside = side_by_side(boxes, gap) if len(boxes) > 1 else boxes
+    placed += [place + low for place in beside[len(placed) :]]
     uv = np.zeros((len(V), 2))
-    placed = [_laid_out(piece, result.uv) for piece, result in zip(pieces, results, strict=True)]
-    for place, (vertices, _) in zip(side_by_side(placed, gap) if len(placed) > 1 else placed, parts, strict=True):
-        uv[vertices] = place
+    uv[np.concatenate([part.vertices for part in [*held, *free]])] = np.concatenate(placed)
     if unit_square:
         uv = in_unit_square(uv)
-    loops = [vertices[loop] for piece, (vertices, _) in zip(pieces, parts, strict=True) for loop in piece.loops]
+    status, certificate = furthest_last(result.status for result in results), certify(F, uv, loops=_loops(parts))
+    if held and not certificate.bijective and status in (Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING):
+        # Beside what is held so far away, or at such a size, doubles do not tell the triangles of the others.
+        status = Status.ROUNDED
     return MapResult(
         uv=uv,
-        status=min((result.status for result in results), key=_FURTHEST_LAST.index),
-        certificate=certify(F, uv, loops=loops),
+        status=status,
+        certificate=certificate,
         stages=[stage for result in results for stage in result.stages],
         history=[step for result in results for step in result.history],
         path=results[0].path if len(results) == 1 else [],
+        diagnosis=results[0].diagnosis,
         linear_solver=results[0].linear_solver,
         seconds=time.perf_counter() - began,
     )
+
+
+def _loops(parts: list[Part]) -> list[IntArray]:
+    return [loop for part in parts for loop in part.loops]
 
 
 def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
@@ -212,7 +233,7 @@ def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
         As `flatten` says of surfaces.
     """
     V, F = real_array("V", V), index_array("F", F)
-    pieces = _pieces(V, F, _parts(V, F))
+    pieces = [part.piece for part in parts_of(V, F)]
     for piece in pieces:
         # Says which rest triangles have no area.
         piece.energy(SymmetricDirichlet(), None)
@@ -231,37 +252,6 @@ def _with_distances(piece: Piece, found: MapResult, rings: int, settings: Settin
         history=found.history + then.history,
         path=found.path + then.path,
     )
-
-
-def _parts(V: FloatArray, F: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Vertices and triangles of every connected piece, largest piece first; one of all if the arrays are malformed."""
-    everything = np.arange(len(V)), np.arange(len(F))
-    if V.ndim != 2 or F.ndim != 2 or F.shape[1] != 3 or not F.size:
-        return [everything]
-    check_range("F", F, len(V))
-    label = components(F, len(V))
-    if not label.any() or np.bincount(F.ravel(), minlength=len(V)).min() == 0:
-        # What is wrong with vertices of no triangle is said with the rest.
-        return [everything]
-    of_triangle = label[F[:, 0]]
-    labels, count = np.unique(of_triangle, return_counts=True)
-    return [
-        (np.flatnonzero(label == own), np.flatnonzero(of_triangle == own))
-        for own in labels[np.argsort(-count, kind="stable")].tolist()
-    ]
-
-
-def _pieces(V: FloatArray, F: IntArray, parts: list[tuple[IntArray, IntArray]]) -> list[Piece]:
-    return [Piece(V, F)] if len(parts) == 1 else [_piece(V, F, *part) for part in parts]
-
-
-def _piece(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -> Piece:
-    number = np.zeros(len(V), dtype=np.int64)
-    number[vertices] = np.arange(vertices.size)
-    try:
-        return Piece(V[vertices], number[F[triangles]])
-    except ValueError as error:
-        raise ValueError(f"the piece around vertex {vertices[0]}, its elements numbered anew: {error}") from None
 
 
 def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, counted
+from quasiharmonic.arrays import FloatArray, check_callback, counted
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.newton_descent import in_units
@@ -59,6 +59,9 @@ class Settings:
     callback: Callable[[Step], object] | None
     record: int
 
+    def __post_init__(self) -> None:
+        check_callback(self.callback)
+
 
 class Piece:
     """A connected surface that can be flattened, in a unit near its size.
@@ -101,6 +104,19 @@ class Piece:
         corners = self.V[self.F]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+
+    @classmethod
+    def united(cls, pieces: Sequence[Piece]) -> Piece:
+        """Several pieces as one that is not connected, their elements piece after piece, in the largest one's unit."""
+        made = object.__new__(cls)
+        first = np.cumsum([0, *(len(piece.V) for piece in pieces)])[:-1].tolist()
+        made.F = np.concatenate([piece.F + k for piece, k in zip(pieces, first, strict=True)])
+        made.loops = [loop + k for piece, k in zip(pieces, first, strict=True) for loop in piece.loops]
+        made.exponent = max(piece.exponent for piece in pieces)
+        smaller = [piece.exponent - made.exponent for piece in pieces]
+        made.V = np.concatenate([np.ldexp(piece.V, down) for piece, down in zip(pieces, smaller, strict=True)])
+        made.area = float(sum(np.ldexp(piece.area, 2 * down) for piece, down in zip(pieces, smaller, strict=True)))
+        return made
 
     @staticmethod
     def _missing(domain: Domain) -> int:

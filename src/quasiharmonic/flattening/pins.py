@@ -56,10 +56,9 @@ _ITERATIONS, _SPLITS = 2000, 4
 
 
 def pinned(
-    V: FloatArray,
-    F: IntArray,
-    fixed: ArrayLike,
-    target: ArrayLike,
+    piece: Piece,
+    fixed: IntArray,
+    target: FloatArray,
     settings: Settings,
     weights: FloatArray | None = None,
     start: FloatArray | None = None,
@@ -68,13 +67,10 @@ def pinned(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float64
-        Rest positions.
-    F : (f, 3) int64
-        Triangles of one connected surface with at least one boundary loop and no handles.
-    fixed : (k,) array of int
+    piece : Piece
+    fixed : (k,) int64
         Vertices that are held, on the boundary or not, each once; at least one.
-    target : (k, 2) array
+    target : (k, 2) float64
         Where they are held.
     settings : Settings
         Of the descent once the map is bijective. The search before it is called back from, too.
@@ -94,18 +90,16 @@ def pinned(
     Raises
     ------
     ValueError
-        When the input is malformed. Places that no map can meet, two vertices in one for instance, are no malformed
-        input.
+        When a rest triangle has no area. Places that no map can meet, two vertices in one for instance, are no
+        malformed input.
     KeyboardInterrupt
         When Ctrl-C comes before there is any bijective map, with or without pins.
     """
     began = time.perf_counter()
-    run = _Pinned(Piece(V, F), *_pins(fixed, target, len(V)), settings, weights)
+    run = Pinned(piece, fixed, target, settings, weights)
     # Overflow gives inf or NaN, and every comparison with NaN is false: such a step is never accepted.
     with np.errstate(all="ignore"):
-        run.place(start)
-        if run.certificate.bijective and run.status is not Status.INTERRUPTED:
-            run.let_go()
+        run.run(start)
     return replace(run.result(), seconds=time.perf_counter() - began)
 
 
@@ -145,8 +139,14 @@ def _stages(problem: Problem) -> Stages:
     return [first, Untangling(iterations=_UNTANGLING, resume=True), *stages]
 
 
-def _pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
-    """Vertices and their places, checked."""
+def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
+    """Vertices of n and their places, checked: what `flatten` takes as ``fixed`` and ``target``.
+
+    Raises
+    ------
+    ValueError
+        When there is none, one is no vertex or held twice, or a place is missing or not finite.
+    """
     vertices, places = index_array("fixed", fixed), real_array("target", target)
     if vertices.ndim != 1 or not vertices.size:
         raise ValueError(f"fixed must have shape (k,) with k > 0, not {vertices.shape}")
@@ -162,8 +162,20 @@ def _pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatA
     return vertices, places
 
 
-class _Pinned:
-    """A surface with vertices held, the map of it so far, and what is to be told; all in the piece's unit."""
+class Pinned:
+    """A surface with vertices held, the map of it so far, and what is to be told; all in the piece's unit.
+
+    Parameters
+    ----------
+    piece, fixed, target, settings, weights
+        As `pinned` has them.
+
+    Attributes
+    ----------
+    certificate : Certificate
+        Of the map so far.
+    status : Status
+    """
 
     def __init__(
         self, piece: Piece, fixed: IntArray, target: FloatArray, settings: Settings, weights: FloatArray | None
@@ -179,8 +191,21 @@ class _Pinned:
         self._history: list[Step] = []
         self._path: list[Snapshot] = []
 
-    def place(self, start: FloatArray | None) -> None:
-        """Look for a bijective map with the vertices in place."""
+    @property
+    def pins(self) -> tuple[IntArray, FloatArray]:
+        """The vertices (k,) that are held, and where (k, 2)."""
+        return self._fixed, self._target
+
+    def run(self, start: FloatArray | None) -> None:
+        """Find a bijective map with the vertices in place, and lower its distortion."""
+        moved = self.lay(start)
+        if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
+            self.seek(moved)
+        if self.certificate.bijective and self.status is not Status.INTERRUPTED:
+            self.let_go()
+
+    def lay(self, start: FloatArray | None) -> FloatArray:
+        """Flatten freely, from a start in the surface's unit if there is one, and move that onto the pins; (n, 2)."""
         piece = self._piece
         rough = replace(
             self._settings, density=SymmetricDirichlet(), name="symmetric-dirichlet", callback=None, record=0
@@ -189,13 +214,15 @@ class _Pinned:
         flat = Flattening(piece, rough, None).run(None if start is None else np.ldexp(start, -piece.exponent))
         self._stages += flat.stages
         self._solver = flat.linear_solver
-        moved = moved_onto(flat.uv, self._fixed, self._target)
-        self._keep(moved)
         if flat.status is Status.INTERRUPTED:
             self.status = Status.INTERRUPTED
-            return
-        if self.certificate.bijective:
-            return
+        moved = moved_onto(flat.uv, self._fixed, self._target)
+        self.keep(moved)
+        return moved
+
+    def seek(self, moved: FloatArray) -> None:
+        """Look for a bijective map with the vertices in place, from a bijective map (n, 2) with them elsewhere."""
+        piece = self._piece
         n = len(piece.V)
         diagnosis = pin_obstructions(piece.F, n, edges(piece.F, n), self._fixed, self._target)
         if diagnosis.forbids_bijective:
@@ -245,7 +272,7 @@ class _Pinned:
                 here.bijective
                 or here.flipped.size + here.degenerate.size < before.flipped.size + before.degenerate.size
             ):
-                self._keep(uv)
+                self.keep(uv)
             self.status = found.status
             if here.bijective or found.status is not Status.IMPOSSIBLE or found.diagnosis is None:
                 return
@@ -296,7 +323,7 @@ class _Pinned:
                 self._report(descent)
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
-        self._keep(descent.uv)
+        self.keep(descent.uv)
         self.status = status
         seconds, energies = time.perf_counter() - began, (first, descent.distortion)
         self._stages.append(Stage(f"guarded descent, {settings.name}", steps, seconds, (0, 0), energies))
@@ -309,8 +336,8 @@ class _Pinned:
         if settings.callback is not None:
             settings.callback(self._history[-1])
 
-    def _keep(self, uv: FloatArray) -> None:
-        """Take a map on, with the vertices put in place."""
+    def keep(self, uv: FloatArray) -> None:
+        """Take a map on, in the piece's unit, with the vertices put in place."""
         self._uv = uv.copy()
         self._uv[self._fixed] = self._target
         self.certificate = certify(self._piece.F, self._uv, loops=self._piece.loops)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
+    check_callback,
     check_choice,
     map_array,
     named,
@@ -187,6 +188,7 @@ def harmonise_map(
     check_choice("reference", reference, get_args(Reference))
     whole_number("max_iterations", max_iterations, least=1)
     not_negative("tolerance", tolerance)
+    check_callback(callback)
     start = map_array("uv", uv, domain.n)
     flipped = flipped_triangles(domain.F, start)
     if barrier and flipped.size:

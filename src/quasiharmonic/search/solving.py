@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, check_choice, map_array, named, whole_number
+from quasiharmonic.arrays import ComplexArray, FloatArray, check_callback, check_choice, map_array, named, whole_number
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
@@ -161,6 +161,7 @@ def solve(
     began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=1)
     whole_number("record", record, least=0)
+    check_callback(callback)
     lower = None if polish is None else energy_named(polish)
     first = None if start is None else _first_map(problem, start)
     if slide is not False:

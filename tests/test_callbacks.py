@@ -1,0 +1,52 @@
+"""What is called at every step: taken by many, and refused by each of them at once if it cannot be called."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import (
+    Problem,
+    batch,
+    flatten,
+    harmonise,
+    injective_map,
+    keep_distances,
+    morph,
+    polish,
+    repair,
+    solve,
+)
+from quasiharmonic.flattening import piece
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.search import stages
+from quasiharmonic.surfaces import disk
+
+V, F = disk(3)
+(LOOP,) = boundary_loops(F, len(V))
+PLACES = V[LOOP] * (1.0, 0.5)
+FLIPPED = V * np.where(np.arange(len(V)) == 1, -1.0, 1.0)[:, None]
+
+TAKERS = {
+    "injective_map": lambda callback: injective_map(V, F, LOOP, PLACES, callback=callback),
+    "solve": lambda callback: solve(Problem(V, F, LOOP, PLACES), callback=callback),
+    "polish": lambda callback: polish(V, F, V, fixed=LOOP, callback=callback),
+    "harmonise": lambda callback: harmonise(V, F, V, fixed=LOOP, callback=callback),
+    "flatten": lambda callback: flatten(V, F, callback=callback),
+    "flatten with pins": lambda callback: flatten(V, F, fixed=[0], target=[(0, 0)], callback=callback),
+    "keep_distances": lambda callback: keep_distances(V, F, V, callback=callback),
+    "morph": lambda callback: morph(V, F, LOOP, PLACES, callback=callback),
+    "repair": lambda callback: repair(V, F, FLIPPED, callback=callback),
+    "batch": lambda callback: batch.run("set", "out", callback=callback),
+}
+
+
+@pytest.mark.parametrize("take", TAKERS.values(), ids=TAKERS)
+def test_what_cannot_be_called_is_refused_before_anything_is_computed(take, monkeypatch):
+    def computed(*arguments, **options):
+        raise AssertionError("the search has begun")
+
+    monkeypatch.setattr(stages.Search, "run", computed, raising=False)
+    monkeypatch.setattr(piece.Flattening, "run", computed)
+    with pytest.raises(ValueError, match="callback must be callable, or None, not 3"):
+        take(3)
