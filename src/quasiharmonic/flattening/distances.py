@@ -18,7 +18,7 @@ way along edges has k of them. What is measured here, all of which belongs besid
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -210,20 +210,36 @@ def surface_distances(
         whole_number(name, value, least=0)
     if targets is not None:
         whole_number("targets", targets, least=1)
+    return sampled(V, F, Sampling(rings, sources, targets, crossings), seed=seed)
+
+
+def sampled(V: FloatArray, F: IntArray, sampling: Sampling, *, seed: int = 0, lowest: float = 0.0) -> SurfaceDistances:
+    """Distances as `surface_distances` samples them, its arguments checked.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+    F : (f, 3) int64
+    sampling : Sampling
+        How many sources there are to be at most.
+    seed : int
+    lowest : float
+        As `straight_segments` has it.
+    """
     dice = np.random.default_rng(seed)
     used = np.unique(F)
-    source = used if sources >= used.size else np.sort(dice.choice(used, sources, replace=False))
+    source = used if sampling.sources >= used.size else np.sort(dice.choice(used, sampling.sources, replace=False))
     source = source[_along_curve(V[source])]
     edges = edge_graph(F, len(V))
-    row, target = neighbours_within(edges, source, rings)
-    if targets is not None:
-        kept = _some_of_each(row, targets, dice)
+    row, target = neighbours_within(edges, source, sampling.rings)
+    if sampling.targets is not None:
+        kept = _some_of_each(row, sampling.targets, dice)
         row, target = row[kept], target[kept]
-    segments = straight_segments(V, F, crossings)
+    segments = straight_segments(V, F, sampling.crossings, lowest=lowest)
     mean_edge = (segments * edges).sum() / edges.nnz
-    length = chain_lengths(segments, source, row, target, float(_REACH * rings * mean_edge))
+    length = chain_lengths(segments, source, row, target, float(_REACH * sampling.rings * mean_edge))
     order = np.argsort(source[row], kind="stable")
-    return SurfaceDistances(source[row][order], target[order], length[order], Sampling(rings, source.size, targets, crossings))
+    return SurfaceDistances(source[row][order], target[order], length[order], replace(sampling, sources=source.size))
 
 
 def distance_error(

@@ -37,7 +37,7 @@ _AT_A_TIME = 64
 _FARTHER = 1.25
 
 
-def straight_segments(V: FloatArray, F: IntArray, crossings: int) -> csr_array:
+def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: float = 0.0) -> csr_array:
     """All straight segments between vertices of a surface that cross few of its edges.
 
     Parameters
@@ -48,6 +48,8 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int) -> csr_array:
         Triangles of a surface, consistently oriented, none of zero area.
     crossings : int
         The number of edges that a segment may cross; with 0 there are but the edges themselves.
+    lowest : float
+        Triangles lower than this share of their longest side are taken as being so high, and may have no area.
 
     Returns
     -------
@@ -59,7 +61,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int) -> csr_array:
     ValueError
         When triangles have no area.
     """
-    shapes = rest_shapes(V, F)
+    shapes = rest_shapes(V, F, lowest=lowest)
     if shapes.flat.size:
         raise ValueError(
             f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: it cannot be laid flat there"
