@@ -21,10 +21,10 @@ from quasiharmonic.flattening.hierarchy import Hierarchy, Level
 from quasiharmonic.flattening.start import disk_start
 from quasiharmonic.flattening.touching_up import thick_energy, touched_up
 
-# Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has at least.
-_COARSEST, _RATIO = 150, 4.0
+#: Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has at least.
+COARSEST, RATIO = 150, 4.0
 # How far the maps of coarse meshes are taken: they are only beginnings. Steps at most, on the coarsest and on others.
-_TOLERANCE, _STEPS = 1e-1, (300, 40)
+_TOLERANCE, STEPS = 1e-1, (300, 40)
 # Ears stand so high above their edges, one after the other, until the map is bijective.
 _HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
 # ... and from this height on all of the boundary is put within the coarse image, not only what has met.
@@ -53,50 +53,67 @@ def coarse_start(
     (n, 2) float64 or None
         A bijective map of moderate distortion; None where the way ends in rounding.
     """
-    hierarchy = Hierarchy(V, F, list(loops), _COARSEST)
+    hierarchy = Hierarchy(V, F, list(loops), COARSEST)
+    return climbed(hierarchy, hierarchy.stations(RATIO), linear_solver, guarded=guarded)
+
+
+def climbed(
+    hierarchy: Hierarchy, stops: Sequence[int], linear_solver: str = "auto", *, guarded: bool = False
+) -> FloatArray | None:
+    """Flatten the coarsest of some meshes, and carry its map from each to the next, with a descent on all but the last.
+
+    Parameters
+    ----------
+    hierarchy : Hierarchy
+    stops : sequence of int
+        Some of its stops, coarsest first.
+    linear_solver, guarded
+        As `coarse_start` has them.
+
+    Returns
+    -------
+    (m, 2) float64 or None
+        A bijective map of the last of the meshes; None where the way ends in rounding.
+    """
     here: Level | None = None
     uv: FloatArray | None = None
-    last = 0
-    for stop in hierarchy.stations(_RATIO):
+    for stop in stops:
         level = hierarchy.level(stop)
         if here is None:
-            uv = disk_start(V[level.vertices], level.F, level.loops, linear_solver)
+            uv = disk_start(hierarchy.V[level.vertices], level.F, level.loops, linear_solver)
         else:
             assert uv is not None
-            uv = _carried(hierarchy, here, level, uv, (last, stop), len(V))
-            if uv is not None:
-                uv = touched_up(V[level.vertices], level.F, level.loops, uv, linear_solver)
-        if uv is None or stop == 0:
+            uv = carried(hierarchy, here, level, uv, linear_solver)
+        if uv is None or stop == stops[-1]:
             return uv
-        uv, guarded = _settled(V[level.vertices], level, uv, linear_solver, guarded, _STEPS[here is not None])
-        here, last = level, stop
+        uv, guarded = settled(hierarchy.V[level.vertices], level, uv, linear_solver, guarded, STEPS[here is not None])
+        here = level
     return uv
 
 
-def _carried(
-    hierarchy: Hierarchy, here: Level, there: Level, uv: FloatArray, stops: tuple[int, int], n: int
+def carried(
+    hierarchy: Hierarchy, here: Level, there: Level, uv: FloatArray, linear_solver: str = "auto"
 ) -> FloatArray | None:
-    """A map of one level carried to a finer one, bijective; None where none was found."""
-    w = np.zeros(n, dtype=np.complex128)
+    """A bijective map of one level carried to a finer one and touched up there; None where none was found."""
+    w = np.zeros(len(hierarchy.V), dtype=np.complex128)
     w[here.vertices] = in_units(uv, 0)
     rim = Rim(there.loops)
-    wary = np.zeros(n, dtype=bool)
+    wary = np.zeros(w.size, dtype=bool)
     for height in _HEIGHTS:
-        carried = hierarchy.prolong(w, *stops, wary, height)[there.vertices]
-        uv = carried.view(np.float64).reshape(-1, 2)
+        uv = hierarchy.prolong(w, here.stop, there.stop, wary, height)[there.vertices].view(np.float64).reshape(-1, 2)
         met = rim.meetings(uv)
         if not met.size and is_injective(there.F, uv):
-            return uv
+            return touched_up(hierarchy.V[there.vertices], there.F, there.loops, uv, linear_solver)
         # Those that met are put inside, and in the end all.
         late = height < _LATE
         wary[there.vertices if late else there.vertices[met]] = True
     return None
 
 
-def _settled(
+def settled(
     V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
 ) -> tuple[FloatArray, bool]:
-    """A level's map after some steps, bijective, and whether it had to be guarded."""
+    """A level's map after some steps down the symmetric Dirichlet energy, bijective, and whether it had to be guarded."""
     rim = Rim(level.loops)
     energy = thick_energy(V, level.F)
     if not guarded:

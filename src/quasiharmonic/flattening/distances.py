@@ -18,7 +18,7 @@ way along edges has k of them. What is measured here, all of which belongs besid
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,9 @@ from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range
 from quasiharmonic.flattening.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
 
 # The farthest vertices are looked for up to so many mean edges for each ring.
-_REACH = 1.5
+_REACH = 1.3
+# Cells of the curve that visits sources: 2^BITS along the longest side of their bounding box.
+_BITS = 10
 
 
 @dataclass(frozen=True)
@@ -208,18 +210,36 @@ def surface_distances(
         whole_number(name, value, least=0)
     if targets is not None:
         whole_number("targets", targets, least=1)
+    return sampled(V, F, Sampling(rings, sources, targets, crossings), seed=seed)
+
+
+def sampled(V: FloatArray, F: IntArray, sampling: Sampling, *, seed: int = 0, lowest: float = 0.0) -> SurfaceDistances:
+    """Distances as `surface_distances` samples them, its arguments checked.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+    F : (f, 3) int64
+    sampling : Sampling
+        How many sources there are to be at most.
+    seed : int
+    lowest : float
+        As `straight_segments` has it.
+    """
     dice = np.random.default_rng(seed)
     used = np.unique(F)
-    source = used if sources >= used.size else np.sort(dice.choice(used, sources, replace=False))
+    source = used if sampling.sources >= used.size else np.sort(dice.choice(used, sampling.sources, replace=False))
+    source = source[_along_curve(V[source])]
     edges = edge_graph(F, len(V))
-    row, target = neighbours_within(edges, source, rings)
-    if targets is not None:
-        kept = _some_of_each(row, targets, dice)
+    row, target = neighbours_within(edges, source, sampling.rings)
+    if sampling.targets is not None:
+        kept = _some_of_each(row, sampling.targets, dice)
         row, target = row[kept], target[kept]
-    segments = straight_segments(V, F, crossings)
+    segments = straight_segments(V, F, sampling.crossings, lowest=lowest)
     mean_edge = (segments * edges).sum() / edges.nnz
-    length = chain_lengths(segments, source, row, target, float(_REACH * rings * mean_edge))
-    return SurfaceDistances(source[row], target, length, Sampling(rings, source.size, targets, crossings))
+    length = chain_lengths(segments, source, row, target, float(_REACH * sampling.rings * mean_edge))
+    order = np.argsort(source[row], kind="stable")
+    return SurfaceDistances(source[row][order], target[order], length[order], replace(sampling, sources=source.size))
 
 
 def distance_error(
@@ -272,6 +292,18 @@ def distance_error(
     if np.shape(uv) != (n, 2):
         raise ValueError(f"uv must have shape ({n}, 2), a position for every vertex, not {np.shape(uv)}")
     return surface_distances(V, F, rings=rings, sources=sources, crossings=crossings).error(uv)
+
+
+def _along_curve(points: FloatArray) -> IntArray:
+    """An order of points (n, d) in which those next to each other are near each other: Morton's curve."""
+    low = points.min(axis=0)
+    size = float((points.max(axis=0) - low).max())
+    cell = ((points - low) / (size if size > 0 else 1.0) * ((1 << _BITS) - 1)).astype(np.int64)
+    code = np.zeros(len(points), dtype=np.int64)
+    for bit in range(_BITS):
+        for axis, along in enumerate(cell.T):
+            code |= (along >> bit & 1) << (len(cell.T) * bit + axis)
+    return np.argsort(code, kind="stable")
 
 
 def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArray:

@@ -31,11 +31,13 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, named
 from quasiharmonic.mesh.shapes import rest_shapes
 
-# Distances from so many vertices to all that are kept at a time: 32 MiB of each kind.
-_AT_A_TIME = 1 << 22
+# From so many vertices together distances are taken in what is around them all, ...
+_AT_A_TIME = 64
+# ... and from those that have not got to all of their targets so many times as far.
+_FARTHER = 1.25
 
 
-def straight_segments(V: FloatArray, F: IntArray, crossings: int) -> csr_array:
+def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: float = 0.0) -> csr_array:
     """All straight segments between vertices of a surface that cross few of its edges.
 
     Parameters
@@ -46,6 +48,8 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int) -> csr_array:
         Triangles of a surface, consistently oriented, none of zero area.
     crossings : int
         The number of edges that a segment may cross; with 0 there are but the edges themselves.
+    lowest : float
+        Triangles lower than this share of their longest side are taken as being so high, and may have no area.
 
     Returns
     -------
@@ -57,7 +61,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int) -> csr_array:
     ValueError
         When triangles have no area.
     """
-    shapes = rest_shapes(V, F)
+    shapes = rest_shapes(V, F, lowest=lowest)
     if shapes.flat.size:
         raise ValueError(
             f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: it cannot be laid flat there"
@@ -116,6 +120,7 @@ def neighbours_within(edges: csr_array, sources: IntArray, rings: int) -> tuple[
     edges : (n, n) csr_array
         As `edge_graph` makes it.
     sources : (s,) int64
+        Quickest if those near each other in this order are near each other on the surface.
     rings : int
 
     Returns
@@ -124,10 +129,11 @@ def neighbours_within(edges: csr_array, sources: IntArray, rings: int) -> tuple[
         Which source, ascending, and the vertex.
     """
     found = []
-    for start, part in _portions(sources, edges.shape[0]):
-        apart = dijkstra(edges, indices=part, unweighted=True, limit=rings)
+    for start, part in _portions(sources):
+        inside, graph, own = _around(edges, part, rings)
+        apart = dijkstra(graph, indices=own, unweighted=True, limit=rings)
         row, vertex = np.nonzero(np.isfinite(apart) & (apart > 0))
-        found.append((row + start, vertex))
+        found.append((row + start, inside[vertex]))
     row, vertex = (np.concatenate(part) for part in zip(*found, strict=True))
     return row, vertex
 
@@ -140,29 +146,44 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
     segments : (n, n) csr_array
         As `straight_segments` makes it.
     sources : (s,) int64
+        As of `neighbours_within`.
     row, target : (k,) int64
         Which source, ascending, and the vertex to get to; there must be a way.
     reach : float
-        About how far the farthest is. Further ones are found, with the distance looked for doubled until they are.
+        About how far the farthest is. Sources with further ones are asked again, farther and farther.
 
     Returns
     -------
     (k,) float64
     """
-    length = np.empty(row.shape)
-    for start, part in _portions(sources, segments.shape[0]):
-        own = slice(*np.searchsorted(row, [start, start + part.size]))
-        limit = reach
-        while np.isinf(found := dijkstra(segments, indices=part, limit=limit)[row[own] - start, target[own]]).any():
-            limit *= 2
-        length[own] = found
+    length = np.full(row.shape, np.inf)
+    first = np.searchsorted(row, np.arange(sources.size + 1))
+    left, limit = np.arange(sources.size), reach
+    while left.size:
+        for _, part in _portions(left):
+            inside, graph, own = _around(segments, sources[part], limit)
+            apart = dijkstra(graph, indices=own, limit=limit)
+            place = np.full(segments.shape[0], -1)
+            place[inside] = np.arange(inside.size)
+            for k, source in enumerate(part.tolist()):
+                pairs = slice(first[source], first[source + 1])
+                at = place[target[pairs]]
+                length[pairs] = np.where(at < 0, np.inf, apart[k, at])
+        left = np.unique(row[np.isinf(length)])
+        limit *= _FARTHER
     return length
 
 
-def _portions(sources: IntArray, n: int) -> list[tuple[int, IntArray]]:
-    """Sources in portions whose distances to all of ``n`` vertices can be held, and where each portion begins."""
-    size = max(_AT_A_TIME // max(n, 1), 1)
-    return [(start, sources[start : start + size]) for start in range(0, sources.size, size)]
+def _portions(sources: IntArray) -> list[tuple[int, IntArray]]:
+    """Sources in portions, and where each portion begins."""
+    return [(start, sources[start : start + _AT_A_TIME]) for start in range(0, sources.size, _AT_A_TIME)]
+
+
+def _around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:
+    """The vertices that can be reached from some sources, the part of the graph between them, and the sources in it."""
+    near = dijkstra(graph, indices=sources, limit=reach, min_only=True)
+    inside = np.flatnonzero(np.isfinite(near))
+    return inside, graph[inside][:, inside], np.searchsorted(inside, sources)
 
 
 def _twins(tail: IntArray, head: IntArray, n: int) -> IntArray:
@@ -177,10 +198,11 @@ def _twins(tail: IntArray, head: IntArray, n: int) -> IntArray:
 def _shortest(row: IntArray, column: IntArray, length: FloatArray, n: int) -> csr_array:
     """A matrix with the least of all lengths given for an entry."""
     key = row * n + column
-    order = np.lexsort((length, key))
+    order = np.argsort(key, kind="stable")
     key = key[order]
-    first = order[np.flatnonzero(np.diff(key, prepend=-1))]
-    return csr_array((length[first], (row[first], column[first])), shape=(n, n))
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    least, at = np.minimum.reduceat(length[order], first), order[first]
+    return csr_array((least, (row[at], column[at])), shape=(n, n))
 
 
 def _cross(a: ComplexArray, b: ComplexArray) -> FloatArray:

@@ -36,12 +36,15 @@ class Level:
 
     Attributes
     ----------
+    stop : int
+        Which of the hierarchy's.
     vertices : (m,) int64
         Its vertices as the finest mesh numbers them, ascending.
     F : (f, 3) int64
     loops : list of (l,) int64
     """
 
+    stop: int
     vertices: IntArray
     F: IntArray
     loops: list[IntArray]
@@ -60,10 +63,17 @@ class Hierarchy:
         Its boundary loops.
     goal : int
         How many vertices the coarsest mesh is to have; it has more where no other can be taken out.
+
+    Attributes
+    ----------
+    V : (n, 3) float64
+        As given.
+    stops : list of int
+        Where there is a mesh, finest first; 0 is the surface itself.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, loops: list[IntArray], goal: int) -> None:
-        self._V = V
+        self.V = V
         self._n = n = len(V)
         filled = fans(loops, n)
         held = np.zeros(n + len(loops), dtype=bool)
@@ -75,8 +85,7 @@ class Hierarchy:
 
     def stations(self, ratio: float) -> list[int]:
         """Some of the `stops`, coarsest first: each mesh has so many times the vertices of the one before, or more."""
-        removed = [0, *(sum(vertices.size for vertices, _ in removals) for removals in self._coarsening.rounds)]
-        left = self._n - np.cumsum(removed)
+        left = self._left()
         chosen = [0]
         for stop in self.stops[1:]:
             if left[stop] * ratio <= left[chosen[-1]]:
@@ -84,6 +93,17 @@ class Hierarchy:
         if len(chosen) == 1:
             chosen.append(self.stops[-1])
         return chosen[::-1]
+
+    def coarsest(self, least: float) -> int:
+        """The last of the `stops` whose mesh has so many vertices or more; 0 where none has."""
+        left = self._left()
+        return max((stop for stop in self.stops if left[stop] >= least), default=0)
+
+    def _left(self) -> IntArray:
+        """How many vertices there are after none, one, … of the rounds."""
+        removed = [0, *(sum(vertices.size for vertices, _ in removals) for removals in self._coarsening.rounds)]
+        left: IntArray = self._n - np.cumsum(removed)
+        return left
 
     def level(self, stop: int) -> Level:
         """The mesh after so many rounds, one of `stops`."""
@@ -95,7 +115,7 @@ class Hierarchy:
         number = np.full(self._n, -1)
         number[vertices] = np.arange(vertices.size)
         F = number[T]
-        return Level(vertices, F, boundary_loops(F, vertices.size))
+        return Level(stop, vertices, F, boundary_loops(F, vertices.size))
 
     def prolong(self, w: ComplexArray, start: int, stop: int, wary: BoolArray, height: float) -> ComplexArray:
         """Carry a map from the mesh at one stop to a finer one.
@@ -157,7 +177,7 @@ class Hierarchy:
 
     def _laid_out(self, vertices: IntArray, ring: IntArray, rim: bool) -> ComplexArray:
         """Rings at rest, laid out flat around their vertices; (r, d) complex128, of about unit size."""
-        arm = self._V[ring] - self._V[vertices][:, None]
+        arm = self.V[ring] - self.V[vertices][:, None]
         length = np.linalg.norm(arm, axis=2)
         following = np.roll(arm, -1, axis=1)
         cross = np.linalg.norm(np.cross(arm, following), axis=2)

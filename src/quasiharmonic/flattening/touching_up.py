@@ -22,9 +22,10 @@ from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.mesh.coarsening import touching
 from quasiharmonic.mesh.prolongation import positive
 from quasiharmonic.mesh.reference import rest_frames
+from quasiharmonic.mesh.shapes import rest_shapes
 
-# Triangles of a mesh whose triangles were never there are no lower than this share of their longest side.
-_LOWEST = 0.05
+#: Triangles of a mesh whose triangles were never there are no lower than this share of their longest side.
+LOWEST = 0.05
 # Towards the weighted middle of its neighbours a vertex goes this share of the way, so often; no weight is below this.
 _SHARE, _SWEEPS, _LEAST_WEIGHT = 0.8, 4, 0.02
 # Triangles are opened up whose density is so many times that of three quarters of all, with so many rings around them,
@@ -63,14 +64,11 @@ def touched_up(
 
 def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
     """The symmetric Dirichlet energy of a mesh, its thinnest triangles thickened, for descents from afar."""
-    z1, z2 = rest_frames(V, F)
-    longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
-    base = np.where(z1 > 0, z1, longest)
-    laid = np.zeros((len(F), 3, 2))
-    laid[:, 1, 0], laid[:, 2, 0] = base, z2.real
-    laid[:, 2, 1] = np.maximum(z2.imag, _LOWEST * longest**2 / base)
+    shapes = rest_shapes(V, F, lowest=LOWEST)
+    laid = np.zeros((len(F), 3), dtype=np.complex128)
+    laid[:, 1], laid[:, 2] = shapes.unit * shapes.sides[0], -shapes.unit * shapes.sides[2]
     corners = np.arange(F.size).reshape(-1, 3)
-    return DeformationEnergy(laid.reshape(-1, 2), F, ReweightedDirichlet(), rest_F=corners)
+    return DeformationEnergy(laid.view(np.float64).reshape(-1, 2), F, ReweightedDirichlet(), rest_F=corners)
 
 
 def _smoothed(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: ComplexArray) -> ComplexArray:

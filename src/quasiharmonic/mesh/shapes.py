@@ -52,7 +52,7 @@ class RestShapes:
         return 0.25j * self.sides[(1, 2, 0), :] / m
 
 
-def rest_shapes(V: ArrayLike, F: NDArray[np.integer]) -> RestShapes:
+def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) -> RestShapes:
     """Lay the triangles of a planar or curved mesh into the plane.
 
     Parameters
@@ -61,6 +61,8 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer]) -> RestShapes:
         Rest positions.
     F : (f, 3) int
         Triangles.
+    lowest : float
+        Triangles lower than this share of their longest side are made so high.
 
     Raises
     ------
@@ -72,4 +74,8 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer]) -> RestShapes:
     surface = np.zeros((len(positions), 3))
     surface[:, : positions.shape[1]] = np.ldexp(positions, -exponent)
     z1, z2 = rest_frames(surface, F)
+    if lowest:
+        longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
+        z1 = np.where(z1 > 0, z1, longest)
+        z2.imag = np.maximum(z2.imag, lowest * longest**2 / np.where(z1 > 0, z1, 1.0))
     return RestShapes(float(np.ldexp(1.0, exponent)), np.stack([z1 + 0j, z2 - z1, -z2]), 0.5 * z1 * z2.imag)
