@@ -355,10 +355,10 @@ def test_statements_keep_their_places_among_the_faces(put, tmp_path):
 # made by hand
 mtllib things.mtl
 o Cube
-v 0.0 0.0 0.0
-v 1.0 0.0 0.0
-v 1.0 1.0 0.0
-v 0.0 1.0 0.0
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
 vt 0.0 0.0
 vt 0.1 0.0
 vt 0.3333333333333333 1e-320

@@ -252,9 +252,28 @@ class TestBeyondRepair:
         rows = np.unique(FT[strip == 2])
         uv[rows] *= [-1, 1]
         result = repair(V, F, uv, FT=FT)
-        assert [island.injective for island in result.islands] == [True, True, False]
-        assert [o.kind.name for o in result.islands[2].diagnosis.obstructions] == ["REVERSED"]
+        assert [island.mirrored for island in result.islands] == [False, False, True]
+        assert result.injective
+        assert "mirrored, and left so" in result.summary()
         assert np.array_equal(result.uv, uv)
+
+    def test_mirrored_and_turned_over(self):
+        V, F, uv, FT, strip = strips(4)
+        rows = np.unique(FT[strip == 2])
+        uv[rows] *= [-1, 1]
+        result = repair(V, F, uv, FT=FT, unmirror=True)
+        assert result.injective
+        assert not flipped_triangles(result.FT, result.uv).size
+        assert np.array_equal(result.uv[FT[strip != 2]], uv[FT[strip != 2]])
+        # In the same box.
+        for pick in (np.min, np.max):
+            np.testing.assert_allclose(pick(result.uv[rows], axis=0), pick(uv[rows], axis=0))
+
+    def test_a_single_island_that_is_mirrored_is_inverted(self):
+        V, F = grid(4, 4)
+        result = repair(V, F, V * [-1, 1])
+        assert not result.injective
+        assert [o.kind.name for o in result.islands[0].diagnosis.obstructions] == ["REVERSED"]
 
     def test_closed_surface(self):
         F = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])

@@ -21,9 +21,10 @@ from quasiharmonic.arrays import (
     named,
     whole_number,
 )
+from quasiharmonic.atlas.verdict import is_mirrored
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Diagnosis
-from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.mesh.seams import Island, SeamedMesh
 from quasiharmonic.result import Step
 
 
@@ -39,6 +40,9 @@ class RepairedIsland:
         Those that were not strictly positive, and those that are still not.
     moved : (c,) int64
         Vertices that are in another place than before.
+    mirrored : bool
+        Whether every triangle was strictly negative, as in an island that was turned over on purpose, one of several.
+        It then was left, unless asked for, and is judged as the other side shows it.
     bijective : bool
         Whether the island, as it now is, covers no place twice. What its boundary overlaps stays so.
     reason : str
@@ -51,6 +55,7 @@ class RepairedIsland:
     inverted_before: IntArray
     inverted: IntArray
     moved: IntArray
+    mirrored: bool
     bijective: bool
     reason: str = ""
     diagnosis: Diagnosis | None = None
@@ -64,6 +69,9 @@ class RepairedIsland:
         """Say in a sentence what was done."""
         where = f"island at triangle {self.triangles[0]} ({counted('triangle', 'triangles', len(self.triangles))})"
         overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
+        if self.mirrored:
+            done = "turned over" if self.moved.size else "mirrored, and left so"
+            return f"{where}: {done}{overlap}"
         if not self.inverted_before.size:
             return f"{where}: nothing to repair{overlap}"
         done = (
@@ -78,6 +86,7 @@ class RepairedIsland:
         return {
             "first_triangle": int(self.triangles[0]),
             "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
             "injective": self.injective,
             "bijective": self.bijective,
             "inverted_before": self.inverted_before.tolist(),
@@ -125,7 +134,7 @@ class Repaired:
             f"{counted('triangle', 'triangles', before)} inverted before, {now} now; "
             f"{counted('vertex', 'vertices', len(self.moved))} moved"
         ]
-        return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size])
+        return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: everything but the map itself."""
@@ -145,6 +154,7 @@ def repair(
     *,
     FT: ArrayLike | None = None,
     whole: bool = False,
+    unmirror: bool = False,
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -168,6 +178,9 @@ def repair(
         and is left alone. By default ``F``. See `quasiharmonic.mesh.seams.SeamedMesh` for what counts as a seam.
     whole : bool
         Map every island that has inverted triangles anew as a whole, and polish it.
+    unmirror : bool
+        Turn islands over that are mirrored, each in its place. Otherwise they are left as they are: of several islands
+        some often are, on purpose, to use a picture twice.
     max_iterations : int
         Linear solves to spend at most on an island as a whole.
     linear_solver : str
@@ -203,6 +216,9 @@ def repair(
     mesh = SeamedMesh(V, F, FT, uv)
     done = []
     for island in mesh.islands:
+        if len(mesh.islands) > 1 and is_mirrored(island.F, island.uv):
+            done.append(_mirrored(island, unmirror))
+            continue
         one = IslandRepair(
             mesh.V, island, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback
         )
@@ -218,6 +234,7 @@ def repair(
                     inverted_before=before,
                     inverted=island.triangles[one.inverted],
                     moved=np.unique(island.vertices[one.moved]),
+                    mirrored=False,
                     bijective=bool(certificate.bijective),
                     reason="" if certificate.injective else one.reason,
                     diagnosis=None if certificate.injective else one.diagnosis,
@@ -227,3 +244,22 @@ def repair(
     mended = mesh.with_places([new for new, _ in done])
     assert mended.uv is not None
     return Repaired(mended.uv, mended.FT, tuple(report for _, report in done))
+
+
+def _mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
+    """A mirrored island, turned over within its box if asked for."""
+    uv = island.uv.copy()
+    if turn:
+        uv[:, 0] = uv[:, 0].min() + uv[:, 0].max() - uv[:, 0]
+    certificate = certify(island.F if turn else island.F[:, ::-1], uv)
+    wrong = np.sort(np.concatenate([certificate.flipped, certificate.degenerate]))
+    none = np.empty(0, dtype=np.int64)
+    return uv, RepairedIsland(
+        triangles=island.triangles,
+        inverted_before=none,
+        inverted=island.triangles[wrong],
+        moved=np.unique(island.vertices) if turn else none,
+        mirrored=True,
+        bijective=bool(certificate.bijective),
+        reason="Doubles have no room for it the other way around." if wrong.size else "",
+    )

@@ -5,7 +5,7 @@ Every function takes a `SeamedMesh` in the place of ``V, F, uv``, and has the na
 
 from quasiharmonic.atlas.mapped import MappedAtlas, MappedIsland
 from quasiharmonic.atlas.verdict import AtlasVerdict, IslandVerdict, certify
-from quasiharmonic.atlas.working import flatten, harmonise, injective_map, onto_outline, polish
+from quasiharmonic.atlas.working import flatten, harmonise, injective_map, pack, polish
 from quasiharmonic.mesh.seams import Island, SeamedMesh
 
 __all__ = [
@@ -19,6 +19,6 @@ __all__ = [
     "flatten",
     "harmonise",
     "injective_map",
-    "onto_outline",
+    "pack",
     "polish",
 ]

@@ -28,7 +28,7 @@ class IslandVerdict:
         Its triangles, ascending.
     mirrored : bool
         Whether every triangle is strictly negative, as in an island that was turned over on purpose. It then is judged
-        as the other side shows it.
+        as the other side shows it. A single island is never held for mirrored, but for inverted.
     certificate : Certificate
         By the island's own numbers.
     flipped : (a,) int64
@@ -152,7 +152,7 @@ def certify(mesh: SeamedMesh) -> AtlasVerdict:
     """
     judged = []
     for island in mesh.islands:
-        mirrored = is_mirrored(island.F, island.uv)
+        mirrored = len(mesh.islands) > 1 and is_mirrored(island.F, island.uv)
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)
         wrong = np.sort(np.concatenate([found.flipped, found.degenerate, found.nonfinite]))
         judged.append(IslandVerdict(island.triangles, mirrored, found, island.triangles[wrong]))

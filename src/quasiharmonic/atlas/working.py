@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, index_array, map_array, named
+from quasiharmonic.arrays import FloatArray, IntArray, index_array, named
 from quasiharmonic.atlas.mapped import MappedAtlas, each_island, in_place_of
+from quasiharmonic.atlas.packing import packed
+from quasiharmonic.atlas.verdict import is_mirrored
 from quasiharmonic.energy.deformation import positive_weights
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.flattening import flattened
@@ -119,38 +120,6 @@ def injective_map(
     return each_island(mesh, find)
 
 
-def onto_outline(
-    mesh: SeamedMesh, place: Callable[[Island], tuple[IntArray, FloatArray]], *, reference: Any = None, **rest: Any
-) -> MappedAtlas:
-    """Map every island onto an outline of its own; several stand side by side.
-
-    Parameters
-    ----------
-    mesh : SeamedMesh
-    place : callable
-        Says for an island which vertices are fixed, and where: `quasiharmonic.targets.boundary_to`, for instance.
-    reference, **rest
-        As `quasiharmonic.injective_map` has it.
-
-    Returns
-    -------
-    MappedAtlas
-    """
-    right = 0.0
-
-    def find(island: Island) -> MapResult:
-        nonlocal right
-        fixed, target = place(island)
-        target = map_array("target", target)
-        if len(mesh.islands) > 1:
-            low, high = target.min(axis=0), target.max(axis=0)
-            target = target + np.array([right - low[0], 0.0])
-            right += 1.05 * float(high[0] - low[0])
-        return solve(Problem(island.V, island.F, fixed, target, reference=reference), **rest)
-
-    return each_island(mesh, find, reflect=False)
-
-
 def flatten(
     mesh: SeamedMesh,
     *,
@@ -203,6 +172,40 @@ def flatten(
         sizes = np.cumsum([len(places) for places in uv])[:-1]
         uv = np.split(in_unit_square(np.concatenate(uv)), sizes)
     return replace(mapped, mesh=mesh.with_places(uv))
+
+
+def pack(mesh: SeamedMesh, *, margin: float = 1 / 256) -> SeamedMesh:
+    """Lay islands into the unit square, all at one texel density; see `quasiharmonic.atlas.packing.packed`.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+        Its islands injective, or mirrored; these stay mirrored.
+    margin : float
+        Least room between two islands, as a share of the square's side.
+
+    Returns
+    -------
+    SeamedMesh
+
+    Raises
+    ------
+    ValueError
+        When an island has no places, or so many have no room with such a margin.
+    """
+    islands = mesh.islands
+    F = [island.F[:, ::-1] if is_mirrored(island.F, island.uv) else island.F for island in islands]
+    return mesh.with_places(packed([island.uv for island in islands], F, _surface_areas(mesh), margin=margin))
+
+
+def _surface_areas(mesh: SeamedMesh) -> FloatArray:
+    """The islands' areas, in a unit near the surface's size."""
+    V = np.ldexp(mesh.V, -int(np.frexp(np.abs(mesh.V).max(initial=0.0))[1]))
+    a, b, c = V[mesh.F].swapaxes(0, 1)
+    along, across = b - a, c - a
+    squared = (along**2).sum(axis=1) * (across**2).sum(axis=1) - (along * across).sum(axis=1) ** 2
+    area = 0.5 * np.sqrt(np.maximum(squared, 0.0))
+    return np.array([area[island.triangles].sum() for island in mesh.islands])
 
 
 def _fixed(mesh: SeamedMesh, fixed: ArrayLike | None) -> IntArray | None:

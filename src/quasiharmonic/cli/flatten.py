@@ -53,6 +53,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
     seams.add_options(parser)
+    seams.add_packing(parser)
     parser.add_argument(
         "--pattern", type=Path, metavar="FILE", help="draw the outline true to scale too, as .svg or .dxf"
     )
@@ -86,6 +87,8 @@ def run(options: argparse.Namespace) -> int:
     )
     report.check_outputs(options.output, None, options.json, inputs, pattern=options.pattern)
     _check_pattern(options)
+    if options.pack and (options.unit_square or options.fixed is not None or options.pattern is not None):
+        raise ValueError("--pack decides size and place: leave --unit-square, --fixed and --pattern out")
     mesh = io.read_mesh(options.input)
     given: dict[str, Any] = {}
     if options.start or options.fixed is not None:
@@ -111,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
             callback=show,
             **given,
         )
-    judged = judging.write(options.output, mesh.with_places(mapped.mesh))
+    judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, mapped.mesh)))
     with report.after_writing(options.output):
         flat = io.without_idle(judged.V, judged.F, judged.uv)
         measured = distortion(*flat)

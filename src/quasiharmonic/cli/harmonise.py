@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments
+    from quasiharmonic.cli import arguments, seams
 
     parser = commands.add_parser(
         "harmonise",
@@ -46,6 +46,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
     )
+    seams.add_packing(parser)
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)

@@ -30,7 +30,7 @@ STEPS, LARGEST = 20, 100_000
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, sliding, targets
+    from quasiharmonic.cli import arguments, seams, sliding, targets
 
     parser = commands.add_parser(
         "map",
@@ -52,6 +52,7 @@ def add_parser(commands: Commands) -> None:
         default="map",
         help="draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂), with its histogram",
     )
+    seams.add_packing(parser)
     arguments.add_report(parser)
     distortion = parser.add_mutually_exclusive_group()
     distortion.add_argument(
@@ -117,6 +118,8 @@ def run(options: argparse.Namespace) -> int:
         mapped = each_island(found.mesh, solved, reflect=options.to is None)
     refined = [one.fitted.refined for one in posed]
     written = refined_islands(mesh, mapped, refined) if any(refined) else mesh.with_places(mapped.mesh)
+    if options.pack:
+        written = written.with_places(seams.laid_out(options, io.mapped(written)))
     judged = judging.write(options.output, written)
     with report.after_writing(options.output):
         if options.plot is not None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, sliding
+    from quasiharmonic.cli import arguments, seams, sliding
 
     parser = commands.add_parser(
         "polish",
@@ -52,6 +52,7 @@ def add_parser(commands: Commands) -> None:
         metavar="OUTLINE",
         help="the outline that the boundary is on, as qhm map names it (default: the polygon that the boundary is)",
     )
+    seams.add_packing(parser)
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
@@ -92,7 +93,7 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
     What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``.
     """
     from quasiharmonic import io
-    from quasiharmonic.cli import judging, progress, report
+    from quasiharmonic.cli import judging, progress, report, seams
     from quasiharmonic.energy.measures import distortion
 
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
@@ -101,7 +102,7 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input), progress.line() as show:
         after = lower(before, fixed, show)
-    judged = judging.write(options.output, mesh.with_places(after.mesh))
+    judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, after.mesh)))
     with report.after_writing(options.output):
         # Each with the vertices that its own seams give it, which may lie in different places.
         opened = before.opened(), after.mesh.opened()

@@ -32,6 +32,11 @@ def add_parser(commands: Commands) -> None:
         help="map islands that have inverted triangles anew as a whole (default: only patches around them)",
     )
     parser.add_argument(
+        "--unmirror",
+        action="store_true",
+        help="turn over islands that are mirrored, each in its place (default: left, as some are on purpose)",
+    )
+    parser.add_argument(
         "--max-iterations",
         type=arguments.count,
         default=2000,
@@ -49,8 +54,8 @@ def run(options: argparse.Namespace) -> int:
 
     from quasiharmonic import io
     from quasiharmonic.apply.repairing import repair
+    from quasiharmonic.atlas.verdict import certify
     from quasiharmonic.cli import progress, report
-    from quasiharmonic.exact.certificate import is_injective
     from quasiharmonic.mesh.seams import SeamedMesh
 
     if options.output.suffix.lower() != ".obj":
@@ -68,6 +73,7 @@ def run(options: argparse.Namespace) -> int:
             mesh.vt,
             FT=mesh.FT,
             whole=options.whole,
+            unmirror=options.unmirror,
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
@@ -75,15 +81,14 @@ def run(options: argparse.Namespace) -> int:
     io.write_obj(options.output, replace(mesh, vt=result.uv, FT=result.FT))
     written = io.read_obj(options.output)
     with report.after_writing(options.output):
-        parts = SeamedMesh(written.V, written.F, written.FT, written.vt).islands
-        injective = bool(parts) and all(is_injective(part.F, part.uv) for part in parts)
+        verdict = certify(SeamedMesh(written.V, written.F, written.FT, written.vt))
         facts = {
             **result.to_dict(),
-            "injective": injective,
+            "injective": verdict.injective,
             "input": str(options.input),
             "output": str(options.output),
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
         }
         report.emit(facts, options.json, f"wrote {options.output}: {result.summary()}")
-    return 0 if injective else 1
+    return 0 if verdict.injective else 1

@@ -49,6 +49,27 @@ def add_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def add_packing(parser: argparse._ActionsContainer) -> None:
+    """``--pack`` and ``--margin``."""
+    parser.add_argument(
+        "--pack", action="store_true", help="lay the islands into the unit square, all at one texel density"
+    )
+    parser.add_argument(
+        "--margin",
+        type=float,
+        default=1 / 256,
+        metavar="SHARE",
+        help="for --pack: least room between islands, as a share of the square's side (default: 1/256)",
+    )
+
+
+def laid_out(options: argparse.Namespace, mesh: SeamedMesh) -> SeamedMesh:
+    """The map packed, if that is asked for."""
+    from quasiharmonic import atlas
+
+    return atlas.pack(mesh, margin=options.margin) if options.pack else mesh
+
+
 def check_options(options: argparse.Namespace) -> None:
     """Raise a ValueError for a file of edges that is not there."""
     if options.seams not in ("file", "none") and not Path(options.seams).is_file():

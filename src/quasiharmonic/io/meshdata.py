@@ -42,6 +42,9 @@ class MeshData:
         For every corner its row of ``vt``; -1 where the corner has none.
     extra : (n, k) float64 or None
         What stood behind the three coordinates of a vertex (weight, colour); NaN where nothing did.
+    positions : bytes
+        The lines of the first vertices as they stood: written back, so that not one digit of a model changes. Vertices
+        that were added come after them.
     normals : bytes
         The ``vn`` lines as they stood. They are never looked into, only written back.
     FN : (f, 3) int64 or None
@@ -61,6 +64,7 @@ class MeshData:
     vt: FloatArray | None = None
     FT: IntArray | None = None
     extra: FloatArray | None = None
+    positions: bytes = b""
     normals: bytes = b""
     FN: IntArray | None = None
     statements: bytes = b""

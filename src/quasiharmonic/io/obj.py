@@ -94,7 +94,8 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
     statements = _lines_of(_STATEMENT, data, ends, kinds)
     if _NOT_PLAIN.search(statements):
         return None
-    rows = number_table(_lines_of(_VERTEX, data, ends, kinds), b"v", int(counts[_VERTEX]))
+    positions = _lines_of(_VERTEX, data, ends, kinds)
+    rows = number_table(positions, b"v", int(counts[_VERTEX]))
     if rows is None or rows.shape[1] < 3:
         return None
     vt = None
@@ -116,6 +117,7 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
         normal_lines=flat.get(2),
         vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
         extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
+        positions=positions,
         normals=_lines_of(_NORMAL, data, ends, kinds),
         statements=statements,
         statement_faces=before[kinds == _STATEMENT],
@@ -179,7 +181,8 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
     statements = mesh.statements.split(b"\n")
     head = int(np.count_nonzero(at < 0))
     yield b"".join(line + b"\n" for line in statements[:head])
-    rows = mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra])
+    yield mesh.positions
+    rows = (mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra]))[mesh.positions.count(b"\n") :]
     if np.isnan(rows).any():
         for row in rows.tolist():
             yield ("v " + " ".join(repr(x) for x in row if not math.isnan(x)) + "\n").encode()

@@ -37,6 +37,7 @@ class _Reader:
         self.data = data
         self.coordinates, self.width = array("d"), array("b")
         self.vt = array("d")
+        self.positions = bytearray()
         self.normals = bytearray()
         self.normal_count = 0
         self.corners = array("q")
@@ -68,6 +69,7 @@ class _Reader:
             raise _FaultError(f"a vertex with {_count(row, 'coordinate')}", "three are needed")
         self.coordinates.extend(row)
         self.width.append(len(row))
+        self.positions += text + b"\n"
 
     def texture(self, line: int, text: bytes) -> None:
         row = _numbers(text, 3)
@@ -129,6 +131,7 @@ class _Reader:
             normal_lines=normals if (normals >= 0).any() else None,
             vt=np.array(self.vt, dtype=np.float64).reshape(-1, 2) if self.vt else None,
             extra=extra,
+            positions=bytes(self.positions),
             normals=bytes(self.normals),
             statements=bytes(self.statements),
             statement_faces=np.array(self.statement_faces, dtype=np.int64),
