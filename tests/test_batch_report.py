@@ -85,8 +85,30 @@ class TestPage:
         assert "Failed (10)" in text
         assert text.count("over the time limit: not done within 10 s") == 10
         slowest = sorted(good, key=lambda row: -row["seconds"])[:12]
-        listed = re.findall(r"(?:simple|letters)/\d+", text[text.index("Slowest") : text.index("Most distorted")])
+        listed = re.findall(r"(?:simple|letters)/\d+", text[text.index("Slowest") : text.index("Failed")])
         assert listed == [row["problem"] for row in slowest]
+
+    def test_the_worst_comes_first(self, tmp_path):
+        rows = made(tmp_path)
+        for row in rows:
+            row["isometric"] = None if row["mips"] is None else 2 + row["mips"]
+        rows[7] |= {"isometric": 1.7e10, "mips": 2.5}
+        records.write_table(tmp_path / "t.csv", rows)
+        text = Reader(written(tmp_path, tmp_path / "t.csv")).text
+        good = [row for row in rows if row["certified"]]
+        head = text[: text.index("certified injective, 10 over")]
+        stretch, mips = ([row[name] for row in good] for name in ("isometric", "mips"))
+        assert rows[7]["certified"]
+        assert re.search(rf"1.7·10¹⁰ +worst stretch[^;]*; median {page.number(float(np.median(stretch)))}", head)
+        assert re.search(
+            rf"{page.number(max(mips))} +worst MIPS[^;]*; median {page.number(float(np.median(mips)))}", head
+        )
+        assert head.index("worst stretch") < head.index("median time")
+        lists = [text.index(words) for words in ("Most stretched", "Most distorted", "Slowest")]
+        assert lists == sorted(lists)
+        assert re.findall(r"(?:simple|letters)/\d+", text[lists[0] :])[0] == rows[7]["problem"]
+        name = rows[7]["problem"].partition("/")[0]
+        assert re.search(rf"{name} +100 +\d+ [^a-z]*1.7·10¹⁰", text)
 
     def test_of_a_real_run_with_pictures(self, tmp_path):
         source = write_stars(tmp_path / "set", ["easy/a", "easy/b", "hard/c"])
@@ -96,8 +118,8 @@ class TestPage:
         assert main(["report", str(tmp_path / "out")]) == 0
         read = Reader((tmp_path / "out" / "report.html").read_text())
         pictures = [attributes["src"] for tag, attributes in read.tags if tag == "img"]
-        # Three maps in two lists, and a surface that has no map.
-        assert len(pictures) == 7
+        # Three maps in three lists, and a surface that has no map.
+        assert len(pictures) == 10
         for picture in pictures:
             head, data = picture.split(",")
             assert head == "data:image/png;base64"

@@ -118,8 +118,8 @@ class Group:
     problems, certified : int
     seconds : tuple of float
         Median, 95 % and maximum of the time of those certified; NaN where there are none.
-    mips : float
-        Median.
+    stretch, mips : tuple of float
+        Worst and median of the worst stretch of those certified, and of their MIPS; NaN where there are none.
     triangles : int
     """
 
@@ -127,7 +127,8 @@ class Group:
     problems: int
     certified: int
     seconds: tuple[float, float, float]
-    mips: float
+    stretch: tuple[float, float]
+    mips: tuple[float, float]
     triangles: int
 
 
@@ -142,13 +143,14 @@ def groups(run: Run) -> list[Group]:
 
 def _group(run: Run, name: str, chosen: NDArray[np.bool_]) -> Group:
     good = run.certified & chosen
-    seconds, mips, triangles = (run.column(column) for column in ("seconds", "mips", "triangles"))
+    seconds, stretch, mips, triangles = (run.column(column) for column in ("seconds", "isometric", "mips", "triangles"))
     return Group(
         name=name,
         problems=int(chosen.sum()),
         certified=int(good.sum()),
         seconds=(quantile(seconds[good], 0.5), quantile(seconds[good], 0.95), quantile(seconds[good], 1.0)),
-        mips=quantile(mips[good], 0.5),
+        stretch=(worst(stretch[good]), quantile(stretch[good], 0.5)),
+        mips=(worst(mips[good]), quantile(mips[good], 0.5)),
         triangles=int(np.nansum(triangles[chosen])),
     )
 
@@ -157,6 +159,12 @@ def quantile(values: FloatArray, share: float) -> float:
     """A quantile of the values that are finite, NaN where there are none."""
     finite = values[np.isfinite(values)]
     return float(np.quantile(finite, share)) if finite.size else float("nan")
+
+
+def worst(values: FloatArray) -> float:
+    """The largest of the values that there are, infinite ones included; NaN where there are none."""
+    known = values[~np.isnan(values)]
+    return float(known.max()) if known.size else float("nan")
 
 
 def outcomes(run: Run) -> list[tuple[str, int]]:

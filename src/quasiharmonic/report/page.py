@@ -66,8 +66,9 @@ def _page(run: Run, other: Run | None) -> str:
         *([] if other is None else [_times(run)]),
         _phases(run),
         "</div>",
-        _gallery("Slowest of the certified", pictures, _worst(run, "seconds")),
+        _gallery("Most stretched of the certified, max(σ₁, 1/σ₂)", pictures, _worst(run, "isometric")),
         _gallery("Most distorted of the certified (MIPS)", pictures, _worst(run, "mips")),
+        _gallery("Slowest of the certified", pictures, _worst(run, "seconds")),
         _failures(run, pictures),
     ]
     return (
@@ -124,8 +125,9 @@ def _tiles(run: Run) -> str:
     whole = numbers.groups(run)[-1]
     tiles = [
         (percent(whole.certified, whole.problems), f"{whole.certified:,} of {whole.problems:,} certified {run.wanted}"),
+        (number(whole.stretch[0]), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {number(whole.stretch[1])}"),
+        (number(whole.mips[0]), f"worst MIPS distortion of a map; median {number(whole.mips[1])}"),
         (number(whole.seconds[0], "s"), f"median time of these; 95 % within {number(whole.seconds[1], 's')}"),
-        (number(whole.mips), "median MIPS distortion"),
         (number(whole.triangles), "triangles in all"),
         (number(numbers.quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "memory of one problem at most"),
     ]
@@ -147,13 +149,13 @@ def _groups(run: Run) -> str:
     groups = numbers.groups(run)
     if len(groups) == 1:
         return ""
-    head = "problems", "certified", "success", "median", "95 %", "longest", "median MIPS"
+    head = "problems", "certified", "success", "worst stretch", "worst MIPS", "median MIPS", "median", "95 %", "longest"
     rows = [
         (
             shown(group.name or "(top)"),
             *(f"{group.problems:,}", f"{group.certified:,}", percent(group.certified, group.problems)),
+            *(number(value) for value in (group.stretch[0], *group.mips)),
             *(number(value, "s") for value in group.seconds),
-            number(group.mips),
         )
         for group in groups
     ]
