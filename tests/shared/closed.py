@@ -8,7 +8,7 @@ TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3
 
 
 def torus(around=36, across=14, radius=2.0):
-    """A tube of radius 1 around a circle; vertex ``i * across + j`` is the j-th of the i-th ring, the outermost first."""
+    """A tube of radius 1 around a circle; vertex ``i * across + j`` is the j-th of the i-th ring, outermost first."""
     i, j = np.divmod(np.arange(around * across), across)
     u, v = 2 * np.pi * i / around, 2 * np.pi * j / across
     V = np.stack([(radius + np.cos(v)) * np.cos(u), (radius + np.cos(v)) * np.sin(u), np.sin(v)], axis=1)

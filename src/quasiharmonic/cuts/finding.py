@@ -67,14 +67,16 @@ def find_cuts(
 
     Examples
     --------
-    A cube, corner by corner, cut into a disk:
+    A starfish is cut to the end of each of its three arms and nearly the shortest way from one to the next:
 
+    >>> import numpy as np
     >>> from quasiharmonic.cuts.finding import find_cuts
-    >>> from quasiharmonic.mesh.opening import opened_along
-    >>> V = [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
-    >>> F = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-    ...      [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-    >>> cut = find_cuts(V, F)
+    >>> from quasiharmonic.surfaces import starfish
+    >>> V, F = starfish(3, 12)
+    >>> cut = find_cuts(V, F, gain=0.5)
+    >>> _, times = np.unique(cut, return_counts=True)
+    >>> int((times == 1).sum())
+    3
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))

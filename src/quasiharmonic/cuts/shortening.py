@@ -99,7 +99,8 @@ class _Disk:
         self.cut = cut
         FT, self._origin = opened_along(graph.F, graph.ends[cut], graph.n)
         copies = np.stack([FT.T, FT.T[(1, 2, 0), :]], axis=2)
-        leads_up = graph.F.T[(1, 2, 0), :] > graph.F.T
+        tail, head = graph.F.T, graph.F.T[(1, 2, 0), :]
+        leads_up = tail < head
         self._left = np.full(graph.ends.shape, -1)
         self._right = np.full(graph.ends.shape, -1)
         self._left[graph.side[leads_up]] = copies[leads_up]

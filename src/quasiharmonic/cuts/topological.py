@@ -1,4 +1,4 @@
-"""Cuts that a surface needs whatever its shape: across its handles and between its boundary loops, as short as they get.
+"""Cuts that a surface needs whatever its shape: across handles and between boundary loops, as short as they get.
 
 A tree of triangles, joined across edges, unfolds to a disk; cut are the edges that it does not cross. Most of these are
 of use to nobody: what remains without their loose ends is a few paths. Which, the tree decides. Here it is the one of
@@ -92,7 +92,7 @@ def _long_path(graph: EdgeGraph) -> IntArray:
     path = graph.way_back(before, start)
     if path.size == 1:
         # Around a vertex that is a neighbour of both ends.
-        corners = graph.F[(start == graph.F).any(axis=1) & (end == graph.F).any(axis=1)][0]
+        corners = graph.F[np.isin(graph.F, (start, end)).sum(axis=1) == 2][0]
         around = int(corners[(corners != start) & (corners != end)][0])
         path = graph.numbers(np.array([start, around]), np.array([around, end]))
     return path
