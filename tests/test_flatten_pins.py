@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Forbids, Kind
 from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.pin_obstructions import pin_obstructions
-from quasiharmonic.flattening.pins import moved_onto
+from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.flattening.pins import Pinned, moved_onto
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
@@ -227,6 +229,41 @@ def test_ctrl_c_gives_the_best_map_so_far(at):
     assert result.status is Status.INTERRUPTED
     assert len(seen) == at
     assert np.array_equal(result.uv[fixed], target)
+
+
+@pytest.mark.parametrize(
+    ("ended", "told"),
+    [
+        (Status.SETTLED, Status.INJECTIVE),
+        (Status.OUT_OF_ITERATIONS, Status.INJECTIVE),
+        (Status.INTERRUPTED, Status.INTERRUPTED),
+        (Status.ROUNDED, Status.ROUNDED),
+        (Status.IMPOSSIBLE, Status.IMPOSSIBLE),
+    ],
+)
+def test_a_map_that_overlaps_itself_has_the_status_of_its_search_where_that_says_more(ended, told):
+    V, F = grid(40, 2)
+    z = (1 + V[:, 1]) * np.exp(-2.4j * np.pi * V[:, 0])
+    uv = np.stack([z.real, z.imag], axis=1)
+    settings = Settings(SymmetricDirichlet(), "symmetric-dirichlet", 1e-4, 10, "auto", None, 0)
+    piece = Piece(V, F)
+    run = Pinned(piece, np.array([5]), np.ldexp(uv[5:6], piece.exponent), settings, None)
+    run.keep(uv)
+    run.status = ended
+    result = run.result()
+    assert result.injective
+    assert not result.certificate.bijective
+    assert result.status is told
+
+
+@pytest.mark.slow
+def test_what_other_air_does_not_help_is_started_anew():
+    # Three pins of 250 vertices, two of them next to each other on the rim, which have to change sides.
+    rng = np.random.default_rng(3)
+    V, F = random_delaunay(int(rng.integers(40, 300)), 3)
+    count = int(rng.integers(2, 25))
+    fixed = rng.choice(len(V), count, replace=False)
+    solved(V, F, fixed, rng.random((count, 2)) * rng.choice([1, 2]))
 
 
 def test_least_squares_of_a_similarity():

@@ -227,6 +227,42 @@ def test_a_section_is_a_part_of_its_curve(curve, rng):
             np.testing.assert_allclose(rest.position(np.zeros(1)), curve.position(np.array([end])), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("control", "tips"),
+    [
+        # Comes to a point in the middle; the same turned, moved and in other units.
+        ([(0, 0), (1, 1), (0, 1), (1, 0)], [(0.5, 0.75)]),
+        (np.array([(0, 0), (1, 1), (0, 1), (1, 0)]) @ [(0.6, 0.8), (-0.8, 0.6)] * 0.3 + 7, None),
+        # Goes there and back along one line.
+        ([(0, 0), (2, 0), (0.5, 0)], [(8 / 7, 0)]),
+        ([(0, 0), (3, 3), (-2, -2), (1, 1)], None),
+    ],
+)
+def test_where_a_piece_turns_on_the_spot_is_a_corner(control, tips):
+    curve = Curve([control])
+    found = curve.position(curve.corners(20.0)[1:-1])
+    if tips is not None:
+        np.testing.assert_allclose(found, tips, rtol=0, atol=1e-15)
+    assert len(found) == (2 if len(control) == 4 and np.linalg.matrix_rank(np.diff(control, axis=0)) == 1 else 1)
+    # Its length is that of many chords, and it goes through the same points.
+    t = np.linspace(0, 1, 20001)
+    rows = [np.outer(1 - t, a) + np.outer(t, b) for a, b in itertools.pairwise(np.array(control, dtype=float))]
+    while len(rows) > 1:
+        rows = [(1 - t)[:, None] * a + t[:, None] * b for a, b in itertools.pairwise(rows)]
+    points = rows[0]
+    assert curve.length == pytest.approx(np.hypot(*np.diff(points, axis=0).T).sum(), rel=1e-6)
+    assert curve.nearest(points[::50])[1].max() < 1e-13
+    # Held there, and not gone past.
+    s = curve.corners(20.0)[1]
+    before, after = (curve.frame(np.array([s]), np.array([forward]))[0][0] for forward in (False, True))
+    assert before == pytest.approx(-after, abs=1e-4)
+
+
+def test_handles_at_the_ends_make_no_corner():
+    curve = Curve([[(0, 0), (0, 0), (1, 1), (2, 0)], [(2, 0), (3, -1), (4, -1), (4, -1)]])
+    assert curve.corners(20.0).tolist() == [0, curve.length]
+
+
 def test_sides_lie_between_corners():
     square = Curve.polygon([(0, 0), (2, 0), (2, 1), (0, 1)])
     sides = square.sides(20.0)

@@ -25,7 +25,7 @@ class Status(Enum):
         "no map was found, and perhaps this mesh and this target admit none. No known obstruction forbids one."
     )
     IMPOSSIBLE = (
-        "No injective map exists for this mesh and this target: the diagnosis names what forbids it, and what would "
+        "No such map exists for this mesh and this target: the diagnosis names what forbids it, and what would "
         "help. This is the best map found."
     )
     OUT_OF_ITERATIONS = (

@@ -46,6 +46,14 @@ def add_rings(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def steps(text: str) -> int:
+    """Read a whole number, 0 included; for argparse."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
 def count(text: str) -> int:
     """Read a whole number of at least 1; for argparse."""
     value = int(text)

@@ -63,7 +63,13 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--allowance", type=float, default=0.0, metavar="WIDTH", help="cut so far outside of the outline, in that unit"
     )
-    parser.add_argument("--max-iterations", type=arguments.count, default=500, metavar="N", help="(default: 500)")
+    parser.add_argument(
+        "--max-iterations",
+        type=arguments.steps,
+        default=500,
+        metavar="N",
+        help="steps on each connected surface; 0 leaves the start as it is (default: 500)",
+    )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.curves.pieces import (
+    SLOW,
     Arc,
     angle_at,
     as_complex,
@@ -33,16 +34,20 @@ _LARGEST, _SMALLEST = 1e75, 1e-75
 _MEET = 1e-9
 # Bends of fewer radians than this are passed like none at all: what they change in a descent is beyond its tolerance.
 _KINK = 1e-3
-# Of the mean speed; where a piece is slower its direction is taken from a chord.
-_SLOW, _CHORD = 1e-9, 1e-5
+# Where a piece stands still its direction is taken from so short a chord, in its parameter.
+_CHORD = 1e-5
 # Distances between points and chords computed at a time.
 _PAIRS = 1 << 20
 # Lengths below this share of the curve's size are rounding.
 _SNAP = 1e-13
 # Parameters of each piece in the table of lengths.
 _TABLE = 32
+# From how far within a piece its end is searched for.
+_INWARD = 1e-2
+# A parameter that moves by no more than this is at rest.
+_RESTS = 1e-15
 # Steps of the searches for a parameter by length, and by distance.
-_MOST_STEPS, _REFINEMENTS = 60, 6
+_MOST_STEPS, _REFINEMENTS = 60, 40
 
 
 class Curve:
@@ -241,11 +246,12 @@ class Curve:
         here, at = self._chord_piece[chord], self._chord_first[chord] + share * self._chord_width[chord]
         best = np.full(z.size, np.inf)
         piece, t = here, at
-        # Chords stray from the curve, so near a joint the other piece may be the one.
+        # Chords stray from the curve, so near a joint the other piece may be the one; not quite from its end, where it
+        # might stand still.
         for other in (0, -1, 1):
             candidate = here + other
             candidate = candidate % self._degree.size if self.closed else np.clip(candidate, 0, self._degree.size - 1)
-            begin = np.where(candidate == here, at, 0.0 if other > 0 else 1.0)
+            begin = np.where(candidate == here, at, _INWARD if other > 0 else 1 - _INWARD)
             found, away = self._refined(candidate, begin, z)
             better = away < best
             piece, t = np.where(better, candidate, piece), np.where(better, found, t)
@@ -384,7 +390,7 @@ class Curve:
         first, second = self._derivatives(piece, t)
         speed = np.abs(first)
         # Where handles coincide with ends the speed is 0, and a short chord says where it goes.
-        slow = speed <= _SLOW * np.abs(self._control[piece]).max(axis=1).clip(self.size)
+        slow = speed <= SLOW * np.abs(self._control[piece]).max(axis=1).clip(self.size)
         if slow.any():
             step = np.where(t < 0.5, _CHORD, -_CHORD)
             chord = (self._point(piece, t + step) - self._point(piece, t)) / step
@@ -408,16 +414,24 @@ class Curve:
 
     def _refined(self, piece: IntArray, t: FloatArray, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """The parameter of the piece's point nearest to each of some points, by Newton's method, and the distance."""
-        best, least = t, np.abs(self._point(piece, t) - z)
+        t, least = t.copy(), np.abs(self._point(piece, t) - z)
+        best, going = t.copy(), np.arange(z.size)
         for _ in range(_REFINEMENTS):
-            away = self._point(piece, t) - z
-            first, second = self._derivatives(piece, t)
+            at, here = piece[going], t[going]
+            away = self._point(at, here) - z[going]
+            first, second = self._derivatives(at, here)
             slope = (away.conj() * first).real
             square = np.abs(first) ** 2
             bend = square + (away.conj() * second).real
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = slope / np.where(bend > 0.5 * square, bend, square)
-            t = np.clip(t - np.nan_to_num(step), 0.0, 1.0)
-            found = np.abs(self._point(piece, t) - z)
-            best, least = np.where(found < least, t, best), np.minimum(found, least)
+            there = np.clip(here - np.nan_to_num(step), 0.0, 1.0)
+            found = np.abs(self._point(at, there) - z[going])
+            better = found < least[going]
+            best[going[better]], least[going[better]] = there[better], found[better]
+            t[going] = there
+            # Most rest after four steps; next to where a piece stands still they take ten times as many.
+            going = going[np.abs(there - here) > _RESTS]
+            if not going.size:
+                break
         return best, least

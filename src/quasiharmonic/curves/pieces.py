@@ -17,6 +17,9 @@ from quasiharmonic.exact.predicates import two_product, two_sum
 _LONGEST_ARC = np.pi / 4
 # Radians by which a chord's piece bends.
 _FLAT = 0.1
+# Of its size: a curve slower than this stands still. It does so between its ends where that is at least this far from
+# both in its parameter.
+SLOW, _INSIDE = 1e-9, 1e-6
 # Nodes of Gauss' formula for a length.
 _NODES = 16
 
@@ -67,7 +70,7 @@ class Piece(NamedTuple):
 
 
 def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
-    """Piece ``i`` of a curve, checked; long arcs in several."""
+    """Piece ``i`` of a curve, checked; long arcs in several, Bézier curves that turn on the spot in two or three."""
     if isinstance(piece, Arc):
         rows = [np.asarray(x, dtype=np.float64) for x in (piece.centre, piece.a, piece.b)]
         if any(row.shape != (2,) for row in rows):
@@ -79,13 +82,41 @@ def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
             raise ValueError(f"piece {i} of the curve must have shape (2, 2), (3, 2) or (4, 2), not {control.shape}")
     if not (np.isfinite(control).all() and np.isfinite(ends).all()):
         raise ValueError(f"piece {i} of the curve is not finite")
-    four = np.zeros(4, dtype=np.complex128)
-    four[: len(control)] = as_complex(control)
     if not isinstance(piece, Arc):
-        return [Piece(len(control) - 1, four, ends, False)]
+        return [
+            Piece(len(control) - 1, _four(between(control, *span)), ends, False)
+            for span in pairwise([0.0, *_cusps(control), 1.0])
+        ]
+    four = _four(control)
     steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
     angles = np.linspace(*ends, steps + 1).tolist()
     return [Piece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
+
+
+def _four(control: FloatArray) -> ComplexArray:
+    """Control points, or centre and axes (k, 2), as `Piece` has them."""
+    four = np.zeros(4, dtype=np.complex128)
+    four[: len(control)] = as_complex(control)
+    return four
+
+
+def _cusps(control: FloatArray) -> list[float]:
+    """Parameters within a Bézier curve where its speed is zero, ascending: where it turns back, or comes to a point.
+
+    There both coordinates of the derivative vanish: a complex polynomial has a real root.
+    """
+    points = as_complex(control - control[0])
+    if len(points) < 3:
+        return []
+    if len(points) == 3:
+        by_power = [points[1] - points[0], points[0] - 2 * points[1] + points[2]]
+    else:
+        third = points[3] - points[0] + 3 * (points[1] - points[2])
+        by_power = [points[1] - points[0], 2 * (points[0] - 2 * points[1] + points[2]), third]
+    roots = np.roots(by_power[::-1]).real
+    inner = np.unique(roots[(roots > _INSIDE) & (roots < 1 - _INSIDE)])
+    speed = np.abs(np.polynomial.polynomial.polyval(inner, by_power))
+    return [float(t) for t in inner[speed <= SLOW * np.abs(points).max()]]
 
 
 def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:

@@ -91,7 +91,8 @@ def flatten(
         of their sides is always left. Not negative.
     max_iterations : int
         Newton steps at most on each connected piece, counted anew where an overlap makes the descent begin again, and
-        for distances.
+        for distances; with 0 the map is the start. The search for pins takes as many, or 2,000 if that is more, in each
+        of two tries.
     tolerance : float
         The descent has converged when Newton's model promises a further decrease below this fraction of the
         energy; for distances, which are a sample, below ten times of it. Not negative.

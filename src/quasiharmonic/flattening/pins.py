@@ -51,7 +51,9 @@ _MARGINS = 0.5, 1.5
 # Iterations after which tensors are left for vertices, and how many of these: three times as quick in hard cases as to
 # wait until tensors have settled, and as sure, since what is tried otherwise comes after.
 _FIRST, _UNTANGLING = 60, 300
-# Linear solves at most in each try, and times that edges of air are split as a diagnosis says.
+# Patches in a row that may be started anew in vain, when all else has failed.
+_IN_VAIN = 30
+# Linear solves at most in each try, unless more are asked for, and times that air is split as a diagnosis says.
 _ITERATIONS, _SPLITS = 2000, 4
 
 
@@ -127,16 +129,17 @@ def moved_onto(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArra
     return ((w - here.mean()) * factor + there.mean()).view(np.float64).reshape(-1, 2)
 
 
-def _stages(problem: Problem) -> Stages:
+def _stages(problem: Problem, *, last: bool) -> Stages:
     """What is tried, in which order: air gives way, so that vertices can be moved soon.
 
-    Random restarts are left out: other air is a better chance than a hundred tries with this one.
+    Random restarts are left to the last: other air is a better chance than a hundred tries with this one.
     """
     stages = [stage for stage in speed(problem) if not isinstance(stage, RandomRestarts)]
     if isinstance(stages[0], CoarseToFine):
         return stages
     first = VectorAdam(parameterisation="si-log", iterations=_FIRST)
-    return [first, Untangling(iterations=_UNTANGLING, resume=True), *stages]
+    restarts = [RandomRestarts(in_vain=_IN_VAIN)] if last else []
+    return [first, Untangling(iterations=_UNTANGLING, resume=True), *stages, *restarts]
 
 
 def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
@@ -160,6 +163,10 @@ def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray,
         )
     check_finite("target", "row", "rows", places)
     return vertices, places
+
+
+# Ends of a search that say no more than that no map was found, of which one may be injective all the same.
+_UNDECIDED = Status.INJECTIVE, Status.SETTLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
 
 class Pinned:
@@ -233,11 +240,11 @@ class Pinned:
             self.status = Status.ROUNDED
             return
         for margin in _MARGINS:
-            self._search(moved, margin)
+            self._search(moved, margin, last=margin == _MARGINS[-1])
             if self.certificate.bijective or self.status in (Status.INTERRUPTED, Status.IMPOSSIBLE):
                 return
 
-    def _search(self, flat: FloatArray, margin: float) -> None:
+    def _search(self, flat: FloatArray, margin: float, *, last: bool) -> None:
         """Solve surface and air together, from a bijective map of the surface, with frame and pins held."""
         n, piece = len(flat), self._piece
         try:
@@ -258,8 +265,8 @@ class Pinned:
             settings = self._settings
             found = solve(
                 problem,
-                strategy=_stages(problem),
-                max_iterations=_ITERATIONS,
+                strategy=_stages(problem, last=last),
+                max_iterations=max(_ITERATIONS, settings.max_iterations),
                 linear_solver=settings.linear_solver,
                 callback=settings.callback,
             )
@@ -353,7 +360,7 @@ class Pinned:
         uv = self._outward(self._uv)
         certificate = certify(self._piece.F, uv, loops=self._piece.loops)
         status = self.status
-        if certificate.injective and not certificate.bijective and status is not Status.IMPOSSIBLE:
+        if certificate.injective and not certificate.bijective and status in _UNDECIDED:
             status = Status.INJECTIVE
         return MapResult(
             uv=uv,
