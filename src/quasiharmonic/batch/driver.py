@@ -205,8 +205,12 @@ def _checked(settings: Settings) -> Settings:
     outline(settings.to)
     if settings.corners is not None:
         read_corners(settings.corners)
-    names = {"to": settings.to, "corners": settings.corners}
-    return replace(settings, **{k: os.path.abspath(v) for k, v in names.items() if v is not None and os.path.isfile(v)})
+    return replace(settings, to=_anywhere(settings.to), corners=_anywhere(settings.corners))
+
+
+def _anywhere(name: str | None) -> str | None:
+    """What names a file from anywhere, if it names one."""
+    return os.path.abspath(name) if name is not None and os.path.isfile(name) else name
 
 
 def _check_flatten(settings: Settings) -> None:
