@@ -11,15 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic import io
-from quasiharmonic.apply.fitting import Fitted, laid_along, with_room
-from quasiharmonic.arrays import named
+from quasiharmonic.apply.fitting import Fitted, held_in_place, laid_along, with_room
+from quasiharmonic.atlas.mapped import faced, naming
 from quasiharmonic.atlas.seaming import cut_apart
-from quasiharmonic.atlas.verdict import is_mirrored
 from quasiharmonic.curves import Curve, Rails
 from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.mesh.seams import Island, SeamedMesh
-from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.problem import Problem
 from quasiharmonic.targets.asked_corners import AskedCorners, read_corners
 
 # Outlines of several islands stand so far apart, as a share of their width.
@@ -76,34 +73,24 @@ def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings
     ValueError
         When something about the input makes a problem impossible to pose; it says what.
     """
-    islands, to = surface.islands, settings["to"]
+    to, reference = settings["to"], settings["reference"]
+    islands = faced(surface, reflect=to is None)
     if to is not None and settings["slide"] and len(islands) > 1:
         raise ValueError(f"boundaries slide along the outline of one island, and there are {len(islands)}")
     asked = None if settings["corners"] is None else read_corners(settings["corners"])
     found = []
-    for k, island in enumerate(islands):
-        fitted = _held(island, fixed, settings) if to is None else _onto(island, k, asked, settings)
-        if settings["refine"]:
-            fitted = with_room(fitted)
-        slide: bool | Rails = settings["slide"]
-        if slide:
-            slide = slide if to is None else Rails(_curves(to, _changed(to)), held=fitted.held)
-            fitted = replace(fitted, problem=moved_onto(slide, fitted.problem))
+    for k, (island, _) in enumerate(islands):
+        with naming(island, len(islands)):
+            held = (
+                held_in_place(island, fixed, reference=reference) if to is None else _onto(island, k, asked, settings)
+            )
+            fitted = with_room(held) if settings["refine"] else held
+            slide: bool | Rails = settings["slide"]
+            if slide:
+                slide = slide if to is None else Rails(_curves(to, _changed(to)), held=fitted.held)
+                fitted = replace(fitted, problem=moved_onto(slide, fitted.problem))
         found.append(Posed(fitted, slide))
     return found
-
-
-def _held(island: Island, fixed: NDArray[np.signedinteger] | None, settings: dict[str, Any]) -> Fitted:
-    """An island with its boundary, or with what else is held, where the file's map has it; mirrored ones unfolded."""
-    uv = island.uv * (-1, 1) if is_mirrored(island.F, island.uv) else island.uv
-    own = np.unique(boundary_edges(island.F, len(island.vertices)))
-    if fixed is not None:
-        own = np.flatnonzero(np.isin(island.vertices, fixed))
-    nowhere = own[np.isnan(uv[own]).any(axis=1)]
-    if nowhere.size:
-        which = named("vertex", "vertices", island.vertices[nowhere])
-        raise ValueError(f"no place in the plane for the fixed {which} (0-based): give every fixed vertex a vt")
-    return Fitted(Problem(island.V, island.F, own, uv[own], reference=settings["reference"]))
 
 
 def _onto(island: Island, k: int, asked: AskedCorners | None, settings: dict[str, Any]) -> Fitted:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic import __version__, atlas, io
 from quasiharmonic.apply.fitting import Fitted
-from quasiharmonic.atlas.mapped import MappedAtlas, each_island
+from quasiharmonic.atlas.mapped import MappedAtlas, each_island, faced
 from quasiharmonic.atlas.refined import written_over
 from quasiharmonic.batch import posing, records
 from quasiharmonic.batch.records import Record
@@ -219,7 +219,7 @@ def _flattened(
 ) -> MappedAtlas:
     """Lay a surface flat, its boundary free, island by island."""
     with _timed(record, "setup"):
-        pieces = [piece for island in surface.islands for piece in flattenable(island.V, island.F)]
+        pieces = [piece for island, _ in faced(surface, reflect=False) for piece in flattenable(island.V, island.F)]
     record |= {"vertices": len(surface.V), "triangles": len(surface.F), "fixed": 0, "pins": 0}
     record |= {"loops": sum(len(piece.loops) for piece in pieces), "islands": len(surface.islands)}
     tell({"facts": record})
