@@ -23,11 +23,13 @@ from quasiharmonic.batch.supervisor import Finished
 from quasiharmonic.cli import main
 from quasiharmonic.curves import Curve
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.surfaces import annulus, cat
+from quasiharmonic.surfaces import annulus, cat, disk, grid, refine
 from quasiharmonic.targets import outline, outline_curves, signed_area
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
 pytestmark = pytest.mark.slow
+
+OCTAHEDRON = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
 
 
 def names(source, **options):
@@ -326,9 +328,107 @@ class TestRun:
         assert batch.run(cats, tmp_path / "out", other, jobs=1).outcomes == {"bijective": 1}
         assert "guarded descent, distances" in record_of(tmp_path / "out", "cat.obj")["stages"]
 
+    def test_corners(self, tmp_path):
+        """By angle for sheets of any size, by place where they lie alike; a file of corners is part of the input."""
+        for name, cells in (("a", (9, 6)), ("b", (5, 8))):
+            (tmp_path / "set").mkdir(exist_ok=True)
+            io.write_obj(tmp_path / "set" / f"{name}.obj", io.MeshData(*grid(*cells)))
+        chosen = tmp_path / "corners.txt"
+        chosen.write_text("near:0,0,0\nnear:1,0,0\nnear:1,1,0\nnear:0,1,0\n")
+        for corners in ("auto", "near:0,0,0,near:1,0,0,near:1,1,0,near:0,1,0", str(chosen)):
+            settings = batch.Settings(to="rect:3x1", corners=corners)
+            progress = batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1)
+            assert progress.outcomes == {"injective": 2}
+            assert progress.resumed == 0
+            for name, corner in (("a", [0, 9, 69, 60]), ("b", [0, 5, 53, 48])):
+                uv = io.map_of(io.read_mesh(tmp_path / "out" / "results" / f"{name}.obj" / "map.obj"))
+                assert uv[corner].tolist() == [[0, 0], [3, 0], [3, 1], [0, 1]]
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).resumed == 2
+        chosen.write_text("near:0,0,0 0\n")
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).resumed == 0
+        chosen.write_text("near:0,0,0\n")
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).outcomes == {"invalid": 2}
+        assert "1 corner vertex for a contour with 4 corners" in record_of(tmp_path / "out", "a.obj")["error"]
+
+    @pytest.mark.parametrize("options", [{"to": "letter:H", "refine": True}, {"flatten": True}])
+    def test_what_does_not_lie_flat_is_cut(self, tmp_path, options):
+        """Along seams: vertices and faces stay; a disk beside it is left alone where an outline is wanted."""
+        source = tmp_path / "set"
+        source.mkdir()
+        V, F = refine(*(np.vstack([np.eye(3), -np.eye(3)]), OCTAHEDRON))
+        V, F = refine(V, F)
+        io.write_obj(source / "closed.obj", io.MeshData(V / np.linalg.norm(V, axis=1)[:, None], F))
+        io.write_obj(source / "disk.obj", io.MeshData(*cat(8)))
+        wanted = "bijective" if "flatten" in options else "injective"
+        assert batch.run(source, tmp_path / "none", batch.Settings(**options), jobs=1).outcomes == {
+            wanted: 1,
+            "invalid": 1,
+        }
+        settings = batch.Settings(cut=True, **options)
+        assert batch.run(source, tmp_path / "out", settings, jobs=1).outcomes == {wanted: 2}
+        before, after = (
+            io.read_mesh(path) for path in (source / "closed.obj", tmp_path / "out/results/closed.obj/map.obj")
+        )
+        record = record_of(tmp_path / "out", "closed.obj")
+        assert record["cut_edges"] > 0
+        assert (record["islands"], record["loops"]) == (1, 1)
+        added = record.get("added_vertices", 0)
+        assert len(after.V) == len(before.V) + added
+        np.testing.assert_array_equal(after.V[: len(before.V)], before.V)
+        if not added:
+            np.testing.assert_array_equal(after.F, before.F)
+        # Still closed: the cut is in the map alone.
+        assert not boundary_loops(after.F, len(after.V))
+        assert certify(*io.cut_at_seams(after)[1:]).injective
+        if wanted == "injective":
+            assert record_of(tmp_path / "out", "disk.obj")["cut_edges"] == 0
+
+    def test_edges_without_room_are_split(self, tmp_path):
+        V, F = disk(2)
+        ring = np.arange(len(V) - 12, len(V))
+        tips = 1.2 * (V[ring] + V[np.roll(ring, -1)]) / 2
+        V, F = np.vstack([V, tips]), np.vstack([F, np.stack([np.roll(ring, -1), ring, len(V) + np.arange(12)], axis=1)])
+        (tmp_path / "set").mkdir()
+        io.write_obj(tmp_path / "set" / "ears.obj", io.MeshData(V, F))
+        assert batch.run(tmp_path / "set", tmp_path / "a", batch.Settings(to="rect:2x1"), jobs=1).solved == 0
+        settings = batch.Settings(to="rect:2x1", refine=True)
+        assert batch.run(tmp_path / "set", tmp_path / "b", settings, jobs=1).solved == 1
+        record = record_of(tmp_path / "b", "ears.obj")
+        assert record["added_vertices"] >= 8
+        assert record["vertices"] == len(V) + record["added_vertices"]
+        written = io.read_mesh(tmp_path / "b" / "results" / "ears.obj" / "map.obj")
+        np.testing.assert_array_equal(written.V[: len(V), :2], V)
+
+    def test_islands(self, tmp_path):
+        """Of a file with seams each is mapped, its border kept; onto an outline they have one each, side by side."""
+        V, F = grid(6, 4)
+        left = V[F].mean(axis=1)[:, 0] < 0.5
+        uv = np.vstack([V, V * (-1, 1) + (4, 0)])
+        mesh = io.MeshData(V, F, uv, np.where(left[:, None], F, F + len(V)))
+        (tmp_path / "set").mkdir()
+        io.write_obj(tmp_path / "set" / "input.obj", mesh)
+        batch.run(tmp_path / "set", tmp_path / "out", jobs=1)
+        (name,) = (path.parent for path in (tmp_path / "out" / "results").rglob("map.obj"))
+        record = json.loads((name / "record.json").read_text())
+        assert (record["outcome"], record["islands"], record["fixed"]) == ("injective", 2, 2 * 14)
+        written = io.read_mesh(name / "map.obj")
+        border = np.isin(
+            F, np.concatenate([loop for part in (F[left], F[~left]) for loop in boundary_loops(part, len(V))])
+        )
+        np.testing.assert_array_equal(written.vt[written.FT][border], uv[mesh.FT][border])
+        settings = batch.Settings(to="rect:2x1", refine=True)
+        batch.run(tmp_path / "set" / "input.obj", tmp_path / "to", settings, jobs=1)
+        record = record_of(tmp_path / "to", "input.obj")
+        assert (record["outcome"], record["bijective"], record["islands"]) == ("injective", True, 2)
+
     @pytest.mark.parametrize(
         ("options", "message"),
         [
+            ({"flatten": True, "corners": "auto"}, "corners is of maps onto a given boundary"),
+            ({"flatten": True, "refine": True}, "refine is of maps onto a given boundary"),
+            ({"cut": True}, "cut is of plain meshes and the outline that they go to: name one by to"),
+            ({"corners": "auto"}, "corners is of plain meshes and the outline"),
+            ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is none of V, V:K and V:X:Y"),
             ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
             ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
             ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),

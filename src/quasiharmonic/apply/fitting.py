@@ -1,15 +1,19 @@
-"""A surface made ready for a map onto an outline: its boundary laid along it, edges split for room."""
+"""A surface made ready for a map: its boundary where it is or laid along an outline, edges split for room."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from quasiharmonic.apply.refining import refine_problem
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.mesh.refinement import Refined, composed, refine
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.mesh.seams import Island
+from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.targets.asked_corners import AskedCorners
 from quasiharmonic.targets.boundary import boundary_to
@@ -41,6 +45,41 @@ class Fitted:
     def added(self) -> int:
         """Vertices at the end of the list, each on an edge that was split."""
         return 0 if self.refined is None else len(self.refined.parents)
+
+
+def held_in_place(
+    island: Island, fixed: NDArray[np.integer] | None = None, *, reference: Reference | None = None
+) -> Fitted:
+    """Hold an island's boundary, or other vertices, where its map has them.
+
+    Parameters
+    ----------
+    island : Island
+    fixed : (k,) int, optional
+        Vertices of the mesh that the island is a part of; its boundary by default.
+    reference : {"equilateral", "rest", "corrected"}, optional
+        As `Problem` takes it.
+
+    Returns
+    -------
+    Fitted
+
+    Raises
+    ------
+    ValueError
+        As `Problem`; when there is nothing to hold, or it has no place.
+    """
+    if fixed is None:
+        own = np.unique(boundary_edges(island.F, len(island.vertices)))
+        if not own.size:
+            raise ValueError("there is no boundary that could be fixed: cut it open, or name fixed vertices")
+    else:
+        own = np.flatnonzero(np.isin(island.vertices, fixed))
+    nowhere = own[np.isnan(island.uv[own]).any(axis=1)]
+    if nowhere.size:
+        which = named("vertex", "vertices", island.vertices[nowhere])
+        raise ValueError(f"no place in the plane for the fixed {which}: give every fixed vertex a vt")
+    return Fitted(Problem(island.V, island.F, own, island.uv[own], reference=reference))
 
 
 def laid_along(

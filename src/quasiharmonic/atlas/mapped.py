@@ -124,26 +124,41 @@ def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, refle
     KeyboardInterrupt
         When Ctrl-C comes before an island has a place.
     """
+    islands = faced(mesh, reflect=reflect)
+    done: list[MappedIsland] = []
+    places = [island.uv for island in mesh.islands]
+    for k, (island, mirrored) in enumerate(islands):
+        if done and done[-1].result.status is Status.INTERRUPTED:
+            if np.isnan(island.uv).any():
+                raise KeyboardInterrupt
+            continue
+        with naming(island, len(islands)):
+            result = lower(island)
+        # A refinement of the island has further vertices, at the end.
+        places[k] = (result.uv * _MIRROR if mirrored else result.uv)[: len(island.vertices)]
+        done.append(MappedIsland(island.triangles, mirrored, result))
+    return MappedAtlas(mesh.with_places(places), tuple(done))
+
+
+def faced(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]]:
+    """The islands of a mesh as `each_island` hands them over, and whether each is the reflection of a mirrored one.
+
+    Raises
+    ------
+    ValueError
+        As `each_island` for a mesh that is none.
+    """
     if mesh.seamless:
         # What is no surface comes apart where it is none, which nobody has asked for.
         manifold_edges(mesh.F, len(mesh.V))
     islands = mesh.islands
     if not islands:
         raise ValueError("the mesh has no triangles" if not len(mesh.F) else "no triangle has a place")
-    done: list[MappedIsland] = []
-    places = [island.uv for island in islands]
-    for k, island in enumerate(islands):
-        if done and done[-1].result.status is Status.INTERRUPTED:
-            if np.isnan(island.uv).any():
-                raise KeyboardInterrupt
-            continue
-        mirrored = reflect and len(islands) > 1 and is_mirrored(island.F, island.uv)
-        with naming(island, len(islands)):
-            result = lower(replace(island, uv=island.uv * _MIRROR) if mirrored else island)
-        # A refinement of the island has further vertices, at the end.
-        places[k] = (result.uv * _MIRROR if mirrored else result.uv)[: len(island.vertices)]
-        done.append(MappedIsland(island.triangles, mirrored, result))
-    return MappedAtlas(mesh.with_places(places), tuple(done))
+    mirrored = [reflect and len(islands) > 1 and is_mirrored(island.F, island.uv) for island in islands]
+    return [
+        (replace(island, uv=island.uv * _MIRROR) if turned else island, turned)
+        for island, turned in zip(islands, mirrored, strict=True)
+    ]
 
 
 class naming:  # noqa: N801 (a context manager, used as a word)

@@ -195,11 +195,22 @@ def _checked(settings: Settings) -> Settings:
     if settings.max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, not {settings.max_iterations}")
     if settings.to is None:
+        for name in ("cut", "corners"):
+            if getattr(settings, name) and not (name == "cut" and settings.flatten):
+                raise ValueError(f"{name} is of plain meshes and the outline that they go to: name one by to")
         return settings
     from quasiharmonic.targets import outline
+    from quasiharmonic.targets.asked_corners import read_corners
 
     outline(settings.to)
-    return replace(settings, to=os.path.abspath(settings.to)) if os.path.isfile(settings.to) else settings
+    if settings.corners is not None:
+        read_corners(settings.corners)
+    return replace(settings, to=_anywhere(settings.to), corners=_anywhere(settings.corners))
+
+
+def _anywhere(name: str | None) -> str | None:
+    """What names a file from anywhere, if it names one."""
+    return os.path.abspath(name) if name is not None and os.path.isfile(name) else name
 
 
 def _check_flatten(settings: Settings) -> None:
@@ -209,7 +220,7 @@ def _check_flatten(settings: Settings) -> None:
             raise ValueError("energy is what flatten lowers: ask for that, or for polish")
         return
     plain = Settings()
-    for name in ("to", "strategy", "polish", "slide", "reference"):
+    for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
         if getattr(settings, name) != getattr(plain, name):
             raise ValueError(
                 f"{name} is of maps onto a given boundary, and flatten sets it free: leave one of them out"

@@ -54,6 +54,11 @@ COLUMNS: dict[str, type] = {
     "fixed": int,
     "pins": int,
     "loops": int,
+    # Parts between seams, each mapped on its own; edges that were cut to make them, and vertices that were added for
+    # room.
+    "islands": int,
+    "cut_edges": int,
+    "added_vertices": int,
     # Triangles not positive: in the first map of the search, and in the one written.
     "flips_before": int,
     "flips_after": int,

@@ -27,9 +27,17 @@ class Settings:
         go.
     flatten : bool
         Problems are plain meshes whose boundaries are free: `quasiharmonic.flatten` lays them flat, and what it makes
-        must be bijective. Then of what follows only ``max_iterations`` and ``linear_solver`` are read.
+        must be bijective. Then of what follows only ``cut``, ``max_iterations`` and ``linear_solver`` are read.
     energy : str or None
         What a flattening lowers; see `quasiharmonic.flatten` for the names. ``"symmetric-dirichlet"`` where None.
+    cut : bool
+        Whether plain meshes, or what of them lies between the seams of their files, are cut along further seams until
+        they lie flat.
+    corners : str or None
+        Which boundary vertices go to the corners of ``to``: ``"auto"``, ``"near:x,y,z,…"``, or whatever else
+        `quasiharmonic.targets.asked_corners.read_corners` reads.
+    refine : bool
+        Whether edges that leave the target no room are split, which adds vertices at the end.
     strategy : {"speed", "quality"}
     polish : str or None
         Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
@@ -45,6 +53,9 @@ class Settings:
     to: str | None = None
     flatten: bool = False
     energy: str | None = None
+    cut: bool = False
+    corners: str | None = None
+    refine: bool = False
     strategy: str = "speed"
     polish: str | None = None
     slide: bool = False
@@ -78,8 +89,8 @@ class Settings:
             When a file cannot be read; the message names it.
         """
         digest = blake2b(digest_size=16)
-        drawing = None if self.to is None or not os.path.isfile(self.to) else Path(self.to)
-        for path in (files.mesh, files.fixed, drawing):
+        named = [Path(name) if name is not None and os.path.isfile(name) else None for name in (self.to, self.corners)]
+        for path in (files.mesh, files.fixed, *named):
             contents = b"" if path is None else _contents(path)
             digest.update(len(contents).to_bytes(8, "little"))
             digest.update(contents)

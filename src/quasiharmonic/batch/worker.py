@@ -27,18 +27,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic import __version__, io
-from quasiharmonic.batch import records
+from quasiharmonic import __version__, atlas, io
+from quasiharmonic.apply.fitting import Fitted
+from quasiharmonic.atlas.mapped import MappedAtlas, each_island, faced
+from quasiharmonic.atlas.refined import written_over
+from quasiharmonic.batch import posing, records
 from quasiharmonic.batch.records import Record
-from quasiharmonic.curves import Curve, Rails
+from quasiharmonic.curves import Rails
 from quasiharmonic.energy.measures import distortion
-from quasiharmonic.energy.polishing import polish_map
-from quasiharmonic.energy.sliding import moved_onto
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.flattened import flatten, flattenable
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.problem import Problem
-from quasiharmonic.result import MapResult, Stage, Status
+from quasiharmonic.energy.polishing import polished
+from quasiharmonic.flattening.flattened import flattenable
+from quasiharmonic.mesh.refinement import Refined
+from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.result import MapResult, Status
 from quasiharmonic.search.solving import solve
 
 #: What a process says when it has imported what it needs.
@@ -142,146 +143,133 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
     with _timed(record, "read"):
         mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
+    with _timed(record, "setup"):
+        if not settings["flatten"] and settings["to"] is None and mesh.FT is None:
+            # It says what is missing.
+            io.problem_arrays(mesh, fixed)
+        surface = posing.surface_of(mesh, settings)
+    if settings["cut"]:
+        record["cut_edges"] = len(surface.seams) - len(io.seamed(mesh).seams)
     if settings["flatten"]:
-        found = _flattened(mesh, settings, record, tell)
+        found = _flattened(surface, settings, record, tell)
+        mapped = mesh.with_places(found.mesh)
     else:
-        found = _mapped(mesh, fixed, settings, record, tell)
+        found, refined = _mapped(surface, fixed, settings, record, tell)
+        islands = found.mesh.islands
+        mapped = written_over(mesh, islands, refined, found.places()) if any(refined) else mesh.with_places(found.mesh)
     with _timed(record, "write"):
-        record |= _written(records.map_path(folder), mesh, found, "bijective" if settings["flatten"] else "injective")
+        record |= _written(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
     with _timed(record, "measure"):
-        record |= _measured(mesh, found)
+        record |= _measured(mapped)
 
 
 def _mapped(
-    mesh: io.MeshData,
+    surface: SeamedMesh,
     fixed: NDArray[np.signedinteger] | None,
     settings: dict[str, Any],
     record: Record,
     tell: Callable[[dict[str, Any]], None],
-) -> MapResult:
-    """Map a mesh onto a given boundary."""
+) -> tuple[MappedAtlas, list[Refined | None]]:
+    """Map a surface onto a given boundary, island by island; and what became of the meshes of these."""
     with _timed(record, "setup"):
-        arrays = io.problem_arrays(mesh, fixed) if settings["to"] is None else _onto(settings["to"], mesh)
-        problem = Problem(*arrays, reference=settings["reference"])
-        slide = _along(settings["to"]) if settings["slide"] else False
-        if slide is not False:
-            problem = moved_onto(slide, problem)
-    record |= {"vertices": problem.n, "triangles": len(problem.F), "fixed": len(problem.fixed)}
-    record |= {"pins": len(problem.domain.pins), "loops": len(problem.domain.loops)}
+        posed = posing.posed(surface, fixed, settings)
+    problems = [one.fitted.problem for one in posed]
+    record |= {
+        "vertices": sum(problem.n for problem in problems),
+        "triangles": sum(len(problem.F) for problem in problems),
+        "fixed": sum(len(problem.fixed) for problem in problems),
+        "pins": sum(len(problem.domain.pins) for problem in problems),
+        "loops": sum(len(problem.domain.loops) for problem in problems),
+        "islands": len(problems),
+    }
+    if settings["refine"]:
+        record["added_vertices"] = sum(one.fitted.added for one in posed)
     tell({"facts": record})
+    todo = iter(posed)
+    # Each is posed as it is to be solved.
+    found = each_island(surface, lambda island: _solved(*next(todo), settings, record), reflect=settings["to"] is None)
+    results = [island.result for island in found.islands]
+    record |= _told(found)
+    if all(result.history for result in results):
+        record["flips_before"] = sum(result.history[0].flipped for result in results)
+    why = [result.diagnosis for result in results if not result.injective]
+    if why:
+        reasons = [reason.summary() for reason in why if reason is not None and reason.obstructions]
+        record["error"] = "; ".join(reasons) or found.status.value
+    return found, [one.fitted.refined for one in posed]
+
+
+def _solved(fitted: Fitted, slide: bool | Rails, settings: dict[str, Any], record: Record) -> MapResult:
+    """Map one island, and lower its distortion if that is asked for."""
     with _timed(record, "map"):
         result = solve(
-            problem,
+            fitted.problem,
             strategy=settings["strategy"],
             max_iterations=settings["max_iterations"],
             linear_solver=settings["linear_solver"],
         )
-    stages, found = result.stages, result
-    if settings["polish"] is not None and result.status is Status.INJECTIVE:
-        with _timed(record, "polish"):
-            found = polish_map(
-                problem.domain,
-                result.uv,
-                energy=settings["polish"],
-                linear_solver=settings["linear_solver"],
-                slide=slide,
-            )
-        stages = stages + found.stages
-    record |= _told(found, stages, result.linear_solver)
-    record["flips_before"] = result.history[0].flipped if result.history else None
-    if result.status is not Status.INJECTIVE:
-        why = result.diagnosis
-        record["error"] = result.status.value if why is None or not why.obstructions else why.summary()
-    return found
+    if settings["polish"] is None or result.status is not Status.INJECTIVE:
+        return result
+    with _timed(record, "polish"):
+        return polished(fitted.problem, result, energy=settings["polish"], slide=slide)
 
 
 def _flattened(
-    mesh: io.MeshData, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
-) -> MapResult:
-    """Lay a mesh flat, its boundary free."""
+    surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
+) -> MappedAtlas:
+    """Lay a surface flat, its boundary free, island by island."""
     with _timed(record, "setup"):
-        pieces = flattenable(mesh.V, mesh.F)
-    record |= {"vertices": len(mesh.V), "triangles": len(mesh.F), "fixed": 0, "pins": 0}
-    record["loops"] = sum(len(piece.loops) for piece in pieces)
+        pieces = [piece for island, _ in faced(surface, reflect=False) for piece in flattenable(island.V, island.F)]
+    record |= {"vertices": len(surface.V), "triangles": len(surface.F), "fixed": 0, "pins": 0}
+    record |= {"loops": sum(len(piece.loops) for piece in pieces), "islands": len(surface.islands)}
     tell({"facts": record})
     with _timed(record, "map"):
-        result = flatten(
-            mesh.V,
-            mesh.F,
+        found = atlas.flatten(
+            surface,
             energy=settings["energy"] or "symmetric-dirichlet",
             max_iterations=settings["max_iterations"],
             linear_solver=settings["linear_solver"],
         )
-    record |= _told(result, result.stages, result.linear_solver)
-    if len(pieces) == 1 and isfinite(result.history[-1].energy):
-        record["energy"] = result.history[-1].energy
-    if not result.certificate.bijective:
-        record["error"] = result.certificate.summary()
-    return result
+    record |= _told(found)
+    energy = found.islands[0].result.history[-1].energy
+    if len(pieces) == 1 and isfinite(energy):
+        record["energy"] = energy
+    bad = [result.certificate for result in (island.result for island in found.islands) if not result.injective]
+    if bad:
+        record["error"] = bad[0].summary()
+    return found
 
 
-def _told(result: MapResult, stages: list[Stage], linear_solver: str) -> Record:
+def _told(found: MappedAtlas) -> Record:
     """What a record says of how a map was found."""
+    stages = [stage for island in found.islands for stage in island.result.stages]
     return {
-        "status": result.status.name.lower(),
+        "status": found.status.name.lower(),
         "iterations": sum(stage.iterations for stage in stages),
         "stages": json.dumps([stage.to_dict() for stage in stages]),
-        "linear_solver": linear_solver,
+        "linear_solver": found.islands[0].result.linear_solver,
     }
 
 
-def _onto(to: str, mesh: io.MeshData) -> io.ProblemArrays:
-    """The problem of laying a plain mesh's boundary along an outline."""
-    from quasiharmonic.targets import boundary_to, filled
-
-    contours = _outline(to, _changed(to))
-    if len(boundary_loops(mesh.F, len(mesh.V))) == 1:
-        contours = filled(contours)
-    return io.ProblemArrays(mesh.V, mesh.F, *boundary_to(mesh.V, mesh.F, contours))
-
-
-def _along(to: str | None) -> bool | Rails:
-    """What the boundary slides along."""
-    return True if to is None else Rails(_curves(to, _changed(to)))
-
-
-def _changed(to: str) -> int:
-    """When an outline was changed; files are read anew when they have."""
-    return os.stat(to).st_mtime_ns if os.path.isfile(to) else 0
-
-
-@cache
-def _outline(to: str, _changed: int) -> list[NDArray[np.float64]]:
-    from quasiharmonic.targets import outline
-
-    return outline(to)
-
-
-@cache
-def _curves(to: str, _changed: int) -> list[Curve]:
-    from quasiharmonic.targets import outline_curves
-
-    return outline_curves(to)
-
-
-def _written(path: Path, mesh: io.MeshData, result: MapResult, wanted: str) -> Record:
+def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
     """Write a map, and judge the file as a reader gets it: whether it is what is wanted, injective or bijective."""
     # Waiting for the disk would take longer than most problems. What a power failure takes is found by its length.
-    io.write_obj(path, mesh.with_map(result.uv), durable=False)
-    written = io.read_mesh(path)
-    certificate = certify(written.F, io.map_of(written))
-    certified = certificate.bijective if wanted == "bijective" else certificate.injective
+    io.write_obj(path, mesh, durable=False)
+    V, F, uv = io.cut_at_seams(io.read_mesh(path))
+    verdict = atlas.certify(SeamedMesh(V, F, F, uv))
+    bijective = verdict.bijective and not len(verdict.overlapping)
+    certified = bijective if wanted == "bijective" else verdict.injective
     return {
         "outcome": wanted if certified else f"not {wanted}",
         "certified": certified,
-        "bijective": certificate.bijective,
-        "flips_after": len(certificate.flipped) + len(certificate.degenerate),
+        "bijective": bijective,
+        "flips_after": len(verdict.flipped),
         "map_bytes": path.stat().st_size,
     }
 
 
-def _measured(mesh: io.MeshData, result: MapResult) -> Record:
-    measured = distortion(mesh.V, mesh.F, result.uv)
+def _measured(mesh: io.MeshData) -> Record:
+    measured = distortion(*io.without_idle(*io.cut_at_seams(mesh)))
     if len(measured.flat) == len(mesh.F):
         return {}
     values = {"mips": measured.summary("mips").mean, "isometric": measured.summary("isometric").maximum}
@@ -301,7 +289,8 @@ def _timed(record: Record, phase: str) -> Iterator[None]:
     try:
         yield
     finally:
-        record[f"seconds_{phase}"] = time.perf_counter() - began
+        name = f"seconds_{phase}"
+        record[name] = record.get(name, 0.0) + time.perf_counter() - began
 
 
 @cache

@@ -80,6 +80,17 @@ def add_parser(commands: Commands) -> None:
         help="take every OBJ and OFF file and lay it flat, its boundary free, without overlap",
     )
     solver.add_argument(
+        "--cut", action="store_true", help="with --to and --flatten: cut what does not lie flat, along seams"
+    )
+    solver.add_argument(
+        "--corners",
+        metavar="auto",
+        help="with --to: corners of the boundary by angle (auto), near:x,y,z,…, or as qhm map takes them",
+    )
+    solver.add_argument(
+        "--refine", action="store_true", help="split edges that leave the target no room (adds vertices at the end)"
+    )
+    solver.add_argument(
         "--energy",
         choices=arguments.FLATTENED,
         help="what --flatten lowers (default: symmetric-dirichlet)",
@@ -109,6 +120,9 @@ def run(options: argparse.Namespace) -> int:
         to=options.to,
         flatten=options.flatten,
         energy=options.energy,
+        cut=options.cut,
+        corners=options.corners,
+        refine=options.refine,
         strategy=options.strategy,
         polish=options.polish,
         slide=options.slide,

@@ -125,10 +125,13 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     ValueError, OSError, ModuleNotFoundError
         When options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
-    from quasiharmonic.apply.fitting import with_room
+    from quasiharmonic.apply.fitting import held_in_place, with_room
     from quasiharmonic.cli import report
 
-    posed = Posed(_as_given(options, island, fixed)) if options.to is None else _onto_outline(options, island, right)
+    if options.to is None:
+        posed = Posed(held_in_place(island, fixed, reference=options.reference))
+    else:
+        posed = _onto_outline(options, island, right)
     if options.to is not None and not options.refine:
         with report.about(options.input):
             _check_room(posed.fitted.problem, options.to)
@@ -141,28 +144,6 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     if options.slide:
         _slide(options, posed, island, right)
     return posed
-
-
-def _as_given(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None) -> Fitted:
-    """The island with its boundary, or what else is to be held, where its vt have it."""
-    import numpy as np
-
-    from quasiharmonic.apply.fitting import Fitted
-    from quasiharmonic.arrays import named
-    from quasiharmonic.mesh.topology import boundary_edges
-    from quasiharmonic.problem import Problem
-
-    if fixed is None:
-        own = np.unique(boundary_edges(island.F, len(island.vertices)))
-        if not own.size:
-            raise ValueError("there is no boundary that could be fixed: cut it open, or name fixed vertices")
-    else:
-        own = np.flatnonzero(np.isin(island.vertices, fixed))
-    nowhere = own[np.isnan(island.uv[own]).any(axis=1)]
-    if nowhere.size:
-        which = named("vertex", "vertices", island.vertices[nowhere])
-        raise ValueError(f"no place in the plane for the fixed {which}: give every fixed vertex a vt")
-    return Fitted(Problem(island.V, island.F, own, island.uv[own], reference=options.reference))
 
 
 def _onto_outline(options: argparse.Namespace, island: Island, right: float) -> Posed:
