@@ -23,6 +23,28 @@ from quasiharmonic.mesh.polygons import Polygons, triangulated
 from quasiharmonic.mesh.seams import SeamedMesh
 
 
+class Carried:
+    """What a file holds besides a mesh, as its reader took it apart: for the writer of the same format.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        The mesh that was in the file.
+    """
+
+    def __init__(self, V: FloatArray, F: IntArray) -> None:
+        self.V, self.F = V, F
+
+    def further(self) -> list[str]:
+        """What there is besides the mesh, in words; only a writer of the same format keeps it."""
+        return []
+
+    def fits(self, mesh: MeshData) -> bool:
+        """Whether a mesh is still the one that was in the file, whatever its map."""
+        return np.array_equal(self.V, mesh.V) and np.array_equal(self.F, mesh.F)
+
+
 @dataclass(frozen=True, eq=False)
 class MeshData:
     """A mesh as a file has it, with all that is needed to write the file again.
@@ -54,6 +76,8 @@ class MeshData:
         The file's faces as rings of corners of the triangles; None where they are these.
     source : str
         The file it came from, for messages.
+    carried : Carried or None
+        All else that its file holds, for a writer of the same format; None where there is nothing else.
     """
 
     V: FloatArray
@@ -67,6 +91,7 @@ class MeshData:
     statement_faces: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     polygons: Polygons | None = None
     source: str = "mesh"
+    carried: Carried | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into the types and shapes above; `ValueError` for what cannot be."""
