@@ -1,4 +1,4 @@
-"""PLY, the polygon file format: positions and places in double precision, polygons, seams, and all else that is there."""
+"""PLY, the polygon file format: positions and places in double precision, polygons, seams, and all else in it."""
 
 from __future__ import annotations
 

@@ -137,8 +137,8 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
                 raise ValueError(f"its header has {shown(line)}")
     if order is None:
         raise ValueError("its header names no format that is known")
-    for element, count, of in declared:
-        if count and not of:
+    for element, many, of in declared:
+        if many and not of:
             raise ValueError(f"element {element!r} has no properties")
         if len({property_.name for property_ in of}) < len(of):
             raise ValueError(f"element {element!r} has two properties of one name")
