@@ -13,7 +13,8 @@ from quasiharmonic.io.errors import MeshFileError, OutputError
 from quasiharmonic.io.gltfmesh import read_gltf
 from quasiharmonic.io.gltfwrite import write_gltf
 from quasiharmonic.io.handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
-from quasiharmonic.io.holding import not_held
+from quasiharmonic.io.holding import TEXTURED, not_held
+from quasiharmonic.io.materials import companions
 from quasiharmonic.io.meshdata import MeshData, in_plane, map_of, vertex_places
 from quasiharmonic.io.obj import read_obj, write_obj
 from quasiharmonic.io.off import read_off, write_off
@@ -23,17 +24,22 @@ from quasiharmonic.io.ply import read_ply, write_ply
 from quasiharmonic.io.refined import refined_mesh
 from quasiharmonic.io.seamed import cut_at_seams, mapped, seamed, without_idle
 from quasiharmonic.io.stl import read_stl
+from quasiharmonic.io.textures import Texture, checkerboard, read_texture
 
 __all__ = [
     "MAP_WRITERS",
     "PER_TRIANGLE_FORMATS",
     "READERS",
+    "TEXTURED",
     "MeshData",
     "MeshFileError",
     "OutputError",
     "ProblemArrays",
+    "Texture",
     "check_output",
     "check_writable",
+    "checkerboard",
+    "companions",
     "cut_at_seams",
     "map_of",
     "mapped",
@@ -48,6 +54,7 @@ __all__ = [
     "read_ply",
     "read_problem",
     "read_stl",
+    "read_texture",
     "refined_mesh",
     "seamed",
     "vertex_places",

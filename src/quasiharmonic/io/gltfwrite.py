@@ -17,6 +17,7 @@ from quasiharmonic.io.gltf import Document, embed_pictures
 from quasiharmonic.io.gltfmesh import PLACES, CarriedGltf, Pool
 from quasiharmonic.io.meshdata import MeshData
 from quasiharmonic.io.ply import normal_rows
+from quasiharmonic.io.textures import Texture
 
 _EXACT = 2.0**-53
 
@@ -49,6 +50,8 @@ def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
         embed_pictures(document, carried.folder)
     else:
         document = _new(mesh)
+    if mesh.texture is not None:
+        _paint(document, mesh.texture)
     write_whole(path, document.encoded(binary=Path(path).suffix.lower() == ".glb"))
 
 
@@ -100,6 +103,20 @@ def _refilled(carried: CarriedGltf, mesh: MeshData) -> Document:
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
         _set_attribute(document, pool, primitives, PLACES, table, users)
     return document
+
+
+def _paint(document: Document, texture: Texture) -> None:
+    """Have all triangles with places show a picture."""
+    tree = document.tree
+    colour = {"index": len(tree.setdefault("textures", []))}
+    tree["textures"].append({"source": len(tree.setdefault("images", []))})
+    tree["images"].append({"bufferView": document.add_bytes(texture.data), "mimeType": texture.media_type})
+    look = {"baseColorTexture": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    tree.setdefault("materials", []).append({"name": "map", "pbrMetallicRoughness": look, "doubleSided": True})
+    for shape in tree["meshes"]:
+        for primitive in shape["primitives"]:
+            if PLACES in primitive["attributes"]:
+                primitive["material"] = len(tree["materials"]) - 1
 
 
 def _users(carried: CarriedGltf) -> dict[int, int]:

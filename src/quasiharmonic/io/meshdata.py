@@ -19,6 +19,7 @@ from quasiharmonic.arrays import (
     vertex_array,
 )
 from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textures import Texture
 from quasiharmonic.mesh.polygons import Polygons, triangulated
 from quasiharmonic.mesh.seams import SeamedMesh
 
@@ -78,6 +79,8 @@ class MeshData:
         The file it came from, for messages.
     carried : Carried or None
         All else that its file holds, for a writer of the same format; None where there is nothing else.
+    texture : Texture or None
+        A picture that is to be written with the map, by formats that can.
     """
 
     V: FloatArray
@@ -92,6 +95,7 @@ class MeshData:
     polygons: Polygons | None = None
     source: str = "mesh"
     carried: Carried | None = None
+    texture: Texture | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into the types and shapes above; `ValueError` for what cannot be."""
