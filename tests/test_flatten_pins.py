@@ -11,8 +11,8 @@ from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Forbids, Kind
 from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.pin_obstructions import pin_obstructions
 from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.flattening.pin_obstructions import pin_obstructions
 from quasiharmonic.flattening.pins import Pinned, moved_onto
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.result import Status

@@ -258,7 +258,7 @@ def test_a_pipe_is_not_waited_for(tmp_path):
         io.read_mesh(tmp_path / "pipe.obj")
 
 
-@pytest.mark.parametrize("name", ["mesh.stl", "mesh", ".obj", "mesh.obj.gz"])
+@pytest.mark.parametrize("name", ["mesh.3ds", "mesh", ".obj", "mesh.obj.gz"])
 def test_unsupported_suffixes(tmp_path, name):
     mesh = MeshData([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
     with pytest.raises(MeshFileError, match=r"supported are \.obj, \.off"):

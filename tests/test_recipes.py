@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.formats import try_format
+from shared.formats import try_format, with_map
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -45,7 +45,7 @@ def test_the_format_stands_its_trials(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(RECIPES["A file format"], names)
-    try_format(names["read_npz"], names["write_npz"], tmp_path / "mesh.npz")
+    try_format(names["read_npz"], with_map(names["write_npz"]), tmp_path / "mesh.npz")
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -22,7 +22,7 @@ def add_parser(commands: Commands) -> None:
         epilog="Exit status: 0 injective (every triangle strictly positive), or the boundary is told; 1 not; 2 the "
         "file cannot be judged.",
     )
-    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ or OFF file")
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file")
     parser.add_argument(
         "--as",
         dest="precision",

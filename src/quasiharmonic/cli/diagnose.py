@@ -22,7 +22,10 @@ def add_parser(commands: Commands) -> None:
         epilog="Exit status: 0 nothing forbids an injective map; 1 something does; 2 wrong input or call.",
     )
     parser.add_argument(
-        "input", type=Path, metavar="INPUT", help="OBJ file, or a folder with input.obj and handles.txt"
+        "input",
+        type=Path,
+        metavar="INPUT",
+        help="OBJ, PLY, GLB or glTF file, or a folder with input.obj and handles.txt",
     )
     parser.add_argument(
         "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"

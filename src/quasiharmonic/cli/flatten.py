@@ -19,7 +19,7 @@ _ROOM = 2.1
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, seams
+    from quasiharmonic.cli import arguments, material, seams
 
     parser = commands.add_parser(
         "flatten",
@@ -29,8 +29,8 @@ def add_parser(commands: Commands) -> None:
         epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
         "written; 3 written, but not what should be told about it. Ctrl-C writes the best map so far.",
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ or OFF file")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     parser.add_argument(
         "--energy",
         choices=arguments.FLATTENED,
@@ -71,6 +71,7 @@ def add_parser(commands: Commands) -> None:
         help="steps on each connected surface; 0 leaves the start as it is (default: 500)",
     )
     arguments.add_linear_solver(parser)
+    material.add_options(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
@@ -78,7 +79,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, judge, report."""
     from quasiharmonic import atlas, io
-    from quasiharmonic.cli import judging, progress, report, seams
+    from quasiharmonic.cli import judging, material, progress, report, seams
     from quasiharmonic.energy.measures import distortion
     from quasiharmonic.flattening.distances import distance_error
     from quasiharmonic.flattening.patterns import write_pattern
@@ -95,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     _check_pattern(options)
     if options.pack and (options.unit_square or options.fixed is not None or options.pattern is not None):
         raise ValueError("--pack decides size and place: leave --unit-square, --fixed and --pattern out")
-    mesh = io.read_mesh(options.input)
+    mesh = material.read_mesh(options, options.input)
     given: dict[str, Any] = {}
     if options.start or options.fixed is not None:
         if options.cut or options.seams != "file":

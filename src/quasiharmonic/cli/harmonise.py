@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, seams
+    from quasiharmonic.cli import arguments, material, seams
 
     parser = commands.add_parser(
         "harmonise",
@@ -30,8 +30,8 @@ def add_parser(commands: Commands) -> None:
         "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but not what "
         "should be told about it.",
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with a map")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with a map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     parser.add_argument(
         "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
     )
@@ -48,6 +48,7 @@ def add_parser(commands: Commands) -> None:
     )
     seams.add_packing(parser)
     arguments.add_linear_solver(parser)
+    material.add_options(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 

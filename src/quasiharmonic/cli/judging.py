@@ -102,11 +102,22 @@ def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
     return Judged(V, F, uv, certify(F, uv), verdict if len(verdict.islands) > 1 else None, mesh.faces)
 
 
+def tell_losses(output: Path, mesh: MeshData) -> None:
+    """Say, before it is written, what a file will not have of a mesh."""
+    import sys
+
+    from quasiharmonic import io
+
+    for lost in io.not_held(output, mesh):
+        print(f"{output} will not have {lost}", file=sys.stderr, flush=True)
+
+
 def write(output: Path, mesh: MeshData) -> Judged:
     """Write a mesh with its map, and judge the file as a reader gets it."""
     from quasiharmonic import io
     from quasiharmonic.cli import report
 
+    tell_losses(output, mesh)
     io.write_mapped(output, mesh)
     with report.after_writing(output):
         return judge(io.read_mesh(output))

@@ -30,7 +30,7 @@ STEPS, LARGEST = 20, 100_000
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, seams, sliding, targets
+    from quasiharmonic.cli import arguments, material, seams, sliding, targets
 
     parser = commands.add_parser(
         "map",
@@ -41,9 +41,12 @@ def add_parser(commands: Commands) -> None:
         "2 wrong input or call, nothing written; 3 a map was written, but not what should be told about it.",
     )
     parser.add_argument(
-        "input", type=Path, help="OBJ file, or a folder with input.obj and handles.txt", metavar="INPUT"
+        "input",
+        type=Path,
+        help="OBJ, OFF, PLY, GLB, glTF or STL file, or a folder with input.obj and handles.txt",
+        metavar="INPUT",
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     targets.add_options(parser)
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the rest surface, the start and the map")
     parser.add_argument(
@@ -53,6 +56,7 @@ def add_parser(commands: Commands) -> None:
         help="draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂), with its histogram",
     )
     seams.add_packing(parser)
+    material.add_options(parser)
     arguments.add_report(parser)
     distortion = parser.add_mutually_exclusive_group()
     distortion.add_argument(
@@ -78,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
     from quasiharmonic.atlas.mapped import each_island
-    from quasiharmonic.cli import judging, report, seams, sliding, targets
+    from quasiharmonic.cli import judging, material, report, seams, sliding, targets
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
@@ -92,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     report.check_outputs(
         options.output, options.plot, options.json, inputs=(mesh_path, fixed_path, *targets.files(options))
     )
-    mesh = io.read_mesh(mesh_path)
+    mesh = material.read_mesh(options, mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     targets.check_options(options, mesh, fixed)
     found = seams.surface(options, mesh, disks_too=False)

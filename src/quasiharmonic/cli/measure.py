@@ -23,7 +23,9 @@ def add_parser(commands: Commands) -> None:
         "scaled to it.",
         epilog="Exit status: 0 measured; 2 wrong input or call, nothing written.",
     )
-    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ file with a map, injective or not")
+    parser.add_argument(
+        "input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file with a map, injective or not"
+    )
     parser.add_argument(
         "--export", type=Path, metavar="FILE", help="write every measure of every triangle as .csv, .npz or .ply"
     )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments, seams, sliding
+    from quasiharmonic.cli import arguments, material, seams, sliding
 
     parser = commands.add_parser(
         "polish",
@@ -32,8 +32,8 @@ def add_parser(commands: Commands) -> None:
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
         "that is not injective included), nothing written; 3 written, but not what should be told about it.",
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with an injective map")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ or OFF file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with an injective map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     parser.add_argument(
         "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
     )
@@ -54,6 +54,7 @@ def add_parser(commands: Commands) -> None:
     )
     seams.add_packing(parser)
     arguments.add_linear_solver(parser)
+    material.add_options(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
@@ -93,11 +94,11 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
     What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``.
     """
     from quasiharmonic import io
-    from quasiharmonic.cli import judging, progress, report, seams
+    from quasiharmonic.cli import judging, material, progress, report, seams
     from quasiharmonic.energy.measures import distortion
 
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
-    mesh = io.read_mesh(options.input)
+    mesh = material.read_mesh(options, options.input)
     before = io.mapped(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input), progress.line() as show:

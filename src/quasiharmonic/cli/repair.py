@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.cli import arguments
+    from quasiharmonic.cli import arguments, material
 
     parser = commands.add_parser(
         "repair",
@@ -23,8 +23,8 @@ def add_parser(commands: Commands) -> None:
         epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
         "or call, nothing written; 3 written, but not what should be told about it.",
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ file with texture coordinates")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with texture coordinates")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB or glTF file to write")
     parser.add_argument(
         "--all",
         dest="whole",
@@ -44,6 +44,7 @@ def add_parser(commands: Commands) -> None:
         help="on an island as a whole (default: 2000)",
     )
     arguments.add_linear_solver(parser)
+    material.add_options(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
@@ -55,13 +56,13 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.apply.repairing import repair
     from quasiharmonic.atlas.verdict import certify
-    from quasiharmonic.cli import progress, report
+    from quasiharmonic.cli import judging, material, progress, report
     from quasiharmonic.mesh.seams import SeamedMesh
 
-    if options.output.suffix.lower() != ".obj":
-        raise ValueError(f"{options.output}: a map with seams is written as .obj")
+    if options.output.suffix.lower() == ".off":
+        raise ValueError(f"{options.output}: OFF has no room for seams: write .obj, .ply or .glb")
     report.check_outputs(options.output, None, options.json, inputs=(options.input,))
-    mesh = io.read_mesh(options.input)
+    mesh = material.read_mesh(options, options.input)
     if mesh.vt is None or mesh.FT is None or (mesh.FT < 0).any(axis=1).all():
         raise ValueError(
             f"{options.input}: there is no map to repair: no face has texture coordinates (vt) at all three corners"
@@ -78,8 +79,10 @@ def run(options: argparse.Namespace) -> int:
             linear_solver=options.linear_solver,
             callback=show,
         )
-    io.write_obj(options.output, replace(mesh, vt=result.uv, FT=result.FT))
-    written = io.read_obj(options.output)
+    repaired = replace(mesh, vt=result.uv, FT=result.FT)
+    judging.tell_losses(options.output, repaired)
+    io.write_mapped(options.output, repaired)
+    written = io.read_mesh(options.output)
     with report.after_writing(options.output):
         verdict = certify(SeamedMesh(written.V, written.F, written.FT, written.vt))
         facts = {

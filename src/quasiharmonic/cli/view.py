@@ -19,7 +19,7 @@ def add_parser(commands: Commands) -> None:
         "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
         epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
     )
-    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ file with a map")
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB or glTF file with a map")
     parser.add_argument(
         "--screenshot", type=Path, metavar="PNG", help="write what the window would show instead; needs no display"
     )

@@ -10,55 +10,84 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import MeshFileError, OutputError
+from quasiharmonic.io.gltfmesh import read_gltf
+from quasiharmonic.io.gltfwrite import write_gltf
 from quasiharmonic.io.handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
+from quasiharmonic.io.holding import TEXTURED, not_held
+from quasiharmonic.io.materials import companions
 from quasiharmonic.io.meshdata import MeshData, in_plane, map_of, vertex_places
 from quasiharmonic.io.obj import read_obj, write_obj
 from quasiharmonic.io.off import read_off, write_off
 from quasiharmonic.io.per_triangle import FORMATS as PER_TRIANGLE_FORMATS
 from quasiharmonic.io.per_triangle import write_per_triangle
+from quasiharmonic.io.ply import read_ply, write_ply
 from quasiharmonic.io.refined import refined_mesh
 from quasiharmonic.io.seamed import cut_at_seams, mapped, seamed, without_idle
+from quasiharmonic.io.stl import read_stl
+from quasiharmonic.io.textures import Texture, checkerboard, read_texture
 
 __all__ = [
     "MAP_WRITERS",
     "PER_TRIANGLE_FORMATS",
     "READERS",
+    "TEXTURED",
     "MeshData",
     "MeshFileError",
     "OutputError",
     "ProblemArrays",
+    "Texture",
     "check_output",
     "check_writable",
+    "checkerboard",
+    "companions",
     "cut_at_seams",
     "map_of",
     "mapped",
+    "not_held",
     "problem_arrays",
     "problem_files",
+    "read_gltf",
     "read_handles",
     "read_mesh",
     "read_obj",
     "read_off",
+    "read_ply",
     "read_problem",
+    "read_stl",
+    "read_texture",
     "refined_mesh",
     "seamed",
     "vertex_places",
     "without_idle",
+    "write_gltf",
     "write_map",
     "write_mapped",
     "write_obj",
     "write_off",
     "write_per_triangle",
+    "write_ply",
     "write_whole",
 ]
 
 
 _Path = str | os.PathLike[str]
-#: What a suffix means, in small letters: how to read a mesh and how to write its map. A new format goes into both.
-READERS: dict[str, Callable[[_Path], MeshData]] = {".obj": read_obj, ".off": read_off}
+#: What a suffix means, in small letters: how to read a mesh, and how to write one with its map. A new format goes into
+#: both, unless it has no room for a map.
+READERS: dict[str, Callable[[_Path], MeshData]] = {
+    ".obj": read_obj,
+    ".off": read_off,
+    ".ply": read_ply,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".stl": read_stl,
+}
 MAP_WRITERS: dict[str, Callable[[_Path, MeshData], None]] = {
     ".obj": write_obj,
     # OFF has room for one set of coordinates only, and so for no seams.
     ".off": lambda path, mesh: write_off(path, in_plane(mesh)),
+    ".ply": write_ply,
+    ".glb": write_gltf,
+    ".gltf": write_gltf,
 }
 
 
@@ -68,12 +97,12 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
     Parameters
     ----------
     path : str or path-like
-        An OBJ or OFF file.
+        An OBJ, OFF, PLY, GLB, glTF or STL file.
 
     Returns
     -------
     MeshData
-        The mesh; see `read_obj` and `read_off`.
+        The mesh; see `read_obj`, `read_off`, `read_ply`, `read_gltf` and `read_stl`.
 
     Raises
     ------
@@ -108,9 +137,10 @@ def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> No
 def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write the map that a mesh carries, in the format that the suffix of the name says.
 
-    OBJ gets the mesh as it was read, with the map as its texture coordinates; OFF gets the map
-    alone, as a mesh in the plane z = 0. Numbers are written such that reading them gives the same
-    double. The file appears whole or not at all.
+    OBJ, PLY and glTF get the mesh as it was read, with the map as its texture coordinates; OFF gets the map
+    alone, as a mesh in the plane z = 0. Numbers are written such that reading them gives the same double,
+    except in glTF, which has single precision. The file appears whole or not at all. What it will not hold of the
+    mesh, `not_held` says.
 
     Parameters
     ----------

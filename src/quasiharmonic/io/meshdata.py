@@ -19,8 +19,31 @@ from quasiharmonic.arrays import (
     vertex_array,
 )
 from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textures import Texture
 from quasiharmonic.mesh.polygons import Polygons, triangulated
 from quasiharmonic.mesh.seams import SeamedMesh
+
+
+class Carried:
+    """What a file holds besides a mesh, as its reader took it apart: for the writer of the same format.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        The mesh that was in the file.
+    """
+
+    def __init__(self, V: FloatArray, F: IntArray) -> None:
+        self.V, self.F = V, F
+
+    def further(self) -> list[str]:
+        """What there is besides the mesh, in words; only a writer of the same format keeps it."""
+        return []
+
+    def fits(self, mesh: MeshData) -> bool:
+        """Whether a mesh is still the one that was in the file, whatever its map."""
+        return np.array_equal(self.V, mesh.V) and np.array_equal(self.F, mesh.F)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +80,10 @@ class MeshData:
         The file's faces as rings of corners of the triangles; None where they are these.
     source : str
         The file it came from, for messages.
+    carried : Carried or None
+        All else that its file holds, for a writer of the same format; None where there is nothing else.
+    texture : Texture or None
+        A picture that is to be written with the map, by formats that can.
     """
 
     V: FloatArray
@@ -71,6 +98,8 @@ class MeshData:
     statement_faces: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     polygons: Polygons | None = None
     source: str = "mesh"
+    carried: Carried | None = None
+    texture: Texture | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into the types and shapes above; `ValueError` for what cannot be."""

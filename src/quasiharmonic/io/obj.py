@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.materials import with_libraries, write_material
 from quasiharmonic.io.meshdata import MeshData, polygon_mesh
 from quasiharmonic.io.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.textual import integer_table, number_table, read_text
@@ -61,7 +62,9 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
 def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
     """Write a mesh as an OBJ file, whole or not at all.
 
-    Numbers are written such that reading them gives the same double.
+    Numbers are written such that reading them gives the same double. A material library (``mtllib``) is named such
+    that it is found from the new file where it was found from the old one. With a texture there are two files more,
+    a library and a picture (`quasiharmonic.io.materials.companions`).
 
     Parameters
     ----------
@@ -78,6 +81,9 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
     OutputError
         When it cannot be written; the old file is then untouched.
     """
+    if mesh.texture is not None:
+        mesh = write_material(path, mesh, durable=durable)
+    mesh = with_libraries(path, mesh)
     write_whole(path, lambda file: file.writelines(_pieces(mesh)), durable=durable)
 
 

@@ -26,6 +26,31 @@ _NUMERIC = b"0123456789.eE+-"
 _INTEGER = re.compile(rb"[+-]?[0-9]+")
 
 
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Read a file as it is.
+
+    Raises
+    ------
+    MeshFileError
+        When there is no such file, or it cannot be read.
+    """
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise MeshFileError(path, "is a directory", remedy="name a file")
+        if not stat.S_ISREG(mode):
+            raise MeshFileError(path, "is not a regular file")
+        return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise MeshFileError(path, "there is no such file") from error
+    except OSError as error:
+        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
+    except MeshFileError:
+        raise
+    except ValueError as error:
+        raise MeshFileError(ascii(path), f"is not a file name: {error}") from error
+
+
 def read_text(path: str | os.PathLike[str]) -> bytes:
     """Read a text file.
 
@@ -40,21 +65,7 @@ def read_text(path: str | os.PathLike[str]) -> bytes:
     MeshFileError
         When there is no such file, it cannot be read, or it is not text.
     """
-    try:
-        mode = os.stat(path).st_mode
-        if stat.S_ISDIR(mode):
-            raise MeshFileError(path, "is a directory", remedy="name a file")
-        if not stat.S_ISREG(mode):
-            raise MeshFileError(path, "is not a regular file")
-        data = Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise MeshFileError(path, "there is no such file") from error
-    except OSError as error:
-        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
-    except MeshFileError:
-        raise
-    except ValueError as error:
-        raise MeshFileError(ascii(path), f"is not a file name: {error}") from error
+    data = read_bytes(path)
     for start, (what, remedy) in _FOREIGN.items():
         if data.startswith(start):
             raise MeshFileError(path, what, remedy=remedy)

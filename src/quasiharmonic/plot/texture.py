@@ -1,8 +1,9 @@
-"""A checkerboard of the plane seen on the surface: what a map does, as an artist looks at it."""
+"""A checkerboard of the plane, or a picture, seen on the surface: what a map does, as an artist looks at it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from io import BytesIO
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -34,7 +35,9 @@ _SAMPLES = 2  # per pixel and direction
 _CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
 
 
-def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24) -> Figure:
+def plot_texture(
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24, picture: str | PathLike[str] | None = None
+) -> Figure:
     """Draw a surface with a checkerboard that a map puts on it, beside the same board in the plane.
 
     Squares stay squares where the map keeps angles and are of one size where it keeps areas. Inverted
@@ -49,6 +52,8 @@ def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
         The map.
     squares : int
         Of the board along the longer side of the map's bounding box.
+    picture : path, optional
+        A picture, PNG or JPEG, in place of the board: the unit square, repeated beyond it, as in any viewer.
 
     Returns
     -------
@@ -57,7 +62,7 @@ def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
     Raises
     ------
     ValueError
-        When there are no triangles, a vertex is not finite, or ``squares`` is less than 1.
+        When there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``picture`` is none.
     """
     rest, F = as_mesh(V, F)
     uv = drawable(map_array("uv", uv, len(rest)))
@@ -65,22 +70,32 @@ def plot_texture(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
         raise ValueError("the mesh has no triangles")
     if squares < 1:
         raise ValueError(f"squares must be at least 1, not {squares}")
-    low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
-    board = (uv - low) / size * squares
+    color: Callable[[FloatArray], FloatArray]
+    if picture is None:
+        low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
+        board, color = (uv - low) / size * squares, _checkered
+    else:
+        board, color = uv, _pictured(picture)
     inverted = not_positive(F, uv)
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
-    _show(surface, seen.points, _painted(seen.points, seen.depth, F, board, inverted, seen.light))
+    _show(surface, seen.points, _painted(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
-    _show(plane, board, _painted(board, np.zeros(len(uv)), F, board, inverted, np.full(len(F), 0.6)))
+    _show(plane, board, _painted(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
     outline(plane, F, board)
     verdict(plane, "map", len(inverted))
     return figure
 
 
 def save_texture_figure(
-    path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24
+    path: str | PathLike[str],
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    squares: int = 24,
+    picture: str | PathLike[str] | None = None,
 ) -> None:
     """Write `plot_texture`'s figure as a PNG of 960 × 480 pixels.
 
@@ -88,7 +103,7 @@ def save_texture_figure(
     ----------
     path : path
         Replaced as a whole once the picture is complete.
-    V, F, uv, squares
+    V, F, uv, squares, picture
         As for `plot_texture`.
 
     Raises
@@ -98,7 +113,7 @@ def save_texture_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    save_png(path, plot_texture(V, F, uv, squares=squares))
+    save_png(path, plot_texture(V, F, uv, squares=squares, picture=picture))
 
 
 def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
@@ -116,12 +131,18 @@ def _window(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _painted(
-    points: FloatArray, depth: FloatArray, F: IntArray, board: FloatArray, inverted: IntArray, light: FloatArray
+    points: FloatArray,
+    depth: FloatArray,
+    F: IntArray,
+    board: FloatArray,
+    color_at: Callable[[FloatArray], FloatArray],
+    inverted: IntArray,
+    light: FloatArray,
 ) -> FloatArray:
     """An image (side, side, 4) of triangles seen in the plane, the nearest of them at each pixel.
 
-    ``points`` (n, 2) and ``depth`` (n,) are where vertices are seen, ``board`` (n, 2) their places on the
-    checkerboard, whose squares have side 1, and ``light`` (f,) falls on the triangles.
+    ``points`` (n, 2) and ``depth`` (n,) are where vertices are seen, ``board`` (n, 2) their places on what
+    ``color_at`` gives colours (k, 3) for places (k, 2), and ``light`` (f,) falls on the triangles.
     """
     side = _SIDE * _SAMPLES
     low, high = _window(points)
@@ -138,8 +159,7 @@ def _painted(
         order = order[z[order] >= nearest[pixel[order]]]
         triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
         nearest[pixel] = z
-        square = np.floor(np.einsum("kc,kcd->kd", weights, board[F[triangle]])).sum(axis=1) % 2
-        color = np.where(square[:, None] == 0, _LIGHT, _DARK)
+        color = color_at(np.einsum("kc,kcd->kd", weights, board[F[triangle]]))
         color[bad[triangle]] = RED
         image[pixel, :3] = lit(color, light[triangle])
         image[pixel, 3] = 1
@@ -147,6 +167,44 @@ def _painted(
     cover = grid[..., 3].sum(axis=(1, 3))
     shown = grid[..., :3].sum(axis=(1, 3)) / np.maximum(cover, 1)[..., None]
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
+
+
+def _checkered(places: FloatArray) -> FloatArray:
+    """Colours (k, 3) of a checkerboard whose squares have side 1."""
+    return np.where(np.floor(places).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
+
+
+def _pictured(path: str | PathLike[str]) -> Callable[[FloatArray], FloatArray]:
+    """What gives the colours (k, 3) of a picture that is the unit square, and is repeated beyond it."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(f"pictures need Pillow ({error}): pip install pillow") from error
+    from quasiharmonic.io import read_texture
+    from quasiharmonic.io.errors import MeshFileError
+
+    data = read_texture(path).data
+    try:
+        with Image.open(BytesIO(data)) as image:
+            # What is finer than the panel's samples would only glitter.
+            image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
+            glass = image.convert("RGBA")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise MeshFileError(path, f"is a damaged picture: {error}") from error
+    white = Image.new("RGBA", glass.size, "white")
+    # Lines from below, as v counts.
+    pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
+    size = np.array(pixels.shape[1::-1])
+
+    def color(places: FloatArray) -> FloatArray:
+        within = (places - np.floor(places)) * size - 0.5
+        left = np.floor(within).astype(np.int64)
+        (x, y), (s, t) = left.T, (within - left).T[:, :, None]
+        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1], (y + 1) % size[1]
+        below, above = (1 - s) * pixels[y, x] + s * pixels[y, right], (1 - s) * pixels[up, x] + s * pixels[up, right]
+        return np.asarray((1 - t) * below + t * above)
+
+    return color
 
 
 def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:

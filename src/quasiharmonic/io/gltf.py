@@ -1,0 +1,271 @@
+"""glTF 2.0 files, binary (.glb) or JSON (.gltf): a document, its bytes, and numbers read from and put into them.
+
+Nothing is run and nothing is fetched: bytes are read from the file itself and from files in its own folder.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textual import read_bytes
+
+_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_SHAPES = {width: shape for shape, width in _WIDTHS.items()}
+# What is packed by these cannot be read without libraries of their own.
+_PACKED = "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"
+_PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX 20": "image/ktx2"}
+# What goes wrong in a document whose parts are not what they should be.
+DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+
+
+class Document:
+    """A glTF file: its JSON, and the bytes of each of its buffer views.
+
+    Parameters
+    ----------
+    tree : dict
+        The JSON.
+    views : list of bytes or memoryview
+        What each of ``tree["bufferViews"]`` covers.
+    """
+
+    def __init__(self, tree: dict[str, Any], views: list[bytes | memoryview]) -> None:
+        self.tree = tree
+        self.views = views
+
+    @property
+    def size(self) -> int:
+        """How many bytes all views have together."""
+        return sum(map(len, self.views))
+
+    def copy(self) -> Document:
+        """Another document to change; the bytes are shared."""
+        return Document(json.loads(json.dumps(self.tree)), list(self.views))
+
+    def numbers(self, index: int) -> NDArray[Any]:
+        """What an accessor refers to, (count, width), of the type in the file; raises one of `DAMAGE`."""
+        accessor = self.tree["accessors"][whole(index)]
+        kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        count, sparse = whole(accessor["count"]), accessor.get("sparse")
+        if "bufferView" in accessor:
+            table = self._rows(accessor, count, kind, width)
+        elif sparse is None or count > self.size:
+            raise ValueError(f"accessor {index} has no data")
+        else:
+            table = np.zeros((count, width), dtype=kind)
+        if sparse is not None:
+            many, of = whole(sparse["count"]), sparse["indices"]
+            rows = self._rows(of, many, np.dtype(_KINDS[of["componentType"]]), 1)[:, 0]
+            table[rows] = self._rows(sparse["values"], many, kind, width)
+        return table
+
+    def reals(self, index: int) -> NDArray[np.float64]:
+        """What an accessor means, (count, width): of normalised integers their share of the largest."""
+        table = self.numbers(index)
+        if table.dtype.kind == "f" or not self.tree["accessors"][index].get("normalized"):
+            return table.astype(np.float64)
+        return np.maximum(table / np.iinfo(table.dtype).max, -1.0)
+
+    def add(self, table: NDArray[Any], *, indices: bool = False) -> int:
+        """Add an accessor for numbers (count, width), indices or something at vertices; return its number."""
+        accessors = self.tree.setdefault("accessors", [])
+        accessors.append({})
+        self.put(len(accessors) - 1, table, indices=indices)
+        return len(accessors) - 1
+
+    def put(self, index: int, table: NDArray[Any], *, indices: bool = False, repeated: bool = False) -> None:
+        """Have an accessor refer to other numbers (count, width), ``repeated`` if they are the old ones oftener."""
+        accessor = self.tree["accessors"][index]
+        old = accessor.get("bufferView")
+        for stale in ("sparse", "byteOffset", *(() if repeated else ("min", "max", "normalized"))):
+            accessor.pop(stale, None)
+        table = np.ascontiguousarray(table)
+        raw = table.view(np.uint8).reshape(len(table), -1)
+        # Whatever is at vertices begins at multiples of four bytes.
+        padding = 0 if indices else -raw.shape[1] % 4
+        view = {"buffer": 0, "target": 34963 if indices else 34962}
+        if padding:
+            raw = np.pad(raw, ((0, 0), (0, padding)))
+            view["byteStride"] = raw.shape[1]
+        views = self.tree.setdefault("bufferViews", [])
+        if old is None or self._referred(old) > 1:
+            old = len(views)
+            views.append({})
+            self.views.append(b"")
+        views[old], self.views[old] = view, raw.tobytes()
+        accessor |= {"bufferView": old, "count": len(table), "type": _SHAPES[table.shape[1]]}
+        accessor["componentType"] = _CODES[table.dtype]
+
+    def add_bytes(self, data: bytes) -> int:
+        """Add a view of some bytes, a picture's; return its index."""
+        self.tree.setdefault("bufferViews", []).append({"buffer": 0})
+        self.views.append(data)
+        return len(self.views) - 1
+
+    def encoded(self, *, binary: bool) -> bytes:
+        """The file: binary, or JSON with the bytes in it as text; `ValueError` when it is too large for either."""
+        if self.size >= 1 << 31:
+            raise ValueError("a glTF file has at most 2 GiB: write .ply or .obj")
+        tree, buffer = dict(self.tree), bytearray()
+        views = []
+        for view, data in zip(self.tree.get("bufferViews", []), self.views, strict=True):
+            buffer += b"\0" * (-len(buffer) % 4)
+            views.append(view | {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
+            buffer += data
+        buffer += b"\0" * (-len(buffer) % 4)
+        tree["bufferViews"], tree["buffers"] = views, [{"byteLength": len(buffer)}]
+        if not binary:
+            uri = "data:application/octet-stream;base64," + base64.b64encode(buffer).decode()
+            tree["buffers"][0]["uri"] = uri
+            return json.dumps(tree, ensure_ascii=False, indent=1).encode() + b"\n"
+        text = json.dumps(tree, ensure_ascii=False, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = (b"JSON", text), (b"BIN\0", bytes(buffer))
+        body = b"".join(len(data).to_bytes(4, "little") + name + data for name, data in chunks)
+        return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
+
+    def _referred(self, view: int) -> int:
+        """How often a view is referred to."""
+
+        def count(node: object) -> int:
+            if isinstance(node, dict):
+                return (node.get("bufferView") == view) + sum(map(count, node.values()))
+            return sum(map(count, node)) if isinstance(node, list) else 0
+
+        return count(self.tree)
+
+    def _rows(self, where: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
+        """Rows of numbers in a view, a copy."""
+        index = whole(where["bufferView"])
+        view, begin, row = self.views[index], whole(where.get("byteOffset", 0)), kind.itemsize * width
+        stride = whole(self.tree["bufferViews"][index].get("byteStride", row))
+        if count and (stride < row or begin + (count - 1) * stride + row > len(view)):
+            raise ValueError(f"buffer view {index} ends before the numbers in it do")
+        found = np.ndarray((count, row), np.uint8, view, begin if count else 0, (stride, 1))
+        return np.array(found).view(kind).reshape(count, width)
+
+
+def load(path: str | os.PathLike[str]) -> Document:
+    """Read a glTF file.
+
+    Raises
+    ------
+    MeshFileError
+        When it is none, is damaged or packed, or refers to bytes that are not in its own folder.
+    """
+    data = read_bytes(path)
+    try:
+        text, chunk = _chunks(data) if data[:4] == b"glTF" else (data, None)
+        tree = json.loads(text)
+        version = str(tree["asset"]["version"])
+    except (*DAMAGE, RecursionError) as error:
+        raise MeshFileError(path, f"is no glTF file: {error}") from error
+    if not version.startswith("2."):
+        raise MeshFileError(path, f"is glTF {version[:20]}", remedy="save it as glTF 2.0")
+    packed = [name for name in _PACKED if f'"{name}"' in json.dumps(tree.get("extensionsUsed", []))]
+    if packed:
+        raise MeshFileError(path, f"is packed by {packed[0]}", remedy="save it without compression")
+    try:
+        buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
+        views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
+    except DAMAGE as error:
+        raise MeshFileError(path, f"is damaged: {error!r}") from error
+    return Document(tree, views)
+
+
+def picture_type(data: bytes) -> str | None:
+    """The media type of a picture that glTF can refer to; None for anything else."""
+    return next((kind for magic, kind in _PICTURES.items() if data.startswith(magic)), None)
+
+
+def embed_pictures(document: Document, folder: Path) -> list[str]:
+    """Take pictures that stand in files of the document's folder into it; return the names of those that do not."""
+    missing = []
+    for image in document.tree.get("images", []):
+        uri = image.get("uri")
+        if not isinstance(uri, str) or uri.startswith("data:"):
+            continue
+        try:
+            data = read_bytes(_beside(folder, uri))
+        except ValueError:
+            missing.append(uri)
+            continue
+        kind = picture_type(data)
+        if kind is None:
+            missing.append(uri)
+            continue
+        del image["uri"]
+        image |= {"bufferView": document.add_bytes(data), "mimeType": kind}
+    return missing
+
+
+def whole(value: object) -> int:
+    """A number that counts something, from a document; `ValueError` for anything else."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
+        raise ValueError(f"{ascii(value)[:40]} where a whole number should be")
+    return value
+
+
+def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
+    """The JSON and the bytes of a binary file."""
+    if data[4:8] != b"\2\0\0\0":
+        raise ValueError("its binary version is not 2")
+    found: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        size, name = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+        if at + 8 + size > len(data):
+            raise ValueError("it ends too early")
+        found.setdefault(name, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    return found[b"JSON"], found.get(b"BIN\0")
+
+
+def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes | None) -> bytes:
+    """The bytes of a buffer."""
+    size, uri = whole(buffer["byteLength"]), buffer.get("uri")
+    if uri is None:
+        data = chunk
+    elif uri.startswith("data:"):
+        head, _, text = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise ValueError("a buffer is not base64")
+        try:
+            data = base64.b64decode(text, validate=True)
+        except binascii.Error as error:
+            raise ValueError(f"a buffer is not base64: {error}") from error
+    else:
+        data = read_bytes(_beside(Path(path).parent, uri))
+    if data is None or len(data) < size:
+        raise ValueError("a buffer is shorter than it should be")
+    return data[:size]
+
+
+def _beside(folder: Path, uri: str) -> Path:
+    """A file in the folder of the document or in one below."""
+    name = unquote(uri)
+    inside = Path(os.path.normpath(folder / name))
+    if ":" in name or "\\" in name or name.startswith("/") or ".." in Path(name).parts:
+        raise ValueError(f"{ascii(uri)[:80]} is not in the folder of the file")
+    return inside
+
+
+def _view(view: dict[str, Any], buffers: list[bytes]) -> bytes | memoryview:
+    begin, size = whole(view.get("byteOffset", 0)), whole(view["byteLength"])
+    buffer = buffers[whole(view["buffer"])]
+    if begin + size > len(buffer):
+        raise ValueError("a buffer view ends behind its buffer")
+    # Not a copy: many views of one buffer shall not cost more than it.
+    return memoryview(buffer)[begin : begin + size]

@@ -1,0 +1,294 @@
+"""glTF: what others wrote is read, what is written others read, and nothing but the map changes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quasiharmonic import certify, io
+from quasiharmonic.io import MeshData, MeshFileError
+from quasiharmonic.surfaces import cat
+from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
+
+
+def read(made, tmp_path, name="mesh.glb"):
+    path = tmp_path / name
+    path.write_bytes(made.glb() if name.endswith("glb") else made.gltf())
+    return io.read_mesh(path)
+
+
+def cube():
+    """A cube as exporters have it: 24 vertices, each face an island of its own."""
+    trimesh = pytest.importorskip("trimesh", reason="an independent reader and writer of glTF")
+    V = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    uv = np.concatenate([np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) / 4 + [k % 3 / 3, k // 3 / 2] for k in range(6)])
+    F = np.concatenate([4 * np.arange(6)[:, None] + t for t in ([0, 1, 2], [0, 2, 3])])
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=trimesh.visual.material.PBRMaterial(name="paint"))
+    return trimesh.Trimesh(V[quads.ravel()], F, visual=visual, process=False)
+
+
+def test_a_cube_is_closed_and_its_seams_are_in_the_places(tmp_path):
+    there = cube()
+    there.export(tmp_path / "cube.glb")
+    mesh = io.read_mesh(tmp_path / "cube.glb")
+    assert len(mesh.V) == 8
+    np.testing.assert_array_equal(mesh.V[mesh.F], there.vertices[there.faces])
+    np.testing.assert_allclose(mesh.vt[mesh.FT], there.visual.uv[there.faces], atol=1e-7)
+    assert len(io.seamed(mesh).islands) == 6
+    assert b"usemtl paint\n" in mesh.statements
+
+
+def test_another_library_reads_what_is_written(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="an independent reader and writer of glTF")
+    V, F = cat(8)
+    rng = np.random.default_rng(5)
+    FT = np.arange(F.size).reshape(-1, 3)
+    mesh = MeshData(V, F, vt=rng.random((F.size, 2)), FT=FT)
+    io.write_mapped(tmp_path / "cat.glb", mesh)
+    there = trimesh.load(tmp_path / "cat.glb", process=False, force="mesh")
+    np.testing.assert_array_equal(there.vertices[there.faces], V.astype("f4")[F])
+    np.testing.assert_allclose(there.visual.uv[there.faces], mesh.vt[FT], atol=1e-7)
+
+
+def test_only_the_map_changes(tmp_path):
+    made = square(
+        TEXCOORD_0=SQUARE[:, :2],
+        TEXCOORD_1=SQUARE[:, :2] * np.float32(0.5),
+        NORMAL=np.tile(np.array([[0, 0, 1]], "f4"), (4, 1)),
+        JOINTS_0=np.arange(16, dtype="u1").reshape(4, 4),
+    )
+    made.tree |= {
+        "materials": [{"name": "skin", "extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 0.5}}}],
+        "images": [{"bufferView": made.view(b"\x89PNG not looked into"), "mimeType": "image/png"}],
+        "textures": [{"source": 0}],
+        "animations": [{"channels": [], "samplers": []}],
+        "nodes": [{"mesh": 0, "extras": {"mine": [1, None, "é"]}}],
+        "scenes": [{"nodes": [0]}],
+        "extras": {"kept": True},
+    }
+    made.tree["meshes"][0]["primitives"][0]["material"] = 0
+    mesh = read(made, tmp_path)
+    uv = np.array([[0, 0], [2, 0], [2, 2], [0, 1.5]])
+    io.write_map(tmp_path / "out.glb", mesh, uv)
+    before, after = opened(made.glb())[0], opened((tmp_path / "out.glb").read_bytes())[0]
+    for tree in (before, after):
+        for changed in ("buffers", "bufferViews"):
+            del tree[changed]
+        place = tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
+        assert tree["accessors"][place].pop("componentType") == 5126
+    assert after == before
+    old, new = made.glb(), (tmp_path / "out.glb").read_bytes()
+    for index in range(len(before["accessors"])):
+        if index != place:
+            np.testing.assert_array_equal(numbers(new, index), numbers(old, index))
+    np.testing.assert_array_equal(numbers(new, place), [[0, 1], [2, 1], [2, -1], [0, -0.5]])
+    assert b"\x89PNG not looked into" in new
+    assert io.not_held("out.glb", mesh) == []
+    assert any("animations" in loss for loss in io.not_held("out.obj", mesh))
+    assert any("JOINTS_0" in loss for loss in io.not_held("out.ply", mesh))
+
+
+def test_vertices_are_split_along_seams_with_all_that_they_have(tmp_path):
+    colours = np.arange(12, dtype="u1").reshape(4, 3) * 10
+    made = square(TEXCOORD_0=SQUARE[:, :2], COLOR_0=colours)
+    primitive = made.tree["meshes"][0]["primitives"][0]
+    made.tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
+    primitive["targets"] = [{"POSITION": made.accessor(SQUARE * np.float32(2))}]
+    mesh = read(made, tmp_path)
+    torn = io.seamed(mesh).cut([[0, 2]])
+    places = [island.vertices[:, None] + np.array([[0.0, 0.5]]) + k for k, island in enumerate(torn.islands)]
+    places = [np.where(np.isfinite(p), p, 0) for p in places]
+    cut = mesh.with_places(torn.with_places(places))
+    io.write_mapped(tmp_path / "torn.glb", cut)
+    data = (tmp_path / "torn.glb").read_bytes()
+    primitive = opened(data)[0]["meshes"][0]["primitives"][0]
+    rows = numbers(data, primitive["indices"]).reshape(-1, 3)
+    np.testing.assert_array_equal(numbers(data, primitive["attributes"]["POSITION"])[rows], SQUARE[HALVES])
+    np.testing.assert_array_equal(numbers(data, primitive["targets"][0]["POSITION"])[rows], 2 * SQUARE[HALVES])
+    assert len(numbers(data, primitive["attributes"]["TEXCOORD_0"])) == 6
+    again = io.read_mesh(tmp_path / "torn.glb")
+    np.testing.assert_array_equal(again.F, mesh.F)
+    np.testing.assert_array_equal(again.V, mesh.V)
+    np.testing.assert_array_equal(again.extra, mesh.extra)
+    np.testing.assert_array_equal(again.vt[again.FT], cut.vt[cut.FT])
+    assert len(io.seamed(again).islands) == 2
+
+
+def test_forms_of_numbers(tmp_path):
+    """Integers that mean shares, rows with gaps, numbers of which few are given, lists without indices."""
+    made = Gltf()
+    places = np.array([[0, 0], [65535, 0], [65535, 65535]], dtype="u2")
+    rows = np.zeros((3, 5), dtype="f4")
+    rows[:, :3], rows[:, 3:] = SQUARE[:3], 7
+    view = made.view(rows.tobytes(), byteStride=20)
+    made.tree["accessors"].append({"bufferView": view, "componentType": 5126, "count": 3, "type": "VEC3"})
+    made.tree["accessors"].append(
+        {
+            "componentType": 5126,
+            "count": 3,
+            "type": "VEC3",
+            "sparse": {
+                "count": 1,
+                "indices": {"bufferView": made.view(np.array([2], "u2").tobytes()), "componentType": 5123},
+                "values": {"bufferView": made.view(np.array([[0, 0, 1]], "f4").tobytes())},
+            },
+        }
+    )
+    made.mesh({"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": made.accessor(places, normalized=True)}})
+    mesh = read(made, tmp_path, "mesh.gltf")
+    np.testing.assert_array_equal(mesh.V, SQUARE[:3])
+    np.testing.assert_array_equal(mesh.F, [[0, 1, 2]])
+    np.testing.assert_array_equal(mesh.vt, [[0, 1], [1, 1], [1, 0]])
+    assert mesh.normals == b"vn 0.0 0.0 0.0\nvn 0.0 0.0 0.0\nvn 0.0 0.0 1.0\n"
+    # Written, they are single precision, and still where they were.
+    io.write_map(tmp_path / "out.gltf", mesh, mesh.vt)
+    again = io.read_mesh(tmp_path / "out.gltf")
+    np.testing.assert_array_equal(again.vt, mesh.vt)
+    assert again.normals == mesh.normals
+
+
+@pytest.mark.parametrize(("mode", "expected"), [(5, [[0, 1, 2], [1, 3, 2]]), (6, [[1, 2, 0], [2, 3, 0]])])
+def test_strips_and_fans(mode, expected, tmp_path):
+    made = Gltf()
+    made.mesh({"attributes": {"POSITION": made.accessor(SQUARE)}, "mode": mode})
+    np.testing.assert_array_equal(read(made, tmp_path).F, expected)
+
+
+def test_several_meshes_in_a_scene(tmp_path):
+    """Objects stay apart where they touch, and stand where their nodes put them."""
+    made = Gltf()
+    shared = {"POSITION": made.accessor(SQUARE), "NORMAL": made.accessor(np.tile(np.array([[1, 0, 0]], "f4"), (4, 1)))}
+    one, other = made.accessor(HALVES[0]), made.accessor(HALVES[1])
+    made.mesh({"attributes": shared, "indices": one, "material": 1}, {"attributes": shared, "indices": other})
+    made.mesh({"attributes": {"POSITION": made.accessor(SQUARE)}, "indices": one}, name="second\nf 1 2 3")
+    turn = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
+    made.tree |= {
+        "nodes": [
+            {"children": [1, 2], "translation": [0, 0, 5]},
+            {"mesh": 0, "rotation": turn, "scale": [2, 2, 2]},
+            {"mesh": 1},
+            {"mesh": 1, "translation": [9, 9, 9]},
+        ],
+        "scenes": [{"nodes": [0, 3]}],
+        "materials": [{}, {"name": "wood"}],
+    }
+    mesh = read(made, tmp_path)
+    assert len(mesh.V) == 8
+    np.testing.assert_allclose(mesh.V[:4], 2 * SQUARE[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 5], atol=1e-15)
+    np.testing.assert_array_equal(mesh.V[4:], SQUARE + np.array([0, 0, 5]))
+    assert mesh.statements == b"usemtl wood\no second f 1 2 3\n"
+    np.testing.assert_array_equal(mesh.statement_faces, [0, 2])
+    np.testing.assert_allclose([float(x) for x in mesh.normals.split()[1:4]], [0, 1, 0], atol=1e-15)
+
+
+def test_a_new_file_has_materials_normals_and_colours(tmp_path):
+    path = tmp_path / "in.obj"
+    path.write_text(
+        "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 1 1 0 0 0 1\nv 0 1 0 .5 .5 .5\nvt 0 0\nvt 1 0\nvt 1 1\n"
+        "vn 0 0 1\nvn 0 1 0\nusemtl a\nf 1/1/1 2/2/1 3/3/1\nusemtl b\nf 1//1 3//2 4//1\n"
+    )
+    mesh = io.read_mesh(path)
+    io.write_mapped(tmp_path / "out.glb", mesh)
+    again = io.read_mesh(tmp_path / "out.glb")
+    np.testing.assert_array_equal(again.V[again.F], mesh.V[mesh.F])
+    np.testing.assert_array_equal(again.extra, mesh.extra)
+    np.testing.assert_array_equal((again.FT < 0).all(axis=1), [False, True])
+    np.testing.assert_array_equal(again.vt[again.FT[0]], mesh.vt)
+    assert again.statements == b"usemtl a\nusemtl b\n"
+    lines = np.array(again.normals.split(b"\n"))
+    assert lines[again.FN].tolist() == np.array([b"vn 0.0 0.0 1.0", b"vn 0.0 1.0 0.0"])[mesh.FN].tolist()
+
+
+def test_pictures_beside_a_file_are_taken_in(tmp_path):
+    made = square(TEXCOORD_0=SQUARE[:, :2])
+    made.tree["images"] = [{"uri": "photo%20one.png"}, {"uri": "../secret.png"}, {"uri": "notes.png"}]
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "photo one.png").write_bytes(b"\x89PNG of the photo")
+    (folder / "notes.png").write_text("no picture")
+    (tmp_path / "secret.png").write_bytes(b"\x89PNG a secret")
+    mesh = read(made, folder, "mesh.gltf")
+    losses = io.not_held("x.glb", mesh)
+    io.write_mapped(tmp_path / "out.glb", mesh)
+    data = (tmp_path / "out.glb").read_bytes()
+    assert b"\x89PNG of the photo" in data
+    assert b"a secret" not in data
+    assert b"no picture" not in data
+    assert len(losses) == 2
+    assert "secret" in losses[0]
+
+
+def test_single_precision_is_what_is_judged(tmp_path):
+    """Triangles that single precision flattens are found flat in the file."""
+    V = np.array([[0, 0], [1, 0], [0.5, 1e-12], [0.5, 1]])
+    F = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 3]])
+    io.write_map(tmp_path / "thin.glb", MeshData(V, F), V)
+    again = io.read_mesh(tmp_path / "thin.glb")
+    assert certify(F, V).injective
+    np.testing.assert_array_equal(certify(again.F, io.map_of(again)).degenerate, [0])
+
+
+def test_what_is_too_large_for_single_precision(tmp_path):
+    V, F = cat(4)
+    mesh = MeshData(V, F)
+    with pytest.raises(ValueError, match="single precision"):
+        io.write_map(tmp_path / "out.glb", mesh, 1e39 * V[:, :2])
+    with pytest.raises(ValueError, match="single precision"):
+        io.write_map(tmp_path / "out.glb", MeshData(1e39 * V, F), V[:, :2])
+    assert not (tmp_path / "out.glb").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda tree: tree["accessors"][0].update(count=10**15), "ends before"),
+        (lambda tree: tree["accessors"][0].update(count=-1), "whole number"),
+        (lambda tree: (tree["accessors"][0].update(count=10**15), tree["accessors"][0].pop("bufferView")), "no data"),
+        (lambda tree: tree["accessors"][-1].update(count=4), "make no triangles"),
+        (lambda tree: tree["bufferViews"][0].update(byteLength=10**9), "behind its buffer"),
+        (lambda tree: tree["buffers"][0].update(byteLength=10**9), "shorter"),
+        (lambda tree: tree["buffers"][0].update(uri="../../etc/passwd"), "not in the folder"),
+        (lambda tree: tree["buffers"][0].update(uri="/etc/passwd"), "not in the folder"),
+        (lambda tree: tree["buffers"][0].update(uri="http://example.org/x.bin"), "not in the folder"),
+        (lambda tree: tree["buffers"][0].update(uri="gone.bin"), "no such file"),
+        (lambda tree: tree["asset"].update(version="1.0"), "glTF 2.0"),
+        (lambda tree: tree.update(extensionsUsed=["KHR_draco_mesh_compression"]), "without compression"),
+        (lambda tree: tree.update(meshes=[]), "no triangles"),
+        (lambda tree: tree.update(meshes=3), "damaged"),
+        (
+            lambda tree: tree["meshes"].__setitem__(0, {"primitives": tree["meshes"][0]["primitives"] * 999}),
+            "too often",
+        ),
+        (lambda tree: tree.update(scenes=[{"nodes": [7]}]), "damaged"),
+        (lambda tree: tree["meshes"][0]["primitives"][0].update(indices=99), "damaged"),
+        (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=1), "shape"),
+    ],
+)
+def test_what_is_damaged_is_named(change, message, tmp_path):
+    made = square()
+    tree = json.loads(made.gltf())
+    change(tree)
+    path = tmp_path / "bad.gltf"
+    path.write_text(json.dumps(tree))
+    with pytest.raises(MeshFileError, match=message):
+        io.read_mesh(path)
+
+
+def test_nodes_that_hold_themselves_and_deep_nests(tmp_path):
+    made = square()
+    made.tree |= {"nodes": [{"children": [0, 1]}, {"mesh": 0, "children": [0]}], "scenes": [{"nodes": [0]}]}
+    assert len(read(made, tmp_path).F) == 2
+    (tmp_path / "deep.gltf").write_text("[" * 100_000)
+    with pytest.raises(MeshFileError, match="no glTF"):
+        io.read_mesh(tmp_path / "deep.gltf")
+
+
+def test_a_mesh_that_changed_is_written_anew(tmp_path):
+    mesh = read(square(TEXCOORD_0=SQUARE[:, :2]), tmp_path)
+    fewer = replace(mesh, F=mesh.F[:1], FT=mesh.FT[:1])
+    io.write_mapped(tmp_path / "out.glb", fewer)
+    np.testing.assert_array_equal(io.read_mesh(tmp_path / "out.glb").F, [[0, 1, 2]])

@@ -1,0 +1,183 @@
+"""PLY and STL: read as independent readers do, written without loss, and bad files named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import io
+from quasiharmonic.io import MeshData, MeshFileError
+from quasiharmonic.surfaces import cat
+
+HEAD = b"ply\nformat ascii 1.0\ncomment made by hand\n"
+MIXED = (
+    HEAD + b"element vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+    b"property uchar red\nproperty uchar green\nproperty uchar blue\nproperty int label\n"
+    b"element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\nproperty char flag\n"
+    b"element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    b"0 0 0 255 0 0 7\n1 0 0 0 255 0 8\n1 1 0 0 0 255 9\n0 1 0 51 51 51 10\n.1 2 0 0 0 0 11\n"
+    b"4 0 1 2 3 8 0 0 .5 0 .5 .5 0 .5 -1\n3 3 2 4 6 .6 .6 .8 .6 .7 .9 1\n0 1\n"
+)
+
+
+def swapped(data):
+    """A text file of ours as big-endian bytes."""
+    import struct
+
+    body = data.split(b"end_header\n")[1].splitlines()
+    rows = [line.split() for line in body]
+    out = data.split(b"end_header\n")[0].replace(b"ascii", b"binary_big_endian") + b"end_header\n"
+    for row in rows[:5]:
+        out += struct.pack(">fff3Bi", *map(float, row[:3]), *map(int, row[3:]))
+    for row, size in ((rows[5], 4), (rows[6], 3)):
+        out += struct.pack(f">B{size}iB{2 * size}fb", size, *map(int, row[1 : size + 1]), 2 * size,
+                           *map(float, row[size + 2 : 3 * size + 2]), int(row[-1]))  # fmt: skip
+    return out + struct.pack(">ii", 0, 1)
+
+
+@pytest.mark.parametrize("form", [bytes, swapped, lambda data: data.replace(b"\n", b"\r\n")])
+def test_all_forms_of_ply(form, tmp_path):
+    path = tmp_path / "mixed.ply"
+    path.write_bytes(form(MIXED))
+    mesh = io.read_mesh(path)
+    assert mesh.V[4].tolist() == [np.float64(np.float32(0.1)), 2, 0]
+    assert mesh.polygons.sizes.tolist() == [4, 3]
+    corners = mesh.polygons.corners
+    assert mesh.F.ravel()[corners].tolist() == [0, 1, 2, 3, 3, 2, 4]
+    expected = np.array([[0, 0], [0.5, 0], [0.5, 0.5], [0, 0.5], [0.6, 0.6], [0.8, 0.6], [0.7, 0.9]])
+    np.testing.assert_array_equal(mesh.vt[mesh.FT.ravel()[corners]], expected.astype("f4"))
+    np.testing.assert_array_equal(mesh.extra, np.array([[5, 0, 0], [0, 5, 0], [0, 0, 5], [1, 1, 1], [0, 0, 0]]) / 5)
+    # Written again, all of it is there, and only the places may differ.
+    io.write_mapped(tmp_path / "out.ply", mesh)
+    data = (tmp_path / "out.ply").read_bytes()
+    assert b"comment made by hand\n" in data
+    again = io.read_mesh(tmp_path / "out.ply")
+    for name in ("V", "F", "extra"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(mesh, name))
+    np.testing.assert_array_equal(again.vt[again.FT], mesh.vt[mesh.FT])
+    tables = again.carried.tables
+    assert tables.find("vertex").find("label").values.tolist() == [7, 8, 9, 10, 11]
+    assert tables.find("face").find("flag").values.tolist() == [-1, 1]
+    assert tables.find("edge").find("vertex2").values.tolist() == [1]
+    assert io.not_held("out.ply", mesh) == []
+    assert io.not_held("out.obj", mesh) == [
+        "label of its element vertex",
+        "flag of its element face",
+        "vertex1 of its element edge",
+        "vertex2 of its element edge",
+    ]
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_other_libraries_write_what_is_read(binary, tmp_path):
+    meshlane = pytest.importorskip("meshlane", reason="an independent reader and writer of PLY")
+    V, F = cat(6)
+    data = {"s": V[:, 0] / 3, "t": V[:, 1] / 7}
+    there = meshlane.Mesh(V, [("triangle", F)], point_data=data)
+    there.write(tmp_path / "cat.ply", binary=binary)
+    mesh = io.read_mesh(tmp_path / "cat.ply")
+    np.testing.assert_array_equal(mesh.V, V)
+    np.testing.assert_array_equal(mesh.F, F)
+    np.testing.assert_array_equal(io.map_of(mesh), np.stack([data["s"], data["t"]], axis=1))
+
+
+def test_other_libraries_read_what_is_written(tmp_path):
+    meshlane = pytest.importorskip("meshlane", reason="an independent reader and writer of PLY")
+    trimesh = pytest.importorskip("trimesh", reason="an independent reader and writer of PLY")
+    V, F = cat(6)
+    uv = V[:, :2] / 3
+    io.write_map(tmp_path / "cat.ply", MeshData(V, F), uv)
+    there = meshlane.read(tmp_path / "cat.ply")
+    np.testing.assert_array_equal(there.points, V)
+    np.testing.assert_array_equal(there.cells_dict["triangle"], F)
+    np.testing.assert_array_equal(np.stack([there.point_data["s"], there.point_data["t"]], axis=1), uv)
+    seams = MeshData(V, F, vt=np.random.default_rng(1).random((F.size, 2)), FT=np.arange(F.size).reshape(-1, 3))
+    io.write_mapped(tmp_path / "seams.ply", seams)
+    torn = trimesh.load(tmp_path / "seams.ply", process=False)
+    np.testing.assert_array_equal(torn.visual.uv[torn.faces], seams.vt[seams.FT])
+
+
+def test_an_obj_as_ply(tmp_path):
+    """Normals and colours go along where vertices have one each, and what does not is named."""
+    text = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0 0 0 .5\nvn 0 0 1\nvn 0 1 0\nusemtl a\nf 1//1 2//2 3//1\n"
+    (tmp_path / "in.obj").write_text(text)
+    mesh = io.read_mesh(tmp_path / "in.obj")
+    assert io.not_held("out.ply", mesh) == ["materials, groups and other statements"]
+    io.write_mapped(tmp_path / "out.ply", mesh)
+    again = io.read_mesh(tmp_path / "out.ply")
+    assert again.normals == b"vn 0.0 0.0 1.0\nvn 0.0 1.0 0.0\nvn 0.0 0.0 1.0\n"
+    np.testing.assert_array_equal(again.extra, mesh.extra)
+    (tmp_path / "in.obj").write_text(text + "f 1//2 3//1 2//1\n")
+    assert "normals, of which a vertex has several" in io.not_held("out.ply", io.read_mesh(tmp_path / "in.obj"))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (MIXED[:-2], "too early"),
+        (swapped(MIXED)[:-5], "too early"),
+        (MIXED.replace(b"element vertex 5", b"element vertex 500000000000000000"), "too early"),
+        (swapped(MIXED).replace(b"element vertex 5", b"element vertex 999999999999999"), "too early"),
+        (MIXED.replace(b"element vertex 5", b"element vertex -5"), "element vertex -5"),
+        (MIXED.replace(b"end_header", b"end_head"), "no end"),
+        (MIXED.replace(b"uchar float texcoord", b"float float texcoord"), "its header has"),
+        (MIXED.replace(b"property int label", b"property int x"), "two properties"),
+        (MIXED.replace(b"4 0 1 2 3", b"4 0 1 2 9"), "refers to vertex 9"),
+        (MIXED.replace(b"4 0 1 2 3", b"4 0 1 2 1"), "vertex twice"),
+        (MIXED.replace(b"3 3 2 4 6", b"-3 3 2 4 6"), "no uchar"),
+        (MIXED.replace(b".1 2 0", b"nan 2 0"), "not finite"),
+        (MIXED.replace(b".1 2 0", b"1_0 2 0"), "underscore"),
+        (MIXED.replace(b"8 0 0 .5 0 .5 .5 0 .5", b"4 0 0 .5 0"), "4 numbers of texcoord and 4 corners"),
+        (MIXED.replace(b"vertex_indices", b"other"), "no faces"),
+        (b"", "empty"),
+    ],
+)
+def test_bad_ply(data, message, tmp_path):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(data)
+    with pytest.raises(MeshFileError, match=message):
+        io.read_mesh(path)
+
+
+def test_stl_is_welded(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="an independent writer of STL")
+    V, F = cat(6)
+    V = V.astype("f4").astype(float)
+    there = trimesh.Trimesh(V, F, process=False)
+    for name, file_type in (("binary.stl", "stl"), ("text.stl", "stl_ascii")):
+        there.export(tmp_path / name, file_type=file_type)
+        mesh = io.read_mesh(tmp_path / name)
+        assert len(mesh.V) == len(V)
+        np.testing.assert_allclose(mesh.V[mesh.F], V[F], atol=1e-7)
+        if name == "binary.stl":
+            np.testing.assert_array_equal(mesh.V[mesh.F], V[F])
+            # In the order in which they come first.
+            np.testing.assert_array_equal(
+                np.unique(mesh.F, return_index=True)[1], np.sort(np.unique(F, return_index=True)[1])
+            )
+    with pytest.raises(MeshFileError, match=r"stl files cannot be written; supported are \.obj"):
+        io.write_map(tmp_path / "out.stl", mesh, mesh.V[:, :2])
+
+
+FACET = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"solid a\n" + FACET + FACET[:50] + b"\nendsolid a\n",
+        b"solid a\n" + FACET,
+        b"solid a\n" + FACET.replace(b"1 0 0", b"1e 0 0") + b"endsolid a\n",
+        b"solid a\n" + FACET.replace(b"1 0 0", b"1e999 0 0") + b"endsolid a\n",
+        b"solid a\nendsolid a\n",
+        b"\0" * 80 + (2**32 - 1).to_bytes(4, "little") + b"\0" * 50,
+        b"\0" * 80 + (1).to_bytes(4, "little") + b"\0" * 49,
+        b"\0" * 84,
+        b"",
+    ],
+)
+def test_bad_stl(data, tmp_path):
+    path = tmp_path / "bad.stl"
+    path.write_bytes(data)
+    with pytest.raises(MeshFileError, match=r"bad\.stl"):
+        io.read_mesh(path)
