@@ -47,6 +47,27 @@ class Carried:
 
 
 @dataclass(frozen=True, eq=False)
+class VertexLines:
+    """Lines of a file that are written back as they stood, so that not one digit of a model changes.
+
+    Attributes
+    ----------
+    text : bytes
+        A line for each vertex.
+    rows : (n, 3 + k) float64
+        What they say. Where a mesh says something else by now, they are not written.
+    """
+
+    text: bytes
+    rows: FloatArray
+
+    def still_said(self, rows: FloatArray) -> bool:
+        """Whether the first of some rows, or all of them, are what the lines say."""
+        first = rows[: len(self.rows)]
+        return first.shape == self.rows.shape and np.array_equal(first, self.rows, equal_nan=True)
+
+
+@dataclass(frozen=True, eq=False)
 class MeshData:
     """A mesh as a file has it, with all that is needed to write the file again.
 
@@ -65,9 +86,8 @@ class MeshData:
         For every corner its row of ``vt``; -1 where the corner has none.
     extra : (n, k) float64 or None
         What stood behind the three coordinates of a vertex (weight, colour); NaN where nothing did.
-    positions : bytes
-        The lines of the first vertices as they stood: written back, so that not one digit of a model changes. Vertices
-        that were added come after them.
+    lines : VertexLines or None
+        The lines of the first vertices as they stood.
     normals : bytes
         The ``vn`` lines as they stood. They are never looked into, only written back.
     FN : (f, 3) int64 or None
@@ -91,7 +111,7 @@ class MeshData:
     vt: FloatArray | None = None
     FT: IntArray | None = None
     extra: FloatArray | None = None
-    positions: bytes = b""
+    lines: VertexLines | None = None
     normals: bytes = b""
     FN: IntArray | None = None
     statements: bytes = b""

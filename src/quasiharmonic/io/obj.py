@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.materials import with_libraries, write_material
-from quasiharmonic.io.meshdata import MeshData, polygon_mesh
+from quasiharmonic.io.meshdata import MeshData, VertexLines, polygon_mesh
 from quasiharmonic.io.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.textual import integer_table, number_table, read_text
 
@@ -123,7 +123,7 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
         normal_lines=flat.get(2),
         vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
         extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
-        positions=positions,
+        lines=VertexLines(positions, rows),
         normals=_lines_of(_NORMAL, data, ends, kinds),
         statements=statements,
         statement_faces=before[kinds == _STATEMENT],
@@ -187,8 +187,10 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
     statements = mesh.statements.split(b"\n")
     head = int(np.count_nonzero(at < 0))
     yield b"".join(line + b"\n" for line in statements[:head])
-    yield mesh.positions
-    rows = (mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra]))[mesh.positions.count(b"\n") :]
+    rows = mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra])
+    if mesh.lines is not None and mesh.lines.still_said(rows):
+        yield mesh.lines.text
+        rows = rows[len(mesh.lines.rows) :]
     if np.isnan(rows).any():
         for row in rows.tolist():
             yield ("v " + " ".join(repr(x) for x in row if not math.isnan(x)) + "\n").encode()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.meshdata import MeshData, polygon_mesh
+from quasiharmonic.io.meshdata import MeshData, VertexLines, polygon_mesh
 from quasiharmonic.io.textual import integer, number, shown
 
 # Statements whose geometry would be lost, and elements that point to vertices in ways not kept.
@@ -131,7 +131,7 @@ class _Reader:
             normal_lines=normals if (normals >= 0).any() else None,
             vt=np.array(self.vt, dtype=np.float64).reshape(-1, 2) if self.vt else None,
             extra=extra,
-            positions=bytes(self.positions),
+            lines=VertexLines(bytes(self.positions), V if extra is None else np.hstack([V, extra])),
             normals=bytes(self.normals),
             statements=bytes(self.statements),
             statement_faces=np.array(self.statement_faces, dtype=np.int64),
