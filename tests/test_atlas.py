@@ -1,0 +1,339 @@
+"""Maps with seams: every command and function, island by island, and files that lose nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from quasiharmonic import atlas, io
+from quasiharmonic.exact.convexity import not_convex
+from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.surfaces import grid, starfish
+from shared.commands import run
+from shared.meshes import lift
+from shared.seamed import strips
+
+
+def seamed(path, mirrored=None, stacked=False):
+    """A file whose map is cut into three strips; one of them mirrored, or all over one another."""
+    V, F, uv, FT, strip = strips(6)
+    if stacked:
+        for k in range(3):
+            uv[np.unique(FT[strip == k])] -= [3 * k, 0]
+    if mirrored is not None:
+        uv[np.unique(FT[strip == mirrored])] *= [-1, 1]
+    io.write_obj(path, io.MeshData(V, F, vt=uv, FT=FT))
+    return SeamedMesh(V, F, FT, uv)
+
+
+def vertex_lines(path):
+    return [line for line in path.read_text().splitlines() if line.startswith("v ")]
+
+
+def faces(path):
+    """Faces by their vertices alone."""
+    return [re.sub(r"/\d*", "", line) for line in path.read_text().splitlines() if line.startswith("f ")]
+
+
+@pytest.fixture
+def source(tmp_path):
+    seamed(tmp_path / "in.obj")
+    return tmp_path / "in.obj"
+
+
+class TestCommands:
+    @pytest.mark.parametrize(
+        "command",
+        [
+            ["polish"],
+            ["polish", "--free"],
+            ["polish", "--free", "--pack"],
+            ["polish", "--slide"],
+            ["harmonise"],
+            ["map"],
+            ["map", "--to", "disk"],
+            ["flatten"],
+            ["flatten", "--start"],
+            ["flatten", "--pack", "--margin", "0.02"],
+            ["repair"],
+        ],
+        ids=" ".join,
+    )
+    def test_every_island_is_injective_and_the_model_stays(self, source, tmp_path, command):
+        out, told = tmp_path / "out.obj", tmp_path / "told.json"
+        assert run(command[0], source, "-o", out, "--json", told, *command[1:]) == 0
+        verdict = atlas.certify(io.mapped(io.read_mesh(out)))
+        assert len(verdict.islands) == 3
+        assert verdict.bijective
+        assert vertex_lines(out) == vertex_lines(source)
+        assert faces(out) == faces(source)
+        report = json.loads(told.read_text())
+        assert report["injective"] is True
+        assert len(report["islands"]) == 3
+        if "--pack" in command:
+            uv = io.read_mesh(out).vt
+            assert uv.min() >= 0
+            assert uv.max() <= 1
+            assert not len(verdict.overlapping)
+
+    def test_borders_are_kept_or_free(self, source, tmp_path):
+        before = io.mapped(io.read_mesh(source))
+        energy = {}
+        for name, options in {"kept": [], "free": ["--free"]}.items():
+            run("polish", source, "-o", tmp_path / "out.obj", "--json", tmp_path / "told.json", *options)
+            energy[name] = json.loads((tmp_path / "told.json").read_text())["distortion"]["symmetric_dirichlet"]["mean"]
+            after = io.mapped(io.read_mesh(tmp_path / "out.obj"))
+            for one, other in zip(before.islands, after.islands, strict=True):
+                rim = np.unique(one.F[(one.F < 0).any(axis=1)]) if name == "free" else boundary(one)
+                assert np.array_equal(one.uv[rim], other.uv[rim])
+                # Not far from where it was, whatever its border does.
+                assert np.linalg.norm(one.uv.mean(axis=0) - other.uv.mean(axis=0)) < 0.2
+        assert energy["free"] < energy["kept"]
+
+    def test_measure_plot_and_check(self, source, tmp_path, capsys):
+        assert run("measure", source) == 0
+        assert run("plot", source, "-o", tmp_path / "a.png") == 0
+        capsys.readouterr()
+        assert run("check", source, "--json", tmp_path / "told.json") == 0
+        said = capsys.readouterr().out
+        assert "3 islands: 3 injective, 3 bijective." in said
+        assert len(json.loads((tmp_path / "told.json").read_text())["verdict"]["islands"]) == 3
+
+    def test_seams_are_ignored_or_chosen(self, source, tmp_path):
+        out = tmp_path / "out.obj"
+        assert run("flatten", source, "-o", out, "--seams", "none") == 0
+        assert len(io.mapped(io.read_mesh(out)).islands) == 1
+        mesh = io.read_mesh(source)
+        (tmp_path / "edges.txt").write_text("".join(f"{a} {b}  # a seam\n" for a, b in seams_at(mesh, 1 / 3)))
+        assert run("flatten", source, "-o", out, "--seams", tmp_path / "edges.txt") == 0
+        assert len(io.mapped(io.read_mesh(out)).islands) == 2
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [("0 1\n0 400000\n", "line 2"), ("0 x\n", "is not an edge"), ("0 100\n", "no such edge to cut")],
+    )
+    def test_bad_lists_of_edges(self, source, tmp_path, capsys, text, words):
+        (tmp_path / "edges.txt").write_text(text)
+        assert run("flatten", source, "-o", tmp_path / "out.obj", "--seams", tmp_path / "edges.txt") == 2
+        assert words in capsys.readouterr().err
+        assert not (tmp_path / "out.obj").exists()
+
+    def test_a_refined_atlas_keeps_its_vertices(self, source, tmp_path):
+        out = tmp_path / "out.obj"
+        assert run("map", source, "-o", out, "--to", "star:5", "--refine") == 0
+        assert vertex_lines(out)[: len(vertex_lines(source))] == vertex_lines(source)
+        assert atlas.certify(io.mapped(io.read_mesh(out))).bijective
+
+
+class TestMirroredAndStacked:
+    def test_a_mirrored_island_stays_so_and_is_told(self, tmp_path, capsys):
+        before = seamed(tmp_path / "in.obj", mirrored=1)
+        assert run("check", tmp_path / "in.obj") == 1
+        assert "Mirrored, every triangle negative: island 1" in capsys.readouterr().out
+        for command in ("polish", "harmonise", "map", "repair"):
+            assert run(command, tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
+            assert "irrored" in capsys.readouterr().out
+            after = io.mapped(io.read_mesh(tmp_path / "out.obj"))
+            assert atlas.certify(after).mirrored.tolist() == [1]
+            rim = boundary(before.islands[1])
+            assert np.array_equal(after.islands[1].uv[rim], before.islands[1].uv[rim])
+
+    def test_flattened_anew_nothing_is_mirrored(self, tmp_path):
+        seamed(tmp_path / "in.obj", mirrored=1)
+        assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
+        assert not atlas.certify(io.mapped(io.read_mesh(tmp_path / "out.obj"))).mirrored.size
+
+    def test_islands_over_one_another_are_told_and_left(self, tmp_path, capsys):
+        seamed(tmp_path / "in.obj", stacked=True)
+        assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
+        assert "Islands lie on or touch each other" in capsys.readouterr().out
+        assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--pack") == 0
+        assert "Islands lie on" not in capsys.readouterr().out
+
+
+class TestCut:
+    def test_a_closed_surface_stays_watertight(self, tmp_path):
+        V, F = starfish(rings=12)
+        (tmp_path / "in.obj").write_text(
+            "".join(f"v {x:.7f} {y:.4f} {z:.3e} # {i}\n" for i, (x, y, z) in enumerate(V))
+            + "usemtl one\n"
+            + "".join(f"f {a} {b} {c}\n" for a, b, c in F + 1)
+        )
+        out, told = tmp_path / "out.obj", tmp_path / "told.json"
+        assert run("flatten", tmp_path / "in.obj", "-o", out, "--cut", "--json", told) == 0
+        assert vertex_lines(out) == vertex_lines(tmp_path / "in.obj")
+        assert faces(out) == faces(tmp_path / "in.obj")
+        mapped = io.mapped(io.read_mesh(out))
+        assert len(mapped.seams) == json.loads(told.read_text())["cut_edges"] > 0
+        # Read back, the seams are there to go on with.
+        for command in (["polish"], ["flatten"], ["map", "--to", "letter:G", "--refine"], ["repair"]):
+            assert run(command[0], out, "-o", tmp_path / "then.obj", *command[1:]) == 0
+            if command[0] != "map":
+                assert vertex_lines(tmp_path / "then.obj") == vertex_lines(tmp_path / "in.obj")
+                assert np.array_equal(io.mapped(io.read_mesh(tmp_path / "then.obj")).seams, mapped.seams)
+
+    def test_a_disk_is_no_error(self, tmp_path, capsys):
+        V, F = grid(6, 6)
+        io.write_obj(tmp_path / "in.obj", io.MeshData(lift(V), F))
+        assert run("map", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--to", "disk", "--cut") == 0
+        assert "nothing to cut" in capsys.readouterr().out
+        assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--cut") == 0
+
+    def test_quads_are_cut_between_each_other_only(self, tmp_path):
+        write_cube(tmp_path / "in.obj", 4)
+        out = tmp_path / "out.obj"
+        assert run("flatten", tmp_path / "in.obj", "-o", out, "--cut") == 0
+        assert vertex_lines(out) == vertex_lines(tmp_path / "in.obj")
+        assert faces(out) == faces(tmp_path / "in.obj")
+        mesh = io.read_mesh(out)
+        assert mesh.faces == 96
+        inside = {tuple(sorted(e)) for e in mesh.polygons.diagonals(mesh.F).tolist()}
+        assert not inside & {tuple(e) for e in io.mapped(mesh).seams.tolist()}
+
+    def test_a_seam_inside_a_quad_is_refused(self, tmp_path, capsys):
+        write_cube(tmp_path / "in.obj", 2)
+        mesh = io.read_mesh(tmp_path / "in.obj")
+        a, b = mesh.polygons.diagonals(mesh.F)[0]
+        (tmp_path / "edges.txt").write_text(f"{a} {b}\n")
+        given = ["--seams", tmp_path / "edges.txt"]
+        assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", *given) == 2
+        assert f"edge ({a}, {b}) inside a face" in capsys.readouterr().err
+
+
+class TestRefused:
+    def test_an_island_that_is_not_injective_is_named(self, tmp_path, capsys):
+        mesh = seamed(tmp_path / "in.obj")
+        uv = mesh.uv.copy()
+        inner = np.setdiff1d(mesh.FT[mesh.islands[1].triangles], rim_rows(mesh, 1))[0]
+        uv[inner] += 5
+        io.write_obj(tmp_path / "in.obj", io.MeshData(mesh.V, mesh.F, vt=uv, FT=mesh.FT))
+        assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 2
+        first = mesh.islands[1].triangles[0]
+        assert f"the island at triangle {first} (" in capsys.readouterr().err
+        assert not (tmp_path / "out.obj").exists()
+
+    def test_faces_without_places_beside_faces_with(self, source, tmp_path, capsys):
+        lines = source.read_text().splitlines()
+        at = next(i for i, line in enumerate(lines) if line.startswith("f "))
+        lines[at] = re.sub(r"/\d*", "", lines[at])
+        source.write_text("\n".join(lines) + "\n")
+        for command in ("polish", "flatten", "map", "check"):
+            output = [] if command == "check" else ["-o", tmp_path / "out.obj"]
+            assert run(command, source, *output) == 2
+            assert "face 0 (0-based) without texture coordinates" in capsys.readouterr().err
+        assert not (tmp_path / "out.obj").exists()
+
+    def test_an_island_with_a_handle_is_named(self, tmp_path, capsys):
+        i, j = np.divmod(np.arange(100), 10)
+        u, v = 2 * np.pi * i / 10, 2 * np.pi * j / 10
+        V = np.stack([(3 + np.cos(v)) * np.cos(u), (3 + np.cos(v)) * np.sin(u), np.sin(v)], axis=1)
+        a, b, c, d = (((i + di) % 10) * 10 + (j + dj) % 10 for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1)))
+        F = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])[1:]
+        io.write_obj(tmp_path / "in.obj", io.MeshData(np.vstack([V, V + 9]), np.vstack([F, F + 100])))
+        assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 2
+        said = capsys.readouterr().err
+        assert "the island at triangle 0 (199 triangles)" in said
+        assert "1 handle" in said
+        assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--cut") == 0
+
+
+class TestConvexity:
+    @pytest.mark.parametrize(
+        ("ring", "convex"),
+        [
+            ([(0, 0), (1, 0), (1, 1), (0, 1)], True),
+            ([(0, 0), (1, 0), (0.4, 0.4), (0, 1)], False),
+            ([(0, 0), (1, 0), (2, 0), (1, 1)], False),
+            ([(0, 1), (1, 1), (1, 0), (0, 0)], False),
+            ([(0, 0), (1, 1), (1, 0), (0, 1)], False),
+            # A pentagram turns left at every corner, and runs around twice.
+            ([(np.cos(a), np.sin(a)) for a in 4 * np.pi * np.arange(5) / 5], False),
+        ],
+    )
+    def test_rings(self, ring, convex):
+        uv = np.array(ring, dtype=float)
+        mesh = io.meshdata.polygon_mesh(
+            np.column_stack([uv, np.zeros(len(uv))]), np.arange(len(uv)), np.array([0, len(uv)])
+        )
+        assert (not_convex(mesh.polygons, mesh.F, uv).size == 0) == convex
+
+    def test_the_command_says_which(self, tmp_path, capsys):
+        (tmp_path / "dart.obj").write_text("v 0 0 0\nv 1 0 0\nv 0.4 0.4 0\nv 0 1 0\nv 1 1 0\nf 1 2 3 4\nf 2 5 4 3\n")
+        assert run("check", tmp_path / "dart.obj") == 0
+        said = capsys.readouterr().out
+        assert "on the 4 triangles that stand for its 2 faces" in said
+        assert run("check", tmp_path / "dart.obj", "--any-triangulation") == 1
+        assert "face 0 not convex in the plane" in capsys.readouterr().out
+
+
+class TestFunctions:
+    def test_what_is_fixed_must_be_there(self):
+        V, F, uv, FT, _ = strips(4)
+        with pytest.raises(ValueError, match="fixed refers to vertex 9999"):
+            atlas.polish(SeamedMesh(V, F, FT, uv), fixed=[9999])
+
+    def test_a_callback_that_interrupts_leaves_the_others_where_they_were(self):
+        V, F, uv, FT, _ = strips(6)
+        mesh = SeamedMesh(V, F, FT, uv)
+
+        def stop(step):
+            if step.iteration == 2:
+                raise KeyboardInterrupt
+
+        mapped = atlas.polish(mesh, callback=stop)
+        assert mapped.status.name == "INTERRUPTED"
+        assert len(mapped.islands) == 1
+        assert np.array_equal(mapped.mesh.islands[2].uv, mesh.islands[2].uv)
+        assert mapped.verdict().injective
+
+    def test_the_input_is_not_changed(self):
+        V, F, uv, FT, _ = strips(4)
+        copies = [array.copy() for array in (V, F, uv, FT)]
+        atlas.flatten(SeamedMesh(V, F, FT, uv))
+        assert all(np.array_equal(a, b) for a, b in zip((V, F, uv, FT), copies, strict=True))
+
+    def test_weights_and_pins(self):
+        V, F, uv, FT, _ = strips(4)
+        mesh = SeamedMesh(V, F, FT, uv)
+        pinned = [mesh.islands[1].vertices[12]]
+        mapped = atlas.flatten(mesh, fixed=pinned, weights=np.ones(len(F)))
+        assert np.array_equal(mapped.mesh.islands[1].uv[12], mesh.islands[1].uv[12])
+        with pytest.raises(ValueError, match="weights"):
+            atlas.flatten(mesh, weights=np.ones(3))
+
+
+def boundary(island):
+    sides = np.stack([island.F, np.roll(island.F, -1, axis=1)], axis=2).reshape(-1, 2)
+    rows, count = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+    return np.unique(rows[count == 1])
+
+
+def rim_rows(mesh, which):
+    island = mesh.islands[which]
+    rim = boundary(island)
+    rows = mesh.FT[island.triangles]
+    return np.unique(rows[np.isin(island.F, rim)])
+
+
+def seams_at(mesh, x):
+    ends = np.stack([mesh.F, np.roll(mesh.F, -1, axis=1)], axis=2).reshape(-1, 2)
+    along = ends[(np.abs(mesh.V[ends, 0] - x) < 1e-9).all(axis=1)]
+    return np.unique(np.sort(along, axis=1), axis=0).tolist()
+
+
+def write_cube(path, k):
+    """A cube whose sides are k × k quads."""
+    t = np.linspace(-1, 1, k + 1)
+    x, y = (a.ravel() for a in np.meshgrid(t, t))
+    one = np.ones_like(x)
+    sides = [(x, y, one), (y, x, -one), (one, x, y), (-one, y, x), (y, one, x), (x, -one, y)]
+    V = np.concatenate([np.stack(side, axis=1) for side in sides])
+    corner = (np.arange(k)[:, None] * (k + 1) + np.arange(k)).ravel()
+    quads = np.stack([corner, corner + 1, corner + k + 2, corner + k + 1], axis=1)
+    quads = np.concatenate([quads + s * (k + 1) ** 2 for s in range(6)])
+    _, first, same = np.unique(V.round(6), axis=0, return_index=True, return_inverse=True)
+    text = "".join(f"v {a:g} {b:g} {c:g}\n" for a, b, c in V[first])
+    path.write_text(text + "".join("f {} {} {} {}\n".format(*row) for row in same.ravel()[quads] + 1))
