@@ -124,7 +124,7 @@ def _side_by_side(whole: Part, results: Sequence[MapResult]) -> MapResult:
 
 def _apart(run: Pinned, whole: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
     """Look for a bijective map of all parts, from a map of each that leaves others no room."""
-    unit = -whole.piece.exponent
+    unit = -run.exponent
     with np.errstate(all="ignore"):
         run.keep(np.ldexp(found.uv, unit))
         maps = [np.ldexp(result.uv, unit) for result in results]

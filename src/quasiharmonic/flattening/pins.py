@@ -165,12 +165,14 @@ def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray,
     return vertices, places
 
 
+# In powers of two: how many times further apart pins may be than the surface is large, or nearer, for energies.
+_APART = 100
 # Ends of a search that say no more than that no map was found, of which one may be injective all the same.
 _UNDECIDED = Status.INJECTIVE, Status.SETTLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
 
 class Pinned:
-    """A surface with vertices held, the map of it so far, and what is to be told; all in the piece's unit.
+    """A surface with vertices held, the map of it so far, and what is to be told.
 
     Parameters
     ----------
@@ -182,6 +184,10 @@ class Pinned:
     certificate : Certificate
         Of the map so far.
     status : Status
+    exponent : int
+        The map is in units of ``2 ** exponent``: in the piece's, unless pins are so much further apart, or nearer, than
+        vertices of the surface that squares of stretches leave the numbers' range. Energies are then measured as if
+        they were less so; what has the least is the same.
     """
 
     def __init__(
@@ -189,7 +195,11 @@ class Pinned:
     ) -> None:
         self._piece, self._settings = piece, settings
         self._fixed, self._given = fixed, target
-        self._target = np.ldexp(target, -piece.exponent)
+        # A quarter of it, for the difference of the largest numbers is none.
+        extent, quarter = np.frexp(np.ptp(np.ldexp(target, -2), axis=0).max())
+        apart = int(quarter) + 2 - piece.exponent if extent > 0 else 0
+        self.exponent = piece.exponent + apart - min(max(apart, -_APART), _APART)
+        self._target = np.ldexp(target, -self.exponent)
         self._energy = piece.energy(settings.density, weights)
         self._solver = ""
         self.status = Status.SETTLED
@@ -344,14 +354,14 @@ class Pinned:
             settings.callback(self._history[-1])
 
     def keep(self, uv: FloatArray) -> None:
-        """Take a map on, in the piece's unit, with the vertices put in place."""
+        """Take a map on, in units of ``2 ** exponent``, with the vertices put in place."""
         self._uv = uv.copy()
         self._uv[self._fixed] = self._target
         self.certificate = certify(self._piece.F, self._uv, loops=self._piece.loops)
 
     def _outward(self, uv: FloatArray) -> FloatArray:
         """A map in the target's unit, the vertices where they were given to the last bit."""
-        placed: FloatArray = np.ldexp(uv, self._piece.exponent)
+        placed: FloatArray = np.ldexp(uv, self.exponent)
         placed[self._fixed] = self._given
         return placed
 
