@@ -1,4 +1,4 @@
-"""What each choice costs and brings: functional, parameterisation, method of descent, strategy, energy, linear solver.
+"""What each choice costs and brings: functional, parameterisation, method of descent, strategy, energy.
 
     OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose
 
@@ -13,14 +13,12 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from quasiharmonic import MapResult, Problem, distortion, harmonise, polish, solve
 from quasiharmonic.descent import LBFGS, Alternating, Descent, Newton, VectorAdam
-from quasiharmonic.linsolve import available
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
 from figure_17 import swapped
@@ -165,21 +163,7 @@ def quantile(values: np.ndarray, share: np.ndarray) -> float:
     return float(values[order][np.searchsorted(np.cumsum(share[order]), 0.5)])
 
 
-def solvers(problems: list[Problem]) -> str:
-    """The same search by every linear solver that is installed."""
-    rows, unit = [], 0.0
-    for name in sorted(available()):
-        results = []
-        for problem in problems:
-            start = perf_counter()
-            solve(afresh(problem), linear_solver=name)
-            results.append(perf_counter() - start)
-        rows.append((float(np.median(results)), name))
-    unit = min(rows)[0]
-    return table(["linear solver", "time"], [[f"`{name}`", f"{seconds / unit:.1f}"] for seconds, name in sorted(rows)])
-
-
-TABLES = functionals, parameterisations, pins, methods, strategies, energies, solvers
+TABLES = functionals, parameterisations, pins, methods, strategies, energies
 
 
 def main() -> None:

@@ -7,6 +7,7 @@
     python benchmarks/speed.py --animation                      # 100 frames of a moving boundary besides
     python benchmarks/speed.py --triangles --join a.csv b.csv   # one table and picture of earlier runs
     python benchmarks/speed.py --fine                           # every iteration on the mesh itself, never a coarse one
+    python benchmarks/speed.py --linear-solver qdldl            # by this backend, not by the best present
 
 A made problem maps the head of a cat onto the letters C, R and S. A folder is a problem (``input.obj`` +
 ``handles.txt``) or holds problems at any depth. Tools take turns, and medians over the turns are taken; a tool that
@@ -26,6 +27,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -36,6 +38,7 @@ from peers import PEERS
 from quasiharmonic import Problem, io, is_injective, solve, surfaces
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.descent import Descent, VectorAdam
+from quasiharmonic.linsolve import available
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.search import solving
 from quasiharmonic.search.strategy import STRATEGIES
@@ -98,7 +101,9 @@ def problems(sizes: list[int], letters: str, folders: list[Path]) -> Iterator[tu
             yield path.parent.name, (problem.V, problem.F, problem.fixed, problem.target)
 
 
-def measure(name: str, arrays: Arrays, tools: list[str], runs: int, strategy: Strategy) -> list[Record]:
+def measure(
+    name: str, arrays: Arrays, tools: list[str], runs: int, strategy: Strategy, linear_solver: str = "auto"
+) -> list[Record]:
     """Let the tools take turns at a problem."""
     records = [Record(name, len(arrays[1]), tool) for tool in tools]
     for turn in range(runs):
@@ -110,7 +115,7 @@ def measure(name: str, arrays: Arrays, tools: list[str], runs: int, strategy: St
                 with clock.clocking():
                     began = time.perf_counter()
                     if record.tool == OURS:
-                        result = solving.injective_map(*arrays, strategy=strategy)
+                        result = solving.injective_map(*arrays, strategy=strategy, linear_solver=linear_solver)
                         uv, record.iterations = result.uv, result.iterations
                     else:
                         uv = PEERS[record.tool](*arrays)
@@ -135,21 +140,22 @@ def warm_up(tools: list[str]) -> list[str]:
     return present
 
 
-def peak_megabytes(arrays: Arrays, tool: str) -> float | None:
+def peak_megabytes(arrays: Arrays, tool: str, linear_solver: str = "auto") -> float | None:
     """What a tool's call adds to the peak of a fresh process that holds no more than the arrays."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "problem.npz")
         np.savez(path, *arrays)
-        command = [sys.executable, __file__, "--peak", tool, str(path)]
+        command = [sys.executable, __file__, "--peak", tool, str(path), "--linear-solver", linear_solver]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     return float(done.stdout) if done.returncode == 0 else None
 
 
-def print_peak(tool: str, path: Path) -> None:
+def print_peak(tool: str, path: Path, linear_solver: str) -> None:
     """The child's part of `peak_megabytes`."""
     with np.load(path) as stored:
         arrays = tuple(stored[name] for name in stored.files)
-    run: Callable[..., object] = solving.injective_map if tool == OURS else PEERS[tool]
+    ours = partial(solving.injective_map, linear_solver=linear_solver)
+    run: Callable[..., object] = ours if tool == OURS else PEERS[tool]
     # A small problem first, for what is loaded once and for all.
     run(*cat(100, "C"))
     before = _peak()
@@ -206,7 +212,7 @@ def machine() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
     versions = [f"Python {platform.python_version()}"]
-    for package in ("quasiharmonic", "numpy", "scipy", "mkl", "libigl", "mouette"):
+    for package in ("quasiharmonic", "numpy", "scipy", "mkl", "qdldl", "rslab", "libigl", "mouette"):
         try:
             versions.append(f"{package} {version(package)}")
         except PackageNotFoundError:
@@ -345,6 +351,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), help="what to compare with")
     parser.add_argument("--strategy", choices=STRATEGIES, default="speed", help="%(choices)s (%(default)s)")
     parser.add_argument("--fine", action="store_true", help="VectorAdam alone, on the mesh itself")
+    parser.add_argument(
+        "--linear-solver", choices=["auto", *available()], default="auto", help="%(choices)s (%(default)s)"
+    )
     parser.add_argument("-r", "--runs", type=_count, default=5, help="turns of every tool")
     parser.add_argument("--limit", type=float, default=30, help="seconds, past which a tool gets no larger problem")
     parser.add_argument("--memory", action="store_true", help="peak memory too")
@@ -354,7 +363,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.peak:
-        return print_peak(options.peak[0], Path(options.peak[1]))
+        return print_peak(options.peak[0], Path(options.peak[1]), options.linear_solver)
     tools = warm_up([OURS, *options.peers])
     strategy: Strategy = [VectorAdam()] if options.fine else options.strategy
     records = [record for joined in options.join for record in joined]
@@ -364,9 +373,10 @@ def main(arguments: list[str] | None = None) -> None:
         slow = {
             record.tool for record in records if record.median > options.limit and len(arrays[1]) > record.triangles
         }
-        found = measure(name, arrays, [tool for tool in tools if tool not in slow], options.runs, strategy)
+        able = [tool for tool in tools if tool not in slow]
+        found = measure(name, arrays, able, options.runs, strategy, options.linear_solver)
         for record in found if options.memory else ():
-            record.megabytes = peak_megabytes(arrays, record.tool)
+            record.megabytes = peak_megabytes(arrays, record.tool, options.linear_solver)
         records += found
         times = ", ".join(f"{record.tool} {_time(record)}" for record in found) or "every tool has exceeded the limit"
         print(f"{name}, {len(arrays[1])} triangles: {times}", flush=True)

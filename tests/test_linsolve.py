@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from quasiharmonic.linsolve import (
     BACKENDS,
-    QDLDL_BELOW,
+    QDLDL_UP_TO,
     NotPositiveDefinite,
     available,
     cholmod,
@@ -547,11 +547,11 @@ def test_auto_takes_the_first_that_loads(monkeypatch):
     assert make_solver([0, 1], [0]).name == "superlu"
 
 
-def test_the_order_of_preference_depends_on_the_number_of_unknowns(monkeypatch):
+def test_the_order_of_preference_depends_on_the_number_of_entries(monkeypatch):
     for backend in (mkl.Pardiso, cholmod.Cholmod, rslab.Rslab, qdldl.Qdldl):
         monkeypatch.setattr(backend, "present", classmethod(lambda cls: True))
-    assert available() == available(QDLDL_BELOW) == ALL == ("pardiso", "cholmod", "rslab", "qdldl", "superlu")
-    assert available(QDLDL_BELOW - 1) == ("pardiso", "cholmod", "qdldl", "rslab", "superlu")
+    assert available() == available(QDLDL_UP_TO + 1) == ALL == ("pardiso", "cholmod", "rslab", "qdldl", "superlu")
+    assert available(QDLDL_UP_TO) == ("pardiso", "cholmod", "qdldl", "rslab", "superlu")
     monkeypatch.setattr(qdldl.Qdldl, "present", classmethod(lambda cls: False))
     assert available(1) == ("pardiso", "cholmod", "rslab", "superlu")
 

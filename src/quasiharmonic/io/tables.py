@@ -124,7 +124,7 @@ class TableReader:
         if self.position + rows * row.itemsize > self._end:
             raise ValueError("it ends too early")
         block = np.frombuffer(self.data, row, rows, self.position)
-        begin = self.position + row.itemsize * np.arange(rows)[:, None]
+        begin = self.position + row.itemsize * np.arange(rows, dtype=np.int64)[:, None]
         self.position += rows * row.itemsize
         found = []
         offset = 0

@@ -29,8 +29,9 @@ BACKENDS = {
     "qdldl": ("qdldl", "Qdldl"),
     "superlu": ("superlu", "SuperLU"),
 }
-# Below this many unknowns QDLDL is tried before rslab, whose supernodes then cost more than they save.
-QDLDL_BELOW = 20_000
+# Up to this many entries in the upper triangle QDLDL is tried before rslab, whose supernodes then cost more than they
+# save: 15,000 unknowns of a Laplacian, 8,500 of a Newton system, whose rows are twice as long.
+QDLDL_UP_TO = 60_000
 
 
 def _backend(name: str) -> type[LinearSolver]:
@@ -39,18 +40,21 @@ def _backend(name: str) -> type[LinearSolver]:
     return backend
 
 
-def available(unknowns: int = QDLDL_BELOW) -> tuple[str, ...]:
-    """Names of the backends whose libraries are installed, best first for so many unknowns; none of them is loaded."""
+def available(entries: int | None = None) -> tuple[str, ...]:
+    """Names of the backends whose libraries are installed, best first; none of them is loaded.
+
+    Best for upper triangles of so many entries, or by default for large ones.
+    """
     present = [name for name in BACKENDS if _backend(name).present()]
-    if unknowns < QDLDL_BELOW and {"qdldl", "rslab"} <= set(present):
+    if entries is not None and entries <= QDLDL_UP_TO and {"qdldl", "rslab"} <= set(present):
         young = present.index("rslab")
         present[young : young + 2] = "qdldl", "rslab"
     return tuple(present)
 
 
-def takes_order(name: str, unknowns: int) -> bool:
-    """Whether the backend that `make_solver` takes by this name has a use for so many unknowns in a good order."""
-    chosen = available(unknowns)[0] if name == "auto" else name
+def takes_order(name: str = "auto") -> bool:
+    """Whether the backend that `make_solver` takes by this name for a large system has a use for a good order."""
+    chosen = available()[0] if name == "auto" else name
     return chosen in BACKENDS and _backend(chosen).takes_order
 
 
@@ -63,7 +67,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
         Upper triangle of the pattern in compressed sparse rows: columns ascending within each row, every row starting
         with its diagonal entry.
     name : {"auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"}
-        Which backend to use. "auto" takes the first of `available` for this many unknowns that loads.
+        Which backend to use. "auto" takes the first of `available` for so many entries that loads.
     ordered : bool
         The unknowns are numbered such that eliminating them in turn leaves a sparse factor, as
         `quasiharmonic.mesh.dissection` numbers them. A backend then looks for no order of its own, if it can be told.
@@ -81,7 +85,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
         The backend named is not installed, or its library does not load.
     """
     if name == "auto":
-        for candidate in available(np.size(indptr) - 1):
+        for candidate in available(np.size(indices)):
             try:
                 return _backend(candidate)(indptr, indices, ordered=ordered)
             except ImportError:

@@ -64,7 +64,7 @@ class Laplacian:
         # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
         tail, head = (corner.ravel() for corner in self._unknowns(F))
         order = None
-        if points is not None and self.free.size >= DISSECT_FROM and takes_order(linear_solver, self.free.size):
+        if points is not None and self.free.size >= DISSECT_FROM and takes_order(linear_solver):
             once = np.flatnonzero((tail >= 0) & (tail < head))
             order = nested_dissection(points[self.free], tail[once], head[once])
         if order is not None:

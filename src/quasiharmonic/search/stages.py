@@ -248,7 +248,7 @@ class Search:
             solver = objective.laplacian.solver
             self.linear_solver = solver.name
             if self._spare is None:
-                self._spare = available(solver.n)
+                self._spare = available(solver.nnz)
             if self.linear_solver in self._spare:
                 self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
             given = None if self.history else self._first
