@@ -336,6 +336,17 @@ def test_map(sheet, corners, places, slide):
     assert [tuple(uv[v]) for v in places] == [pytest.approx(place, abs=1e-15) for place in places.values()]
 
 
+def test_corners_by_angle_are_told_as_they_can_be_given(sheet, capsys):
+    out = sheet.with_name("out.obj")
+    assert run("map", sheet, "-o", out, "--to", "star:5", "--corners", "auto", "--refine") == 0
+    (said,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("corners by angle")]
+    chosen = said.split("--corners ")[1]
+    assert len(chosen.split(",")) == 10
+    uv = io.read_mesh(out).vt
+    assert run("map", sheet, "-o", out, "--to", "star:5", "--corners", chosen, "--refine") == 0
+    np.testing.assert_array_equal(io.read_mesh(out).vt, uv)
+
+
 def test_map_of_what_is_asked_wrongly(sheet, capsys):
     out = sheet.with_name("out.obj")
     assert run("map", sheet, "-o", out, "--to", "rect:2x1", "--corners", "near:1,2") == 2
