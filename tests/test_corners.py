@@ -236,6 +236,20 @@ def test_a_sheet_stays_upright():
         assert [where[v] for v in (0, 9, 69, 60)] == [[0, 0], [2, 0], [2, 1], [0, 1]]
 
 
+def test_long_sides_go_to_long_ones():
+    """However a sheet lies, its distortion is the same onto its own shape; on a square it stays upright instead."""
+    V, F = surfaces.grid(20, 10)
+    V = V * [2, 1]
+    for degrees in (0, 20, 45, 70, 90, 135):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        fixed, target = boundary_to(V @ [[c, s], [-s, c]], F, rectangle(2, 1), corners="auto")
+        off = min(np.abs(target - place).max() for place in (V[fixed], (2, 1) - V[fixed]))
+        assert off < 1e-9
+    fixed, target = boundary_to(V @ [[0, 1], [-1, 0]], F, rectangle(1, 1), corners="auto")
+    where = dict(zip(fixed.tolist(), target.tolist(), strict=True))
+    assert [where[v] for v in (0, 20, 230, 210)] == [[1, 0], [1, 1], [0, 1], [0, 0]]
+
+
 def test_outlines_without_corners_and_with_holes():
     V, F = surfaces.annulus(8)
     for contours in (ring(0.4), [rectangle(4, 4) - 2, rectangle(1, 1)]):
