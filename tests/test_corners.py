@@ -236,6 +236,20 @@ def test_a_sheet_stays_upright():
         assert [where[v] for v in (0, 9, 69, 60)] == [[0, 0], [2, 0], [2, 1], [0, 1]]
 
 
+def test_long_sides_go_to_long_ones():
+    """However a sheet lies, its distortion is the same onto its own shape; on a square it stays upright instead."""
+    V, F = surfaces.grid(20, 10)
+    V = V * [2, 1]
+    for degrees in (0, 20, 45, 70, 90, 135):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        fixed, target = boundary_to(V @ [[c, s], [-s, c]], F, rectangle(2, 1), corners="auto")
+        off = min(np.abs(target - place).max() for place in (V[fixed], (2, 1) - V[fixed]))
+        assert off < 1e-9
+    fixed, target = boundary_to(V @ [[0, 1], [-1, 0]], F, rectangle(1, 1), corners="auto")
+    where = dict(zip(fixed.tolist(), target.tolist(), strict=True))
+    assert [where[v] for v in (0, 20, 230, 210)] == [[1, 0], [1, 1], [0, 1], [0, 0]]
+
+
 def test_outlines_without_corners_and_with_holes():
     V, F = surfaces.annulus(8)
     for contours in (ring(0.4), [rectangle(4, 4) - 2, rectangle(1, 1)]):
@@ -334,6 +348,17 @@ def test_map(sheet, corners, places, slide):
     assert run("map", sheet, "-o", out, "--to", "rect:2x1", "--corners", corners, *slide) == 0
     uv = io.map_of(io.read_mesh(out))
     assert [tuple(uv[v]) for v in places] == [pytest.approx(place, abs=1e-15) for place in places.values()]
+
+
+def test_corners_by_angle_are_told_as_they_can_be_given(sheet, capsys):
+    out = sheet.with_name("out.obj")
+    assert run("map", sheet, "-o", out, "--to", "star:5", "--corners", "auto", "--refine") == 0
+    (said,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("corners by angle")]
+    chosen = said.split("--corners ")[1]
+    assert len(chosen.split(",")) == 10
+    uv = io.read_mesh(out).vt
+    assert run("map", sheet, "-o", out, "--to", "star:5", "--corners", chosen, "--refine") == 0
+    np.testing.assert_array_equal(io.read_mesh(out).vt, uv)
 
 
 def test_map_of_what_is_asked_wrongly(sheet, capsys):

@@ -18,6 +18,8 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.targets.asked_corners import AskedCorners
 from quasiharmonic.targets.boundary import boundary_to
 from quasiharmonic.targets.chords import flattened_edges
+from quasiharmonic.targets.contours import corners as corners_of
+from quasiharmonic.targets.contours import in_unit
 from quasiharmonic.targets.nesting import filled
 
 
@@ -29,7 +31,7 @@ class Fitted:
     ----------
     problem : Problem
     held : list of int
-        Boundary vertices whose place somebody has chosen.
+        Boundary vertices whose place somebody has chosen, or which were found for the outline's corners.
     filled : int
         Holes of the outline that the surface does not have.
     refined : Refined or None
@@ -121,10 +123,18 @@ def laid_along(
         # What has no loops is no surface; below it is said why.
         fills = False
     chosen = None if corners is None else corners.on(V, F)
-    places = boundary_to(V, F, whole if fills else list(contours), corners=chosen, corner_angle=corner_angle)
-    held = [] if chosen is None or isinstance(chosen, str) else list(chosen)
-    problem = Problem(V, F, *places, reference=reference)
+    onto = whole if fills else list(contours)
+    fixed, target = boundary_to(V, F, onto, corners=chosen, corner_angle=corner_angle)
+    held = _at_corners(fixed, target, onto, corner_angle) if isinstance(chosen, str) else list(chosen or [])
+    problem = Problem(V, F, fixed, target, reference=reference)
     return Fitted(problem, held, holes if fills else 0)
+
+
+def _at_corners(fixed: IntArray, target: FloatArray, contours: list[FloatArray], angle: float) -> list[int]:
+    """Vertices that have come to the corners of an outline, in the order of these."""
+    sharp = [corners_of(unit, angle) for unit in in_unit(contours)[0]]
+    goals = np.concatenate([contour[marks] for contour, marks in zip(contours, sharp, strict=True)])
+    return [int(fixed[(target == goal).all(axis=1)][0]) for goal in goals]
 
 
 def with_room(fitted: Fitted) -> Fitted:

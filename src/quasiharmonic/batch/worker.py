@@ -155,8 +155,9 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
         mapped = mesh.with_places(found.mesh)
     else:
         found, refined = _mapped(surface, fixed, settings, record, tell)
-        islands = found.mesh.islands
-        mapped = written_over(mesh, islands, refined, found.places()) if any(refined) else mesh.with_places(found.mesh)
+        mapped = mesh.with_places(found.mesh)
+        if any(refined):
+            mapped = written_over(mesh, surface.islands, refined, found.places())
     with _timed(record, "write"):
         record |= _written(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
     with _timed(record, "measure"):

@@ -168,6 +168,9 @@ def _onto_outline(options: argparse.Namespace, island: Island, right: float) -> 
             island.V, island.F, contours, corners=corners, corner_angle=angle, reference=options.reference
         )
     posed = Posed(fitted)
+    if options.corners == "auto" and fitted.held:
+        found = ",".join(map(str, island.vertices[fitted.held].tolist()))
+        posed.notes.append(f"corners by angle, in the outline's order: --corners {found}")
     if fitted.filled:
         posed.facts["filled_holes"] = holes = fitted.filled
         which = "the hole" if holes == 1 else f"the {holes} holes"

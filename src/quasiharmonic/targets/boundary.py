@@ -55,7 +55,7 @@ def boundary_to(
         point). A mapping says for every vertex which corner, counted from 0, or which point (x, y) on
         the outline. The rest is spread between them, so that every run of the boundary keeps to its
         own side. ``"auto"`` chooses by angle, on the loop and for the contour outside: see
-        `boundary_corners`, whose corners go to those of the contour that turn alike.
+        `boundary_corners`; convex corners go to convex ones, long sides to long ones.
     corner_angle : float
         Degrees by which an outline turns at a corner, at the least. Lesser bends belong to a curve.
 

@@ -9,7 +9,7 @@ from quasiharmonic.targets.contours import as_complex, corners, turns
 from quasiharmonic.targets.correspondence import arc
 from quasiharmonic.targets.turning import BoundaryLoop, mean_turns
 
-# How far the likeness of turnings, 1 at best, may fall short of the best for the sake of an upright map.
+# How far the likeness of corners and sides, 2 at best, may fall short of the best for the sake of an upright map.
 _AS_GOOD = 0.1
 
 
@@ -18,9 +18,9 @@ def pins_by_angle(
 ) -> list[tuple[int, float]]:
     """Find as many corners of a boundary loop as a contour has, and where along the contour each goes.
 
-    They follow each other as the contour's do; what is left is which one is the first. The turnings decide, convex
-    corners going to convex ones; where they leave it open, as for a rectangle, the corners are to be as little turned
-    against those of the contour as they can.
+    They follow each other as the contour's do; what is left is which one is the first. Turnings decide and the lengths
+    between them: convex corners go to convex ones, long sides to long ones. Where these leave it open, as for a square,
+    the corners are to be as little turned against those of the contour as they can.
 
     Parameters
     ----------
@@ -48,11 +48,20 @@ def pins_by_angle(
         return []
     positions, turning = loop.corners(len(sharp))
     sides = np.linalg.norm(np.roll(contour, -1, axis=0) - contour, axis=1)
+    ends = arc(contour)[sharp]
+    lengths = np.cumsum(loop.lengths / loop.lengths.max())
+    runs = lengths[positions - 1] / lengths[-1]
     alike = _likeness(turning + 0j, mean_turns(sides, turns(contour), sharp) + 0j)
+    alike += _likeness(_gaps(runs) + 0j, _gaps(ends) + 0j)
     seen, goal = as_complex(flat[positions]), as_complex(contour[sharp])
     upright = _likeness(seen - seen.mean(), goal - goal.mean())
     first = int(np.argmax(np.where(alike >= alike.max() - _AS_GOOD, upright, -np.inf)))
-    return list(zip(np.roll(positions, -first).tolist(), arc(contour)[sharp].tolist(), strict=True))
+    return list(zip(np.roll(positions, -first).tolist(), ends.tolist(), strict=True))
+
+
+def _gaps(along: FloatArray) -> FloatArray:
+    """How far it is from each of some places around a curve of length 1 to the next."""
+    return np.asarray((np.roll(along, -1) - along) % 1.0)
 
 
 def _likeness(one: np.ndarray, other: np.ndarray) -> FloatArray:
