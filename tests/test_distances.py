@@ -426,10 +426,9 @@ def test_record_keeps_maps_on_the_way(dome):
 
 @pytest.fixture(scope="module")
 def folded():
-    """A square with folds as of a cortex, of 7,200 triangles, as `flatten` has it before distances are looked at."""
+    """A square with hills and valleys, of 7,200 triangles."""
     V, F = surfaces.grid(60, 60)
-    height = 0.06 * np.sin(22 * V[:, 0] + 3 * np.sin(5 * V[:, 1])) * np.cos(9 * V[:, 1])
-    return Piece(np.column_stack([V, height]), F)
+    return Piece(np.column_stack([V, 0.3 * np.sin(7 * V[:, 0]) * np.cos(5 * V[:, 1])]), F)
 
 
 @pytest.fixture(scope="module")
@@ -439,29 +438,29 @@ def asked():
 
 def test_a_coarse_mesh_serves_the_fine_one(folded, asked):
     plain = flatten(folded.V, folded.F)
-    found = kept_by_coarse(folded, 16, asked, least=500)
+    found = kept_by_coarse(folded, 16, asked, least=900)
     whole = kept(folded, plain.uv, 16, asked)
     sample = surface_distances(folded.V, folded.F, rings=16, sources=400)
     errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
     assert found.status is Status.POLISHED
     assert certify(folded.F, found.uv).bijective
-    assert errors[1].mean < 0.95 * errors[0].mean
+    assert errors[1].mean < 0.9 * errors[0].mean
     # Of what the descent on the mesh itself gains most is gained.
-    assert errors[2].mean < errors[1].mean + 0.35 * (errors[0].mean - errors[1].mean)
+    assert errors[2].mean < errors[1].mean + 0.3 * (errors[0].mean - errors[1].mean)
     assert errors[2].rms < errors[0].rms
     assert errors[2].scale == pytest.approx(1, abs=0.03)
     assert [stage.name for stage in found.stages] == ["start, coarse", "guarded descent, distances, coarse"]
-    assert np.array_equal(kept_by_coarse(folded, 16, asked, least=500).uv, found.uv)
+    assert np.array_equal(kept_by_coarse(folded, 16, asked, least=900).uv, found.uv)
 
 
 def test_rings_too_few_for_any_coarser_mesh(folded, asked):
-    assert kept_by_coarse(folded, 3, asked, least=500) is None
+    assert kept_by_coarse(folded, 3, asked, least=900) is None
     assert kept_by_coarse(folded, 20, asked, least=len(folded.V)) is None
 
 
 def test_what_the_coarse_way_tells_and_records(folded, asked):
     steps = []
-    found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record=1), least=500)
+    found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record=1), least=900)
     assert steps == found.history
     assert [step.iteration for step in steps] == [*range(len(steps))]
     assert steps[-1].energy < steps[0].energy
@@ -475,7 +474,7 @@ def test_ctrl_c_on_the_coarse_mesh_hands_back_a_map_of_the_surface(folded, asked
         if step.iteration == 1:
             raise KeyboardInterrupt
 
-    found = kept_by_coarse(folded, 16, replace(asked, callback=stop), least=500)
+    found = kept_by_coarse(folded, 16, replace(asked, callback=stop), least=900)
     assert found.status is Status.INTERRUPTED
     assert len(found.uv) == len(folded.V)
     assert certify(folded.F, found.uv).bijective

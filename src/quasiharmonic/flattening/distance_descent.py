@@ -39,7 +39,7 @@ from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 _PAIRS, _CROSSINGS = 300_000, 3
 # The more sources the better, but what distances from one cost grows with the square of the rings: of sources times
 # that there are so many, within bounds.
-_WORK, _FEWEST, _MOST = 1_000_000, 1000, 6000
+_WORK, _FEWEST, _MOST = 1_000_000, 1000, 4000
 # Gradients are followed until the residual has fallen to this share, or there were so many.
 _ACCURACY, _GRADIENTS = 0.1, 20
 
@@ -62,7 +62,7 @@ def keep_distances(
     distance is off, as `distance_error` measures it but for errors below 30 % counting by their squares; and a small
     share of the symmetric Dirichlet energy, which keeps triangles from collapsing
     (`quasiharmonic.flattening.distance_energy`). The sample has 2,500 vertices, or all if there are no more, with 120
-    others each, drawn at random, always the same; for fewer rings up to 6,000 vertices, for more down to 1,000, and
+    others each, drawn at random, always the same; for fewer rings up to 4,000 vertices, for more down to 1,000, and
     300,000 pairs in all.
 
     Parameters
