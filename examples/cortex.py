@@ -9,15 +9,16 @@ each vertex.
 What is measured are distances between vertices at most 20 edges apart, from every vertex to 150 others drawn at random:
 along the surface, as chains of straight segments that cross at most five edges each and no cut, and in the plane. The
 error of a pair is |scale · plane / surface − 1|, with the scale, one for each map, for which the mean is least; "rms"
-is the root of its mean square. All maps are measured alike, whatever made them. Seconds are those of one core.
+is the root of its mean square. All maps are measured alike, whatever made them. Seconds are of one thread's
+processor time; the picture's are the clock's.
 
 =============================== ======= =================== ==================== ====== ==============
 map                             seconds symmetric Dirichlet distance error, mean rms    bijective
 =============================== ======= =================== ==================== ====== ==============
-published                             –               0.868               15.2 % 23.2 % yes
+published                             –               0.868               15.2 % 22.8 % yes
 autoflatten 1.0.7                   144                   ∞               14.9 % 19.6 % no, 6 inverted
-``flatten``                         0.4               0.298               14.6 % 23.8 % yes
-that, and ``keep_distances``        4.5               0.641               13.6 % 19.1 % yes
+``flatten``                         0.5               0.298               14.6 % 23.8 % yes
+that, and ``keep_distances``        5.2               0.639               13.6 % 19.0 % yes
 =============================== ======= =================== ==================== ====== ==============
 
 ``--autoflatten`` runs that program too (``pip install autoflatten``; some minutes) and shows its map. ``--subdivided``

@@ -8,7 +8,7 @@ as long as several here. What has been carried back is bijective, and its triang
 of any map that comes from a coarse mesh.
 
 On a cortex of 298,464 triangles, pairs up to 20 rings apart, this takes an eighth of the time of a descent on the mesh
-itself; the mean error is 12.9 % (root mean square 19.9 %), there 13.1 % (23.4 %). Distances on coarse meshes are off by
+itself; the mean error is 12.7 % (root mean square 20.2 %), there 12.7 % (23.8 %). Distances on coarse meshes are off by
 a hundredth or two: where a map could keep them nearly, a descent on the mesh itself does it better.
 """
 

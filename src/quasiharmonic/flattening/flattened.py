@@ -77,7 +77,8 @@ def flatten(
         What is lowered, the mean over the surface's area: ``"symmetric-dirichlet"``, ``"mips"`` (angles alone),
         ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`. Or ``"distances"``: the symmetric
         Dirichlet energy first, and then how far distances between vertices some edges apart are off, as
-        `quasiharmonic.keep_distances` lowers it; without pins and weights.
+        `quasiharmonic.keep_distances` lowers it; without pins and weights. From 50,000 triangles on that is done on
+        a coarse mesh, if no ``start`` is given, and of its steps ``path`` has none but the map at the end.
     weights : (f,) array, optional
         How much each triangle's distortion counts; positive, 1 by default.
     start : (n, 2) array, optional
