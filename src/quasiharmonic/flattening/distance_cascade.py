@@ -122,5 +122,5 @@ def _between(hierarchy: Hierarchy, level: Level, rings: int) -> SurfaceDistances
         among=np.searchsorted(finer.vertices, level.vertices),
         lowest=LOWEST,
     )
-    ends = (np.searchsorted(level.vertices, finer.vertices[end]) for end in (found.source, found.target))
-    return SurfaceDistances(*ends, found.length, found.sampling)
+    number = np.searchsorted(level.vertices, finer.vertices)
+    return SurfaceDistances(number[found.source], number[found.target], found.length, found.sampling)
