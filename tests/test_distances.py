@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,12 +14,13 @@ from quasiharmonic import distortion, surfaces
 from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.contacts import Rim
-from quasiharmonic.flattening.distance_descent import DistanceDescent, keep_distances
+from quasiharmonic.flattening.distance_cascade import kept_by_coarse
+from quasiharmonic.flattening.distance_descent import DistanceDescent, keep_distances, kept
 from quasiharmonic.flattening.distance_energy import DistanceEnergy
 from quasiharmonic.flattening.distances import distance_error, surface_distances
 from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.geodesics import straight_segments
-from quasiharmonic.flattening.piece import Piece
+from quasiharmonic.flattening.piece import Piece, Settings
 from quasiharmonic.result import Status
 
 
@@ -419,6 +421,79 @@ def test_record_keeps_maps_on_the_way(dome):
         keep_distances(V, F, V[:, :2], record=-1)
 
 
+# --- by way of a coarse mesh
+
+
+@pytest.fixture(scope="module")
+def folded():
+    """A square with hills and valleys, of 7,200 triangles."""
+    V, F = surfaces.grid(60, 60)
+    return Piece(np.column_stack([V, 0.3 * np.sin(7 * V[:, 0]) * np.cos(5 * V[:, 1])]), F)
+
+
+@pytest.fixture(scope="module")
+def asked():
+    return Settings(SymmetricDirichlet(), "distances", 1e-3, 100, "auto", None, 0)
+
+
+def test_a_coarse_mesh_serves_the_fine_one(folded, asked):
+    plain = flatten(folded.V, folded.F)
+    found = kept_by_coarse(folded, 16, asked, least=900)
+    whole = kept(folded, plain.uv, 16, asked)
+    sample = surface_distances(folded.V, folded.F, rings=16, sources=400)
+    errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
+    assert found.status is Status.POLISHED
+    assert certify(folded.F, found.uv).bijective
+    assert errors[1].mean < 0.9 * errors[0].mean
+    # Of what the descent on the mesh itself gains most is gained.
+    assert errors[2].mean < errors[1].mean + 0.3 * (errors[0].mean - errors[1].mean)
+    assert errors[2].rms < errors[0].rms
+    assert errors[2].scale == pytest.approx(1, abs=0.03)
+    assert [stage.name for stage in found.stages] == ["start, coarse", "guarded descent, distances, coarse"]
+    assert np.array_equal(kept_by_coarse(folded, 16, asked, least=900).uv, found.uv)
+
+
+def test_rings_too_few_for_any_coarser_mesh(folded, asked):
+    assert kept_by_coarse(folded, 3, asked, least=900) is None
+    assert kept_by_coarse(folded, 20, asked, least=len(folded.V)) is None
+
+
+def test_what_the_coarse_way_tells_and_records(folded, asked):
+    steps = []
+    found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record=1), least=900)
+    assert steps == found.history
+    assert [step.iteration for step in steps] == [*range(len(steps))]
+    assert steps[-1].energy < steps[0].energy
+    (last,) = found.path
+    assert last.iteration == steps[-1].iteration
+    assert np.array_equal(last.uv, np.ldexp(found.uv, folded.exponent))
+
+
+def test_ctrl_c_on_the_coarse_mesh_hands_back_a_map_of_the_surface(folded, asked):
+    def stop(step):
+        if step.iteration == 1:
+            raise KeyboardInterrupt
+
+    found = kept_by_coarse(folded, 16, replace(asked, callback=stop), least=900)
+    assert found.status is Status.INTERRUPTED
+    assert len(found.uv) == len(folded.V)
+    assert certify(folded.F, found.uv).bijective
+
+
+@pytest.mark.slow
+def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh():
+    V, F = surfaces.cat(120)
+    assert len(F) > 50_000
+    plain, found = (flatten(V, F, **options) for options in ({}, {"energy": "distances"}))
+    sample = surface_distances(V, F, sources=300, targets=150)
+    assert found.stages[-1].name == "guarded descent, distances, coarse"
+    assert certify(F, found.uv).bijective
+    assert sample.error(found.uv).mean < 0.95 * sample.error(plain.uv).mean
+    # A map of one's own is descended from on the mesh itself.
+    given = flatten(V, F, energy="distances", start=plain.uv, max_iterations=1)
+    assert given.stages[-1].name == "guarded descent, distances"
+
+
 # --- as an energy of `flatten`
 
 
@@ -487,7 +562,7 @@ def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkey
     def cut_short(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(distance_descent, "surface_distances", cut_short)
+    monkeypatch.setattr(distance_descent, "sampled", cut_short)
     result = flatten(*dome, energy="distances", rings=6)
     assert result.status is Status.INTERRUPTED
     assert np.array_equal(result.uv, flatten(*dome).uv)

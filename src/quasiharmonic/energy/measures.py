@@ -179,6 +179,8 @@ class Distortion:
 def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Distortion:
     """Measure what a map does to every triangle of a surface.
 
+    What it does to distances between vertices farther apart is `quasiharmonic.distance_error`'s to say.
+
     Parameters
     ----------
     V : (n, 2) or (n, 3) array

@@ -113,7 +113,7 @@ def carried(
 def settled(
     V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
 ) -> tuple[FloatArray, bool]:
-    """A level's map after some steps down the symmetric Dirichlet energy, bijective, and whether it had to be guarded."""
+    """A level's map after steps down the symmetric Dirichlet energy, bijective, and whether it had to be guarded."""
     rim = Rim(level.loops)
     energy = thick_energy(V, level.F)
     if not guarded:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import (
     ComplexArray,
     FloatArray,
+    IntArray,
     check_finite,
     not_negative,
     real_array,
@@ -29,13 +30,16 @@ from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
-from quasiharmonic.flattening.distances import SurfaceDistances, surface_distances
+from quasiharmonic.flattening.distances import Sampling, SurfaceDistances, sampled
 from quasiharmonic.flattening.piece import Piece, Settings
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
-# The pairs that are kept: from so many vertices to so many others, along segments across so many edges. On a cortex of
-# 9,465 vertices twice as many pairs lower the error by a hundredth of it, half as many raise it by as much.
-_SOURCES, _TARGETS, _CROSSINGS = 2500, 120, 3
+# So many pairs are kept, along segments across so many edges. On a cortex of 9,465 vertices twice as many pairs lower
+# the error by a hundredth of it, half as many raise it by as much.
+_PAIRS, _CROSSINGS = 300_000, 3
+# The more sources the better, but what distances from one cost grows with the square of the rings: of sources times
+# that there are so many, within bounds.
+_WORK, _FEWEST, _MOST = 1_000_000, 1000, 4000
 # Gradients are followed until the residual has fallen to this share, or there were so many.
 _ACCURACY, _GRADIENTS = 0.1, 20
 
@@ -57,8 +61,9 @@ def keep_distances(
     What is lowered is the mean, over a sample of pairs of vertices at most ``rings`` edges apart, of how far their
     distance is off, as `distance_error` measures it but for errors below 30 % counting by their squares; and a small
     share of the symmetric Dirichlet energy, which keeps triangles from collapsing
-    (`quasiharmonic.flattening.distance_energy`). The sample has 2,500 vertices, or all if there are
-    no more, with 120 others each, drawn at random, always the same.
+    (`quasiharmonic.flattening.distance_energy`). The sample has 2,500 vertices, or all if there are no more, with 120
+    others each, drawn at random, always the same; for fewer rings up to 4,000 vertices, for more down to 1,000, and
+    300,000 pairs in all.
 
     Parameters
     ----------
@@ -152,36 +157,22 @@ def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first:
         As `keep_distances` makes it, ``uv`` in the piece's unit and ``path`` in the surface's.
     """
     began = time.perf_counter()
-    n = len(piece.V)
-    distances = surface_distances(
-        piece.V, piece.F, rings=rings, sources=_SOURCES, targets=_TARGETS, crossings=_CROSSINGS
-    )
-    start = _in_scale(uv, distances, piece)
+    distances = sampled(piece.V, piece.F, sampling_of(rings))
+    start = in_scale(uv, distances, piece.F, piece.loops)
     with np.errstate(all="ignore"):
-        energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), n)
+        energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), len(piece.V))
         descent = DistanceDescent(energy, start, settings.linear_solver, Rim(piece.loops))
     history: list[Step] = []
     path: list[Snapshot] = []
 
-    def report() -> None:
-        history.append(Step(first + len(history), 0, descent.distortion))
+    def report(value: float) -> None:
+        history.append(Step(first + len(history), 0, value))
         if settings.record and history[-1].iteration % settings.record == 0:
             path.append(Snapshot(history[-1].iteration, np.ldexp(descent.uv, piece.exponent)))
         if settings.callback is not None:
             settings.callback(history[-1])
 
-    status = Status.STILL_FALLING
-    try:
-        report()
-        for _ in range(settings.max_iterations):
-            with np.errstate(all="ignore"):
-                outcome = descent.step(settings.tolerance)
-            report()
-            if outcome is not None and not descent.ease():
-                status = outcome
-                break
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
+    status = followed(descent, settings, report)
     seconds = time.perf_counter() - began
     energies = history[0].energy, descent.distortion
     return MapResult(
@@ -194,6 +185,47 @@ def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first:
         linear_solver=descent.system.solver.name,
         seconds=seconds,
     )
+
+
+def sampling_of(rings: int) -> Sampling:
+    """The pairs that a descent keeps: as many whatever the rings, from fewer sources where these are many."""
+    sources = int(np.clip(_WORK // rings**2, _FEWEST, _MOST))
+    return Sampling(rings, sources, _PAIRS // sources, _CROSSINGS)
+
+
+def in_scale(uv: FloatArray, distances: SurfaceDistances, F: IntArray, loops: list[IntArray]) -> FloatArray:
+    """A bijective map scaled such that its distances are nearest to the surface's, its middle at the origin."""
+    # A power of two first, so that squares of lengths neither overflow nor vanish.
+    uv = np.ldexp(uv, -int(np.frexp(np.ptp(uv, axis=0).max())[1]))
+    scale = distances.error(uv).scale
+    scaled = scale * (uv - uv.mean(axis=0))
+    if certify(F, scaled, loops=loops).bijective:
+        return scaled
+    # Triangles so thin that rounding inverts them: powers of two leave them as they are.
+    return np.ldexp(uv, int(np.rint(np.log2(scale))))
+
+
+def followed(descent: DistanceDescent, settings: Settings, report: Callable[[float], None]) -> Status:
+    """Take steps until there is no other to take, or Ctrl-C comes.
+
+    Parameters
+    ----------
+    descent : DistanceDescent
+    settings : Settings
+    report : callable
+        Called with the energy at the start and after every step.
+    """
+    try:
+        report(descent.distortion)
+        for _ in range(settings.max_iterations):
+            with np.errstate(all="ignore"):
+                outcome = descent.step(settings.tolerance)
+            report(descent.distortion)
+            if outcome is not None and not descent.ease():
+                return outcome
+    except KeyboardInterrupt:
+        return Status.INTERRUPTED
+    return Status.STILL_FALLING
 
 
 class DistanceDescent(GuardedDescent):
@@ -238,18 +270,6 @@ class DistanceDescent(GuardedDescent):
             now, before = _dot(residual, preconditioned), now
             step, by_matrix = preconditioned + now / before * step, residual + now / before * by_matrix
         return direction
-
-
-def _in_scale(uv: FloatArray, distances: SurfaceDistances, piece: Piece) -> FloatArray:
-    """A bijective map scaled such that its distances are nearest to the surface's, its middle at the origin."""
-    # A power of two first, so that squares of lengths neither overflow nor vanish.
-    uv = np.ldexp(uv, -int(np.frexp(np.ptp(uv, axis=0).max())[1]))
-    scale = distances.error(uv).scale
-    scaled = scale * (uv - uv.mean(axis=0))
-    if certify(piece.F, scaled, loops=piece.loops).bijective:
-        return scaled
-    # Triangles so thin that rounding inverts them: powers of two leave them as they are.
-    return np.ldexp(uv, int(np.rint(np.log2(scale))))
 
 
 def _dot(a: ComplexArray, b: ComplexArray) -> float:

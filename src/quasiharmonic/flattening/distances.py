@@ -213,7 +213,15 @@ def surface_distances(
     return sampled(V, F, Sampling(rings, sources, targets, crossings), seed=seed)
 
 
-def sampled(V: FloatArray, F: IntArray, sampling: Sampling, *, seed: int = 0, lowest: float = 0.0) -> SurfaceDistances:
+def sampled(
+    V: FloatArray,
+    F: IntArray,
+    sampling: Sampling,
+    *,
+    seed: int = 0,
+    among: IntArray | None = None,
+    lowest: float = 0.0,
+) -> SurfaceDistances:
     """Distances as `surface_distances` samples them, its arguments checked.
 
     Parameters
@@ -223,15 +231,20 @@ def sampled(V: FloatArray, F: IntArray, sampling: Sampling, *, seed: int = 0, lo
     sampling : Sampling
         How many sources there are to be at most.
     seed : int
+    among : (m,) int64, optional
+        Vertices of which pairs are made, ascending; all that triangles have by default.
     lowest : float
         As `straight_segments` has it.
     """
     dice = np.random.default_rng(seed)
-    used = np.unique(F)
+    used = np.unique(F) if among is None else among
     source = used if sampling.sources >= used.size else np.sort(dice.choice(used, sampling.sources, replace=False))
     source = source[_along_curve(V[source])]
     edges = edge_graph(F, len(V))
     row, target = neighbours_within(edges, source, sampling.rings)
+    if among is not None:
+        own = np.isin(target, among)
+        row, target = row[own], target[own]
     if sampling.targets is not None:
         kept = _some_of_each(row, sampling.targets, dice)
         row, target = row[kept], target[kept]

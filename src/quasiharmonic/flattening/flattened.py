@@ -31,10 +31,11 @@ from quasiharmonic.energy.deformation import positive_weights
 from quasiharmonic.energy.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify, flipped_triangles
+from quasiharmonic.flattening.distance_cascade import kept_by_coarse
 from quasiharmonic.flattening.distance_descent import kept
 from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
 from quasiharmonic.flattening.parts import Part, furthest_last, parts_of
-from quasiharmonic.flattening.piece import Flattening, Piece, Settings
+from quasiharmonic.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
 from quasiharmonic.result import MapResult, Status, Step
 
 # A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
@@ -76,7 +77,8 @@ def flatten(
         What is lowered, the mean over the surface's area: ``"symmetric-dirichlet"``, ``"mips"`` (angles alone),
         ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`. Or ``"distances"``: the symmetric
         Dirichlet energy first, and then how far distances between vertices some edges apart are off, as
-        `quasiharmonic.keep_distances` lowers it; without pins and weights.
+        `quasiharmonic.keep_distances` lowers it; without pins and weights. From 50,000 triangles on that is done on
+        a coarse mesh, if no ``start`` is given, and of its steps ``path`` has none but the map at the end.
     weights : (f,) array, optional
         How much each triangle's distortion counts; positive, 1 by default.
     start : (n, 2) array, optional
@@ -178,11 +180,10 @@ def flatten(
             # The others still need a place, if not their best one.
             settings = replace(settings, max_iterations=0, callback=None)
         uv = None if given is None else np.ldexp(given[vertices], -piece.exponent)
-        run = Flattening(piece, settings, None if weights is None else weights[triangles])
-        result = run.run(uv)
-        if of_distances and result.status is not Status.INTERRUPTED:
-            result = _with_distances(piece, result, rings, replace(settings, tolerance=_SAMPLED * tolerance))
-        results.append(result)
+        if of_distances:
+            results.append(_with_distances(piece, uv, rings, settings))
+        else:
+            results.append(Flattening(piece, settings, None if weights is None else weights[triangles]).run(uv))
     # Where pins have put something, that stays.
     first = len(results) - len(free)
     placed = [result.uv for result in results[:first]]
@@ -241,10 +242,18 @@ def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
     return pieces
 
 
-def _with_distances(piece: Piece, found: MapResult, rings: int, settings: Settings) -> MapResult:
-    """A piece's map after the descent of distances; the one at hand if Ctrl-C comes before there is another."""
+def _with_distances(piece: Piece, start: FloatArray | None, rings: int, settings: Settings) -> MapResult:
+    """A piece's map with distances kept; the one without if Ctrl-C comes before there is another."""
+    sampled = replace(settings, tolerance=_SAMPLED * settings.tolerance)
+    if start is None and settings.max_iterations and len(piece.F) >= COARSE_FROM:
+        by_coarse = kept_by_coarse(piece, rings, sampled)
+        if by_coarse is not None:
+            return by_coarse
+    found = Flattening(piece, settings, None).run(start)
+    if found.status is Status.INTERRUPTED:
+        return found
     try:
-        then = kept(piece, found.uv, rings, settings, first=len(found.history))
+        then = kept(piece, found.uv, rings, sampled, first=len(found.history))
     except KeyboardInterrupt:
         return replace(found, status=Status.INTERRUPTED)
     return replace(

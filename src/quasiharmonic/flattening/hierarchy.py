@@ -99,6 +99,10 @@ class Hierarchy:
         left = self._left()
         return max((stop for stop in self.stops if left[stop] >= least), default=0)
 
+    def finer(self, stop: int) -> int:
+        """The stop before one."""
+        return self.stops[self.stops.index(stop) - 1]
+
     def _left(self) -> IntArray:
         """How many vertices there are after none, one, … of the rounds."""
         removed = [0, *(sum(vertices.size for vertices, _ in removals) for removals in self._coarsening.rounds)]

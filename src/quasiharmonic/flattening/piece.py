@@ -24,8 +24,8 @@ from quasiharmonic.flattening.start import disk_start
 from quasiharmonic.problem import Domain
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
-# From so many triangles on the start is flattened by way of coarse meshes.
-_COARSE_FROM = 50_000
+#: From so many triangles on a surface is flattened by way of coarse meshes.
+COARSE_FROM = 50_000
 # A mean energy below this is near enough to the least for Newton's own steps.
 _NEAR = 1.0
 # Energies are equal if they differ by no more than this part of them.
@@ -205,7 +205,7 @@ class Flattening:
         began = time.perf_counter()
         piece, solver = self._piece, self._settings.linear_solver
         uv = None
-        if len(piece.F) < _COARSE_FROM:
+        if len(piece.F) < COARSE_FROM:
             uv = disk_start(piece.V, piece.F, piece.loops, solver)
         if uv is None:
             uv = coarse_start(piece.V, piece.F, piece.loops, solver)
