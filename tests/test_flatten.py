@@ -10,6 +10,7 @@ from quasiharmonic.energy.derivatives import check_energy
 from quasiharmonic.energy.energies import Deformation, Isotropic, SymmetricDirichlet
 from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.exact.certificate import certify
+from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.layout import laid_along_axis
 from quasiharmonic.flattening.reweighted import ReweightedDirichlet
@@ -328,6 +329,35 @@ def test_the_proxies_have_the_energy_s_slope_and_are_convex():
     by_p, by_q = energy.gradient(d)
     np.testing.assert_allclose(-along_p, by_p, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(-along_q, by_q, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "goals"), [((1e-4, 1e-5), (3e-4, 3e-5)), ((0.5, 1e-2), (1, 3e-2)), ((9, 0.4), (3, 1))]
+)
+def test_a_proxy_aims_at_no_more_than_so_many_times_a_triangle_s_size(sizes, goals):
+    """Its step changes the singular values to the goals; directions stay."""
+    along_p, along_q = np.exp(0.3j), np.exp(1.1j)
+
+    def halves(first, second):
+        return np.array([(first + second) / 2 * along_p]), np.array([(first - second) / 2 * along_q])
+
+    p, q = halves(*sizes)
+    to_p, to_q = halves(*goals)
+    energy, at = ReweightedDirichlet(aim=3), Deformation.of(p, q)
+    pull = energy.curvature(at).apply(to_p - p, to_q - q)
+    np.testing.assert_allclose(np.negative(pull), energy.gradient(at), rtol=1e-9)
+
+
+def test_how_much_of_a_boundary_is_tangled():
+    """A strip of which two edges cross two others; the rest of its boundary is free."""
+    strip, F = grid(9, 2)
+    (loop,) = boundary_loops(F, len(strip))
+    rim = Rim([loop])
+    assert rim.tangled(strip) == 0
+    crossed = strip.copy()
+    upper = np.flatnonzero(strip[:, 1] == 1)
+    crossed[upper[np.argsort(strip[upper, 0])][4], 1] = -1
+    assert rim.tangled(crossed) == 6 / loop.size
 
 
 def test_loops_are_the_surface_s():

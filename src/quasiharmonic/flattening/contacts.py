@@ -168,6 +168,10 @@ class Rim:
         pairs = contacts(uv, self._edges, _MOST_MEETINGS).pairs
         return np.unique(np.concatenate([short.ravel(), self._edges[pairs].ravel()]))
 
+    def tangled(self, uv: FloatArray) -> float:
+        """The share of the boundary's vertices at the ends of edges that meet; of the first thousand pairs at least."""
+        return self.meetings(uv).size / self._vertex.size
+
     def contacts(self, w: ComplexArray) -> Contacts:
         """Pairs that are near each other across what is outside the surface.
 

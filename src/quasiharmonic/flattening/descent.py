@@ -204,8 +204,10 @@ class GuardedDescent(FreeDescent):
         """As of `NewtonDescent`; besides, the boundary does not meet itself, and no gap becomes much narrower."""
         value, there = super().tried(w, bound)
         if there is not None:
-            near = None if self._rim.meets_itself(self.positions(w)) else self._rim.contacts(w)
-            if near is None or near.room(w) < _NARROWER * min(self._near.room(self.w), _NARROWER):
+            near = self._rim.contacts(w)
+            # Pairs that only face each other since count by how near they were, or no step might be short enough.
+            before = min(self._near.room(self.w), near.room(self.w), _NARROWER)
+            if near.room(w) < _NARROWER * before or self._rim.meets_itself(self.positions(w)):
                 return value, None
             self._ahead = near
         return value, there
@@ -246,6 +248,8 @@ def descend(descent: FreeDescent, density: Energy, tolerance: float) -> Iterator
     values = [np.inf, descent.distortion]
     far = isinstance(descent.surface.energy, ReweightedDirichlet)
     while True:
+        if far:
+            descent.surface.energy = ReweightedDirichlet.at(descent.distortion / float(descent.surface.share.sum()))
         with np.errstate(all="ignore"):
             outcome = descent.step(tolerance)
         values.append(descent.distortion)

@@ -33,6 +33,9 @@ _SAME = 1e-6
 # Of so many last maps of a free descent the latest is looked for that is bijective, if its energy is at most so many
 # times the last one's: far from that the start is the better place to begin anew.
 _RECENT, _NOT_FAR = 12, 10.0
+# Every so many steps of a free descent it is looked whether so much of the boundary has met itself that it will not
+# come apart again.
+_LOOK_EVERY, _TANGLED = 8, 0.1
 
 
 @dataclass(frozen=True)
@@ -246,10 +249,12 @@ class Flattening:
         try:
             self._report(descent)
             course = descend(descent, settings.density, settings.tolerance)
-            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):  # noqa: B007
+            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):
                 status = outcome or status
                 recent.append((self._measure.value(descent.w), descent.uv))
                 self._report(descent)
+                if not guarded and steps % _LOOK_EVERY == 0 and self._rim.tangled(descent.uv) > _TANGLED:
+                    break
         finally:
             # Also what Ctrl-C has left half done may be a better map than there was.
             last = self._measure.value(descent.w)

@@ -6,6 +6,11 @@ at rest, and a step goes as far in its direction as other triangles allow [1]_: 
 by a factor of two or three a step falls by a factor of a hundred. Near the minimum the proxies forget how triangles
 resist shear, and Newton's own second derivatives are better.
 
+Where sizes span many orders of magnitude, as along a limb that a disk has shrunk to nothing, the smallest triangles
+would be far ahead of all others: they end the step before anything else has moved. So no triangle aims at more than
+so many times its own size: the proxy is ``k/2 (σ − σ*)²`` with ``σ*`` between ``σ/aim`` and ``aim · σ``, and all of the
+limb grows at once.
+
 References
 ----------
 .. [1] M. Rabinovich, R. Poranne, D. Panozzo, O. Sorkine-Hornung, Scalable locally injective mappings. ACM Transactions
@@ -19,24 +24,43 @@ import numpy as np
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.energy.energies import Deformation, QuadraticForm, SymmetricDirichlet, inverse
 
+#: How far a triangle aims at least and at most, in multiples of its size.
+NEAREST, FARTHEST = 5.0, 1000.0
+
 
 class ReweightedDirichlet(SymmetricDirichlet):
-    """Values and first derivatives of `SymmetricDirichlet`, second derivatives of its rigid proxies."""
+    """Values and first derivatives of `SymmetricDirichlet`, second derivatives of its rigid proxies.
+
+    Parameters
+    ----------
+    aim : float
+        Singular values are to become at most so many times as large or as small, and 1 where that is nearer; above 1.
+    """
+
+    def __init__(self, aim: float = FARTHEST) -> None:
+        self.aim = aim
+
+    @classmethod
+    def at(cls, mean: float) -> ReweightedDirichlet:
+        """For a map of this mean energy: it aims as far as an average triangle has to go, ``σ⁻² = mean``."""
+        return cls(min(max(mean**0.5, NEAREST), FARTHEST))
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """That of ``½ Σ kᵢ ‖uᵢᵀ (J − R)‖²`` with the left singular vectors uᵢ and the rotation R held.
+        """That of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with left singular vectors uᵢ, goals σᵢ* and rotation R held.
 
         ``negative`` plays no part: the form is positive definite.
         """
         size_p, size_q = np.abs(d.p), np.abs(d.q)
         larger = size_p + size_q
-        k1, k2 = _factor(larger), _factor(d.det / larger)
+        k1, k2 = self._factor(larger), self._factor(d.det / larger)
         # Twice the angle of u₁ is that of p q; a triangle that is not sheared has no u₁, and k₁ = k₂.
         turn = (d.p * d.q).conj() * inverse(size_p) * inverse(size_q)
         none = np.zeros(turn.shape, dtype=np.complex128)
         return QuadraticForm(pp=k1 + k2, qq=k1 + k2, p2=none, q2=none, pq=2 * (k1 - k2) * turn, pqc=none)
 
-
-def _factor(sigma: FloatArray) -> FloatArray:
-    """``(2σ − 2σ⁻³)/(σ − 1)``."""
-    return 2 * (sigma + 1) * (sigma**2 + 1) / sigma**3
+    def _factor(self, sigma: FloatArray) -> FloatArray:
+        """``(2σ − 2σ⁻³)/(σ − σ*)``, positive at ``σ = σ* = 1`` too."""
+        rigid = 2 * (sigma + 1) * (sigma**2 + 1) / sigma**3
+        # Of σ − 1 and σ − σ* the first is the longer way where σ* is held back.
+        held = np.where(sigma < 1, (self.aim - 1) * sigma, (1 - 1 / self.aim) * sigma)
+        return rigid * np.maximum(1, np.abs(sigma - 1) / held)
