@@ -112,6 +112,24 @@ class TestDisks:
         V[F[100, 1]] = V[F[100, 0]]
         assert parts(V, F, find_cuts(V, F)) == [(1, 1)]
 
+    @pytest.mark.slow
+    @pytest.mark.parametrize("seed", range(60))
+    def test_of_whatever_comes(self, seed):
+        """Any number of handles, holes and components that touch, edges given at random, any proportions."""
+        rng = np.random.default_rng(seed)
+        V, F = blocks(rng.random(rng.integers(1, 5, 3)) < rng.choice([0.5, 0.75, 0.95]), rounds=rng.integers(0, 3))
+        F = F[rng.random(len(F)) >= rng.choice([0, 0.05, 0.3])]
+        found = edges(F, len(V))
+        F = F[~np.isin(F, [*found.nonmanifold.ravel(), *found.inconsistent.ravel()]).any(axis=1)]
+        if not F.size:
+            return
+        inner = edges(F, len(V)).interior
+        given = inner[rng.random(len(inner)) < rng.choice([0, 0.05, 0.3])]
+        spared = inner[rng.random(len(inner)) < rng.choice([0, 0.2])]
+        V = V * 10.0 ** rng.uniform(-3, 0, 3)
+        cut = find_cuts(V, F, edges=given, uncut=spared, gain=rng.choice([0.01, 0.1, np.inf]))
+        assert set(parts(V, F, cut)) == {(1, 1)}
+
 
 class TestShortest:
     def test_two_edges_of_a_tetrahedron(self):

@@ -138,7 +138,6 @@ def test_cortex(example):
 
 
 def test_creatures(example):
-    pytest.importorskip("igl")
     numbers = example("creatures", size=36)
     for name, most in (("octopus", 0.45), ("armadillo", 0.8)):
         one, every = (numbers[name][cut] for cut in ("one cut", "a cut to every limb"))
@@ -372,7 +371,6 @@ def test_channel(example):
 
 
 def test_cut(example):
-    pytest.importorskip("igl")
     numbers = example("cut")
     assert [row["handles"] for row in numbers.values()] == [0, 1, 2]
     assert all(row["exit status"] == 0 and row["bijective"] for row in numbers.values())

@@ -91,6 +91,6 @@ def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
     optional = (ROOT / ".ci" / "optional").read_text(encoding="utf-8")
     assert "'.[test,view,cortex]' gmsh vtk" in optional
     assert "scikit-sparse" in optional
-    assert {"igl", "polyscope"} <= wanted
+    assert {"shapely", "polyscope"} <= wanted
     known = f"{installed} {' '.join(extras['view'] + extras['cortex'])}"
     assert not [name for name in wanted if name not in sys.stdlib_module_names and name not in known]
