@@ -31,6 +31,7 @@ from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
 from quasiharmonic.flattening.distances import SurfaceDistances, surface_distances
 from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.hearing import heard
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
 # The pairs that are kept: from so many vertices to so many others, along segments across so many edges. On a cortex of
@@ -40,6 +41,7 @@ _SOURCES, _TARGETS, _CROSSINGS = 2500, 120, 3
 _ACCURACY, _GRADIENTS = 0.1, 20
 
 
+@heard
 def keep_distances(
     V: ArrayLike,
     F: ArrayLike,
@@ -78,7 +80,8 @@ def keep_distances(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step.
+        Called with a `Step` at the start and after every step, and with the last one again at least every half second
+        in between, but not within a single factorisation.
     record : int
         Keep the map of every ``record``-th step in the result's ``path``; none of them by default.
 
