@@ -23,6 +23,7 @@ from quasiharmonic.search.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
 from shared.meshes import boundary_of, lift, random_annulus, signed_areas
+from shared.told import Told
 
 
 def meshes():
@@ -184,7 +185,7 @@ class TestSearch:
 
         monkeypatch.setattr(Laplacian, "factor", recorded)
         problem = posed.moved(posed.target)
-        steps = []
+        steps = Told()
         result = solve(problem, callback=steps.append)
         assert result.injective
         assert [s.name.split(",")[0] for s in result.stages] == ["coarse-to-fine"]

@@ -22,6 +22,7 @@ from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.geodesics import straight_segments
 from quasiharmonic.flattening.piece import Piece, Settings
 from quasiharmonic.result import Status
+from shared.told import Told
 
 
 def rolled(V, radius):
@@ -310,7 +311,7 @@ def test_distances_are_kept_better_and_the_map_stays_bijective(dome):
     V, F = dome
     # All of the dome, seen from above: the rim is pressed together.
     start = V[:, :2]
-    steps = []
+    steps = Told()
     result = keep_distances(V, F, start, rings=8, callback=steps.append)
     before, after = (distance_error(V, F, uv, rings=8) for uv in (start, result.uv))
     assert result.status is Status.POLISHED

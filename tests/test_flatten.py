@@ -17,6 +17,7 @@ from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid
+from shared.told import Told
 
 
 def cylinder(turns, cells=(90, 6), height=0.6, radius=1.0, steep=0.0):
@@ -240,7 +241,7 @@ class TestOptions:
 
     def test_iterations_callback_and_record(self):
         V, F = cat(8)
-        seen = []
+        seen = Told()
         result = flatten(V, F, max_iterations=3, callback=seen.append, record=2)
         assert result.status is Status.STILL_FALLING
         assert result.certificate.bijective

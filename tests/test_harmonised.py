@@ -20,6 +20,7 @@ from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length
 from shared.meshes import bend, boundary_of, lift, random_xi
+from shared.told import Told
 
 BARRIERS = {"mips", "symmetric-dirichlet"}
 
@@ -298,7 +299,7 @@ class TestHarmonise:
 
     def test_steps_stages_and_interruption(self):
         V, F, uv, fixed = bowl()
-        seen = []
+        seen = Told()
         result = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, callback=seen.append)
         assert seen == result.history
         assert [step.iteration for step in seen] == list(range(len(seen)))

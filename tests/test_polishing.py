@@ -19,6 +19,7 @@ from quasiharmonic.result import Status
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import bend, boundary_of, lift
 from shared.polygons import circle
+from shared.told import Told
 
 
 def twisted(V, turns=0.2):
@@ -259,7 +260,7 @@ def test_other_linear_solvers(linear_solver):
 
 def test_steps_are_reported_as_they_happen():
     V, F, uv, fixed = bowl()
-    seen = []
+    seen = Told()
     result = polish(V, F, uv, fixed=fixed, callback=seen.append)
     assert seen == result.history
     assert [step.iteration for step in seen] == list(range(len(seen)))

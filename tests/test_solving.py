@@ -24,6 +24,7 @@ from shared.exact import inverted
 from shared.meshes import bend, boundary_of, lift, signed_areas
 from shared.obstructed import OBSTRUCTED
 from shared.solvable import star_problem, turned_ring
+from shared.told import Told
 
 
 class TestFinds:
@@ -189,7 +190,7 @@ class TestPromises:
         assert inverted(F, result.uv) == 0
 
     def test_callback_sees_every_step_and_strategy_can_be_spelled_out(self):
-        seen = []
+        seen = Told()
         stages = [
             LBFGS(parameterisation="si-log", functional="neumann", reference="rest"),
             Newton(resume=True),

@@ -22,6 +22,7 @@ from quasiharmonic.arrays import (
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Step
@@ -66,6 +67,7 @@ class Morphed:
         }
 
 
+@heard
 def morph(
     points: ArrayLike,
     F: ArrayLike,
@@ -98,7 +100,8 @@ def morph(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every iteration.
+        Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
+        not within a single factorisation.
     slide : bool or Rails
         Let the boundary vertices that are not moved glide along their outline, its corners held, as nodes on the walls
         of a channel do: along the curves of `quasiharmonic.curves.Rails`, or with True along the polygon that the

@@ -24,6 +24,7 @@ from quasiharmonic.arrays import (
 from quasiharmonic.atlas.verdict import is_mirrored
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Diagnosis
+from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.seams import Island, SeamedMesh
 from quasiharmonic.result import Step
 
@@ -147,6 +148,7 @@ class Repaired:
         }
 
 
+@heard
 def repair(
     V: ArrayLike,
     F: ArrayLike,
@@ -186,7 +188,8 @@ def repair(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every iteration.
+        Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
+        not within a single factorisation.
 
     Returns
     -------

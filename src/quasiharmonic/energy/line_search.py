@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
+from quasiharmonic.hearing import still_at_it
+
 S = TypeVar("S")
 
 # Fraction of the decrease that the gradient promises which a step must achieve (Armijo's condition).
@@ -70,6 +72,7 @@ def backtrack(
     """
     t = longest
     for _ in range(tries):
+        still_at_it()
         value, there = trial(t, before - _SUFFICIENT * min(t, 1.0) * promise)
         if there is not None:
             return Taken(t, value, there)
@@ -90,6 +93,7 @@ def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf")) -> Tak
         The longest length.
     """
     while taken.t >= 1 and 2 * taken.t <= limit:
+        still_at_it()
         value, there = trial(2 * taken.t, taken.value)
         if there is None:
             break

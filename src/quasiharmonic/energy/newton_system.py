@@ -14,6 +14,7 @@ from scipy.sparse import csr_array, triu
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
 from quasiharmonic.energy.energies import QuadraticForm
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
 from quasiharmonic.mesh.topology import edge_keys
 
@@ -106,6 +107,7 @@ class NewtonSystem:
         form : QuadraticForm
             On every triangle, with its area and weight in it.
         """
+        still_at_it()
         for slot, part in zip(self._side_slots, _blocks(form, self._side_products, self._work), strict=True):
             self._values[slot] = self._sum_sides @ part.ravel()
         xx, xy, _, yy = _blocks(form, self._corner_products, self._work)

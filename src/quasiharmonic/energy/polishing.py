@@ -24,6 +24,7 @@ from quasiharmonic.energy.energies import (
 from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
 from quasiharmonic.energy.sliding import SlidingDescent, lay_boundary
 from quasiharmonic.exact.certificate import certify, flipped_triangles
+from quasiharmonic.hearing import heard
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
 
@@ -36,6 +37,7 @@ ENERGIES: dict[str, Energy] = {
 }
 
 
+@heard
 def polish(
     V: ArrayLike,
     F: ArrayLike,
@@ -83,7 +85,8 @@ def polish(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step; its ``energy`` is the mean energy.
+        Called with a `Step` at the start and after every step, and with the last one again at least every half second
+        in between, but not within a single factorisation; its ``energy`` is the mean energy.
     slide : bool or Rails
         Let boundary vertices glide along the outline, in their order, its corners held: along the curves of
         `quasiharmonic.curves.Rails`, or with True along the polygon that the boundary is in ``uv``, whose corners are
@@ -135,6 +138,7 @@ def polish(
     return replace(result, seconds=time.perf_counter() - began)
 
 
+@heard
 def polish_map(
     domain: Domain,
     uv: ArrayLike,

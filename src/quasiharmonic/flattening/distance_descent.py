@@ -32,6 +32,7 @@ from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
 from quasiharmonic.flattening.distances import Sampling, SurfaceDistances, sampled
 from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.hearing import heard
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
 # So many pairs are kept, along segments across so many edges. On a cortex of 9,465 vertices twice as many pairs lower
@@ -44,6 +45,7 @@ _WORK, _FEWEST, _MOST = 1_000_000, 1000, 4000
 _ACCURACY, _GRADIENTS = 0.1, 20
 
 
+@heard
 def keep_distances(
     V: ArrayLike,
     F: ArrayLike,
@@ -83,7 +85,8 @@ def keep_distances(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step.
+        Called with a `Step` at the start and after every step, and with the last one again at least every half second
+        in between, but not within a single factorisation.
     record : int
         Keep the map of every ``record``-th step in the result's ``path``; none of them by default.
 

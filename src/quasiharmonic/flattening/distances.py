@@ -26,11 +26,14 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, real_array, whole_number
 from quasiharmonic.flattening.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
+from quasiharmonic.hearing import still_at_it
 
 # The farthest vertices are looked for up to so many mean edges for each ring.
 _REACH = 1.3
 # Cells of the curve that visits sources: 2^BITS along the longest side of their bounding box.
 _BITS = 10
+# Pairs of which some are drawn at a time, about.
+_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -321,9 +324,18 @@ def _along_curve(points: FloatArray) -> IntArray:
 
 def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArray:
     """Which of the entries to keep such that at most so many are left of each row; ``row`` is ascending."""
-    order = np.argsort(row + dice.random(row.size))
-    place = np.arange(row.size) - np.searchsorted(row, row)
-    return np.sort(order[place < most])
+    key = row + dice.random(row.size)
+    kept = []
+    begin = 0
+    while begin < row.size:
+        still_at_it()
+        end = int(np.searchsorted(row, row[min(begin + _AT_ONCE, row.size) - 1], side="right"))
+        part = row[begin:end]
+        order = np.argsort(key[begin:end])
+        place = np.arange(part.size) - np.searchsorted(part, part)
+        kept.append(begin + np.sort(order[place < most]))
+        begin = end
+    return np.concatenate([np.empty(0, dtype=np.int64), *kept])
 
 
 def _best_scale(ratio: FloatArray) -> float:

@@ -36,12 +36,14 @@ from quasiharmonic.flattening.distance_descent import kept
 from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
 from quasiharmonic.flattening.parts import Part, furthest_last, parts_of
 from quasiharmonic.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
+from quasiharmonic.hearing import heard
 from quasiharmonic.result import MapResult, Status, Step
 
 # A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
 _SAMPLED = 10.0
 
 
+@heard
 def flatten(
     V: ArrayLike,
     F: ArrayLike,
@@ -101,8 +103,9 @@ def flatten(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step; its ``energy`` is the mean of what is being lowered. It
-        may raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
+        Called with a `Step` at the start and after every step, and with the last one again at least every half second
+        in between, but not within a single factorisation; its ``energy`` is the mean of what is being lowered. It may
+        raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
     record : int
         Keep the map of every ``record``-th step in the result's ``path``, before it is laid out; none of them by
         default, and none of several pieces.

@@ -24,11 +24,14 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, named
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.mesh.shapes import rest_shapes
 
 # From so many vertices together distances are taken in what is around them all, ...
@@ -86,6 +89,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
         edge = twin[edge]
         inner = edge >= 0
         edge, source, a, b, low, high = edge[inner], source[inner], a[inner], b[inner], low[inner], high[inner]
+        still_at_it()
         # Across the edge, which is traversed from ``b`` to ``a`` there.
         c = b + height[edge] * (a - b)
         left, right = _cross(low, c) > 0, _cross(c, high) > 0
@@ -174,9 +178,11 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
     return length
 
 
-def _portions(sources: IntArray) -> list[tuple[int, IntArray]]:
+def _portions(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
     """Sources in portions, and where each portion begins."""
-    return [(start, sources[start : start + _AT_A_TIME]) for start in range(0, sources.size, _AT_A_TIME)]
+    for start in range(0, sources.size, _AT_A_TIME):
+        still_at_it()
+        yield start, sources[start : start + _AT_A_TIME]
 
 
 def _around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:

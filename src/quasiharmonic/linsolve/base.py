@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import FloatArray
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.linsolve.guard import ResidualTest
 
@@ -66,6 +67,7 @@ class LinearSolver(ABC):
         self._ready = False
         self._closed = False
         if self.n:
+            still_at_it()
             self._test = ResidualTest(self._indptr, self._indices, self._values)
             self._analyse()
 
@@ -92,6 +94,7 @@ class LinearSolver(ABC):
         values = np.asarray(values)
         if values.shape != (self.nnz,):
             raise ValueError(f"values has shape {values.shape}; the analysed pattern has {self.nnz} entries")
+        still_at_it()
         with self._lock:
             self._require_open()
             self._ready = False
@@ -127,6 +130,7 @@ class LinearSolver(ABC):
         given = np.asarray(rhs, dtype=np.float64)
         if given.ndim not in (1, 2) or given.shape[0] != self.n:
             raise ValueError(f"right-hand side has shape {given.shape}; expected ({self.n},) or ({self.n}, k)")
+        still_at_it()
         b = np.asfortranarray(given.reshape(self.n, -1) if given.size else np.zeros((self.n, 0)))
         with self._lock:
             self._require_open()

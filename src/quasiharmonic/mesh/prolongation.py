@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.mesh.coarsening import Coarsening, touching
 
 # A triangle's squared sides over twice its area are 2√3 = 3.5 when it is equilateral. Below this on average a vertex
@@ -42,6 +43,7 @@ def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> Complex
     w = w.copy()
     for number in reversed(range(len(coarsening.rounds))):
         for vertices, rings in coarsening.rounds[number]:
+            still_at_it()
             w[vertices] = places(w[rings])
         if number in coarsening.levels:
             _smooth(w, coarsening.levels[number], held)

@@ -28,6 +28,7 @@ from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.exact.diagnosis import diagnose
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.regularisers import Conformal
+from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Status, Step
@@ -47,6 +48,7 @@ BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
 ETA = (0.1, 0.1, 0.01, 0.001)
 
 
+@heard
 def harmonise(
     V: ArrayLike,
     F: ArrayLike,
@@ -107,7 +109,8 @@ def harmonise(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every map on the way; its ``energy`` is E + κR₁.
+        Called with a `Step` at every map on the way, and with the last one again at least every half second in between,
+        but not within a single factorisation; its ``energy`` is E + κR₁.
 
     Returns
     -------
@@ -158,6 +161,7 @@ def harmonise(
     return replace(result, seconds=time.perf_counter() - began)
 
 
+@heard
 def harmonise_map(
     domain: Domain,
     uv: ArrayLike,

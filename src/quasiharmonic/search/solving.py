@@ -23,6 +23,7 @@ from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH
+from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.result import MapResult, Status, Step
@@ -30,6 +31,7 @@ from quasiharmonic.search.stages import Search, Stages
 from quasiharmonic.search.strategy import stages_of
 
 
+@heard
 def injective_map(
     V: ArrayLike,
     F: ArrayLike,
@@ -73,8 +75,9 @@ def injective_map(
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every iteration. It may raise `KeyboardInterrupt`, on a clock of its own for instance,
-        which ends the search as Ctrl-C does.
+        Called with a `Step` at every iteration, and with the last one again at least every half second in between:
+        while patches are tried, say, or a diagnosis is made, but not within a single factorisation. It may raise
+        `KeyboardInterrupt`, on a clock of its own for instance, which ends the search as Ctrl-C does.
     record : int
         Keep the map of every ``record``-th iteration in the result's ``path``; none of them by default.
     slide : bool or Rails
@@ -125,6 +128,7 @@ def injective_map(
     return replace(result, seconds=time.perf_counter() - began)
 
 
+@heard
 def solve(
     problem: Problem,
     *,

@@ -6,6 +6,7 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.predicates import SegmentRelation, box_pairs_between, segment_relation
+from quasiharmonic.hearing import still_at_it
 
 # Segments that are taken at a time.
 _SEGMENTS = 1 << 14
@@ -44,6 +45,7 @@ def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positio
         part = order[start : start + _SEGMENTS]
         a, b, (first, last) = p[part], q[part], ends[part].T
         met = np.zeros(len(part), dtype=bool)
+        still_at_it()
         for i, j in box_pairs_between(np.minimum(a, b), np.maximum(a, b), low, high):
             spent += i.size
             if spent > most:

@@ -18,6 +18,7 @@ import numpy as np
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.loops import Contacts, contacts, winding
 from quasiharmonic.exact.predicates import SegmentRelation, orientation
+from quasiharmonic.hearing import still_at_it
 
 # More meeting pairs than this are not collected: a target that is this entangled needs no full list.
 MOST_CONTACTS = 10_000
@@ -136,6 +137,7 @@ class BoundaryCurves:
         when = [self._when(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)]
         steps: list[dict[tuple[int, Fraction], int]] = [{} for _ in self.loops]
         for k in sorted(range(len(edge)), key=lambda k: (edge[k], when[k])):
+            still_at_it()
             # What is crossed at the same point is crossed at once.
             along = steps[self.loop_of[edge[k]]]
             at = (int(edge[k]), when[k])
@@ -148,6 +150,7 @@ class BoundaryCurves:
 
     def _when(self, edge: int, other: int) -> Fraction:
         """Where along an edge another crosses it, from 0 at its tail to 1 at its head."""
+        still_at_it()
         (px, py), (qx, qy), (rx, ry), (sx, sy) = (
             tuple(map(Fraction, self.positions[vertex].tolist())) for vertex in (*self.ends[edge], *self.ends[other])
         )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from quasiharmonic.hearing import still_at_it
+
 
 class EffortSpentError(Exception):
     """More would be spent than may be."""
@@ -32,6 +34,7 @@ class Effort:
         EffortSpentError
             When there is not so much left; from then on at every call.
         """
+        still_at_it()
         self.spent += amount
         if self.spent > self.most:
             raise EffortSpentError

@@ -8,6 +8,7 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.diagnosis.clipping import Convex, Lattice, line
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.problem import Problem
 
 
@@ -59,6 +60,7 @@ class Fixture:
         Edges of length zero have no left side and are passed over.
         """
         for p, q in zip(self.points(edges[:, 0]), self.points(edges[:, 1]), strict=True):
+            still_at_it()
             if area is None:
                 return None
             if p != q:

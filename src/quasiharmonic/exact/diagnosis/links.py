@@ -26,6 +26,7 @@ import numpy as np
 from quasiharmonic.arrays import IntArray
 from quasiharmonic.exact.diagnosis.clipping import MARGIN
 from quasiharmonic.exact.diagnosis.triangulation import triangulate
+from quasiharmonic.hearing import still_at_it
 
 Point = tuple[int, int, int]
 """Homogeneous coordinates, the last positive."""
@@ -98,6 +99,7 @@ class Polygon:
         """
         window = [(self._points[start], self._at[start])]
         for count in range(1, limit + 1):
+            still_at_it()
             ways = [self._shortest(point, t, goal) for point, t in window]
             common = _common_end(ways)
             if common == 1 or any(len(way) == common for way in ways):

@@ -1,0 +1,156 @@
+"""The callback is heard while nothing new is to be told."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+import problems
+from quasiharmonic import Problem, flatten, hearing, injective_map, polish, solve
+from quasiharmonic.hearing import heard, still_at_it
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import cat
+from quasiharmonic.targets import arc_length, letter
+from shared.solvable import star_problem
+from shared.told import Told
+
+
+@heard
+def working(told, *, callback=None):
+    """Tell some steps, each followed by work of two parts."""
+    for step in told:
+        if callback is not None:
+            callback(step)
+        still_at_it()
+        still_at_it()
+    return told
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(hearing, "INTERVAL", 0.0)
+
+
+def test_the_last_step_is_told_again(impatient):
+    seen = []
+    assert working([1, 2], callback=seen.append) == [1, 2]
+    assert seen == [1, 1, 1, 2, 2, 2]
+    assert working([3]) == [3]
+    still_at_it()
+    assert seen[-1] == 2
+
+
+def test_only_when_it_is_long_ago():
+    seen = []
+    working([1, 2, 3], callback=seen.append)
+    assert seen == [1, 2, 3]
+
+
+def test_what_a_callback_raises_comes_out(impatient):
+    seen = []
+
+    def stop(step):
+        seen.append(step)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        working([1, 2], callback=stop)
+    assert seen == [1, 1]
+    still_at_it()
+    assert seen == [1, 1]
+
+
+def test_what_a_callback_does_is_its_own_affair(impatient):
+    seen, states = [], []
+
+    def nested(step):
+        seen.append(step)
+        states.append(np.geterr())
+        working([10, 20])
+
+    with np.errstate(all="raise"):
+        working([1], callback=nested)
+    assert seen == [1, 1, 1]
+    assert states[0]["over"] == "raise"
+
+    inner = []
+    working([1], callback=lambda step: working([step], callback=inner.append))
+    assert inner == 9 * [1]
+
+
+def test_repeats_are_no_steps(impatient):
+    V, F, fixed, target = star_problem(n=60)
+    seen, once = [], Told()
+
+    def note(step):
+        seen.append(step)
+        once.append(step)
+
+    result = injective_map(V, F, fixed, target, callback=note, polish="mips")
+    assert len(seen) > len(result.history)
+    assert once == result.history
+    plain = injective_map(V, F, fixed, target, polish="mips")
+    np.testing.assert_array_equal(plain.uv, result.uv)
+    assert plain.history == result.history
+
+
+def test_interrupted_in_between(impatient):
+    V, F, fixed, target = star_problem()
+    start = injective_map(V, F, fixed, target).uv
+    for solved in (
+        lambda stop: solve(Problem(V, F, fixed, target), callback=stop),
+        lambda stop: polish(V, F, start, fixed=fixed, callback=stop),
+    ):
+        seen = []
+
+        def stop(step, seen=seen):
+            if seen and step is seen[-1]:
+                raise KeyboardInterrupt
+            seen.append(step)
+
+        assert solved(stop).status.name == "INTERRUPTED"
+        assert len(seen) == 1
+
+
+def longest(run, seconds):
+    """The longest processor time between two calls of the callback of what is stopped after so many seconds."""
+    calls = []
+
+    def note(step):
+        calls.append(time.process_time())
+        if calls[-1] - calls[0] > seconds:
+            raise KeyboardInterrupt
+
+    run(note)
+    return max(np.diff(calls))
+
+
+def stuck():
+    """What local repair tries in vain for minutes."""
+    return problems.make("jam", 282, 0.786)
+
+
+def crossing():
+    """A target that crosses itself a thousand times."""
+    V, F = cat(30)
+    (loop,) = boundary_loops(F, len(V))
+    target = arc_length(V[loop], letter("R")[0])
+    return V, F, loop, target + 0.3 * np.random.default_rng(0).standard_normal(target.shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda note: injective_map(*stuck()[:4], callback=note),
+        lambda note: injective_map(*crossing(), callback=note),
+        lambda note: flatten(*cat(40), energy="distances", callback=note),
+    ],
+    ids=["repair", "diagnosis", "distances"],
+)
+def test_every_half_second(run):
+    # No factorisation here takes long. Processor time, since the machine may be busy with other things.
+    assert longest(run, 12) < 0.5
