@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 from quasiharmonic.io.gltfwrite import not_in_gltf
-from quasiharmonic.io.materials import missing_libraries
 from quasiharmonic.io.meshdata import MeshData
 from quasiharmonic.io.ply import not_in_ply
 
@@ -40,6 +39,4 @@ def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
         return lost + not_in_gltf(mesh)
     if mesh.carried is not None:
         lost += [what for what in mesh.carried.further() if not (lost and what == "materials")]
-    if mesh.texture is None:
-        lost += [f"the materials of {name}, which is nowhere" for name in missing_libraries(path, mesh)]
     return lost
