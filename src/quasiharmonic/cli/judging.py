@@ -108,8 +108,8 @@ def tell_losses(output: Path, mesh: MeshData) -> None:
 
     from quasiharmonic import io
 
-    for lost in io.not_held(output, mesh):
-        print(f"{output} will not have {lost}", file=sys.stderr, flush=True)
+    if lost := io.not_held(output, mesh):
+        print(f"{output} will not have: {'; '.join(lost)}", file=sys.stderr, flush=True)
 
 
 def write(output: Path, mesh: MeshData) -> Judged:

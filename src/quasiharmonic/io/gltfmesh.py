@@ -78,12 +78,11 @@ class CarriedGltf(Carried):
 
     def further(self) -> list[str]:
         tree = self.document.tree
-        found = [f"what its {name} are" for name in ("materials",) if tree.get(name)]
-        found += [f"its {name}" for name in ("animations", "skins", "cameras") if tree.get(name)]
+        found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]
         if any(pool.targets for pool in self.pools):
-            found.append("its morph targets")
+            found.append("morph targets")
         names = sorted({name for pool in self.pools for name in pool.attributes if name not in _CAREFREE})
-        return found + [f"{name} of its vertices" for name in names]
+        return found + [f"{name} of vertices" for name in names]
 
 
 def read_gltf(path: str | os.PathLike[str]) -> MeshData:

@@ -60,10 +60,10 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     carried = mesh.carried
     if isinstance(carried, CarriedGltf) and carried.fits(mesh):
         missing = embed_pictures(carried.document.copy(), carried.folder)
-        return [f"the picture {name}, which is not beside {mesh.source}" for name in missing]
+        return [f"the picture {name}, which is not beside {mesh.source} or is none" for name in missing]
     lost = ["digits beyond single precision"] if carried is None else [*carried.further()]
     if mesh.polygons is not None:
-        lost.append("polygons, which are written as triangles")
+        lost.append("polygons, of which it has the triangles")
     if mesh.extra is not None and _colours(mesh) is None:
         lost.append("what stands behind the coordinates of vertices and is no colour")
     if mesh.FN is not None and _normals(mesh) is None:
@@ -72,7 +72,7 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     if words & {b"o", b"g", b"s"}:
         lost.append("groups")
     if b"mtllib" in words:
-        lost.append("what its materials look like (their names are kept)")
+        lost.append("what materials look like")
     return lost
 
 

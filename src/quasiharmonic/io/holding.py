@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 from quasiharmonic.io.gltfwrite import not_in_gltf
-from quasiharmonic.io.materials import missing_libraries
 from quasiharmonic.io.meshdata import MeshData
 from quasiharmonic.io.ply import not_in_ply
 
@@ -30,18 +29,14 @@ def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
         In words; empty where nothing is lost.
     """
     suffix = Path(path).suffix.lower()
-    own = []
-    if (
-        mesh.texture is not None
-        and suffix in TEXTURED
-        and any(line.startswith(b"usemtl") for line in mesh.statements.split(b"\n"))
-    ):
-        own = ["its own materials, in place of which the picture is"]
-    further = [] if mesh.carried is None else mesh.carried.further()
-    if suffix in (".glb", ".gltf"):
-        return [*own, *not_in_gltf(mesh)]
+    if suffix == ".off":
+        return ["the surface, of which it has the map alone"]
     if suffix == ".ply":
         return not_in_ply(mesh)
-    if suffix == ".off":
-        return ["the surface: an OFF file has room for its map alone"]
-    return [*own, *further, *(f"the materials of {name}, which is nowhere" for name in missing_libraries(path, mesh))]
+    painted = mesh.texture is not None and any(line.startswith(b"usemtl") for line in mesh.statements.split(b"\n"))
+    lost = ["its own materials, in place of which the picture is"] if painted else []
+    if suffix in (".glb", ".gltf"):
+        return lost + not_in_gltf(mesh)
+    if mesh.carried is not None:
+        lost += [what for what in mesh.carried.further() if not (lost and what == "materials")]
+    return lost

@@ -37,20 +37,6 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
     return replace(mesh, statements=b"\n".join(new))
 
 
-def missing_libraries(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
-    """The libraries that a mesh names and that neither its source nor a file at ``path`` would find."""
-    missing = []
-
-    def noted(name: str, here: Path, there: Path) -> str:
-        if not ((there / name).is_file() or (here / name).is_file()):
-            missing.append(name)
-        return name
-
-    for line in filter(_names_library, mesh.statements.split(b"\n")):
-        _with_names(line, path, mesh, noted)
-    return missing
-
-
 def companions(path: str | os.PathLike[str], texture: Texture) -> tuple[Path, Path]:
     """Where the library and the picture of an OBJ file with a texture are."""
     path = Path(path)

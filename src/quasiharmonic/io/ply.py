@@ -48,7 +48,7 @@ class CarriedPly(Carried):
             *(name for pair in _PLACES for name in pair),
         }
         return [
-            f"{column.name} of its element {element.name}"
+            f"{column.name} of {element.name}"
             for element in self.tables.elements
             for column in element.columns
             if element.name not in ("vertex", "face") or column.name not in read
@@ -116,7 +116,7 @@ def not_in_ply(mesh: MeshData) -> list[str]:
         return []
     lost = [] if mesh.carried is None else [*mesh.carried.further()]
     if mesh.statements.strip():
-        lost.append("materials, groups and other statements")
+        lost.append("groups, names of materials and other statements")
     if mesh.extra is not None and _colours(mesh) is None:
         lost.append("what stands behind the coordinates of vertices and is no colour")
     if mesh.FN is not None and _normals(mesh) is None:

@@ -1,0 +1,245 @@
+"""Materials and pictures: what an OBJ names is found again, and what is written opens with its picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import io
+from quasiharmonic.io import MeshData, MeshFileError
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.plot import plot_texture, save_texture_figure
+from quasiharmonic.surfaces import cat, grid
+from shared.commands import run
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+HALVES = "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+
+
+@pytest.fixture
+def qhm(capfd):
+    """The command: its exit status, and what it says."""
+
+    def call(*arguments):
+        capfd.readouterr()
+        return run(*arguments), *capfd.readouterr()
+
+    return call
+
+
+def gradient(path, width=64, height=32):
+    """A picture that is as red as it is far to the right, and as green as it is high."""
+    from PIL import Image
+
+    across, up = (np.arange(width) + 0.5) / width, (np.arange(height)[::-1] + 0.5) / height
+    pixels = np.stack(np.broadcast_arrays(across[None], up[:, None], 0.5), axis=2)
+    Image.fromarray(np.rint(255 * pixels).astype(np.uint8)).save(path)
+    return path
+
+
+def test_a_hundred_materials_and_all_else_stay(tmp_path, qhm):
+    """Negative indices, places that are unused or there twice, a material for each face."""
+    V, F = grid(10, 5)
+    lines = ["mtllib all.mtl", "o sheet", *(f"v {x!r} {y!r} {x * y!r}" for x, y in V.tolist())]
+    lines += ["vt 7 7", *(f"vt {x!r} {y!r}" for x, y in V.tolist()), "vt 8 8"]
+    n = len(V)
+    # The corner of the first face refers to a second copy of its place.
+    lines += ["vt " + " ".join(map(repr, V[F[0, 0]].tolist())), "vn 0 0 1"]
+    for k, face in enumerate(F.tolist()):
+        lines += [f"usemtl m{k:03}", f"s {k % 2}"]
+        corners = [f"{i - n}/{i - n - 2}/-1" for i in face]
+        if k == 0:
+            corners[0] = f"{face[0] - n}/-1/-1"
+        lines.append("f " + " ".join(corners))
+    assert len(F) == 100
+    (tmp_path / "in.obj").write_text("\n".join(lines) + "\n")
+    (tmp_path / "all.mtl").write_text("newmtl m000\n")
+    status, said, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj")
+    assert status == 0, said + told
+    assert told == ""
+    before, after = io.read_obj(tmp_path / "in.obj"), io.read_obj(tmp_path / "out.obj")
+    for name in ("V", "F", "FT", "FN", "statement_faces"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    assert after.statements == before.statements
+    assert after.normals == before.normals
+    assert len(after.vt) == len(before.vt)
+    np.testing.assert_array_equal(after.vt[[0, n + 1]], [[7, 7], [8, 8]])
+    np.testing.assert_array_equal(after.vt[-1], after.vt[F[0, 0] + 1])
+
+
+@pytest.mark.parametrize("name", ["all.mtl", "my colours.mtl", "sub/all.mtl"])
+def test_a_library_is_found_from_another_folder(name, tmp_path):
+    there, library = tmp_path / "a" / "b", tmp_path / "in" / name
+    there.mkdir(parents=True)
+    library.parent.mkdir(parents=True)
+    library.write_text("newmtl x\n")
+    line = f"mtllib {name}"
+    source = tmp_path / "in" / "mesh.obj"
+    source.write_text(f"{line}\n{SQUARE}usemtl x\n{HALVES}")
+    mesh = io.read_mesh(source)
+    io.write_mapped(there / "out.obj", mesh)
+    named = (there / "out.obj").read_text().splitlines()[0]
+    assert named == f"mtllib ../../in/{name}"
+    assert (there / named.removeprefix("mtllib ")).read_text() == "newmtl x\n"
+    assert io.not_held(there / "out.obj", mesh) == []
+    # Where the old one is found it stays, and so does one that is beside the new file too.
+    io.write_mapped(tmp_path / "in" / "out.obj", mesh)
+    assert (tmp_path / "in" / "out.obj").read_text().startswith(line + "\n")
+    (there / name).parent.mkdir(exist_ok=True)
+    (there / name).write_text("another\n")
+    io.write_mapped(there / "out.obj", mesh)
+    assert (there / "out.obj").read_text().startswith(line + "\n")
+
+
+def test_a_library_that_is_nowhere_stays_as_it_is_named(tmp_path):
+    source = tmp_path / "mesh.obj"
+    source.write_text("mtllib  gone.mtl here.mtl\n" + SQUARE + HALVES)
+    (tmp_path / "here.mtl").write_text("")
+    (tmp_path / "out").mkdir()
+    mesh = io.read_mesh(source)
+    io.write_mapped(tmp_path / "out" / "x.obj", mesh)
+    assert (tmp_path / "out" / "x.obj").read_text().startswith("mtllib gone.mtl ../here.mtl\n")
+    io.write_mapped(tmp_path / "x.obj", mesh)
+    assert (tmp_path / "x.obj").read_text().startswith("mtllib  gone.mtl here.mtl\n")
+
+
+def test_an_obj_opens_with_its_picture(tmp_path, qhm):
+    trimesh = pytest.importorskip("trimesh", reason="an independent reader of OBJ and its materials")
+    picture = gradient(tmp_path / "photo.png")
+    (tmp_path / "in.obj").write_text("mtllib old.mtl\nusemtl old\no kept\n" + SQUARE + "usemtl old\n" + HALVES)
+    out = tmp_path / "my map.obj"
+    status, said, told = qhm("polish", tmp_path / "in.obj", "-o", out, "--picture", picture)
+    assert status == 0, said + told
+    assert "its own materials" in told
+    assert (tmp_path / "my_map-texture.png").read_bytes() == picture.read_bytes()
+    text = out.read_text()
+    assert "old" not in text
+    assert "o kept\n" in text
+    there = trimesh.load(out, process=False)
+    seen = trimesh.visual.color.uv_to_color(there.visual.uv, there.visual.material.image)[:, :2] / 255
+    np.testing.assert_allclose(seen, there.vertices[:, :2], atol=1 / 32)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_a_glb_is_drawn_with_its_picture_by_another_library(suffix, tmp_path):
+    """Colours that it finds at the vertices, and ours where these are drawn, are those of the picture."""
+    trimesh = pytest.importorskip("trimesh", reason="an independent reader of glTF and its materials")
+    flat, F = grid(12, 9)
+    uv = 0.04 + 0.92 * flat / np.ptp(flat, axis=0) + 0.03 * np.sin(flat[:, ::-1])
+    V = np.column_stack([flat, np.sin(flat).sum(axis=1)])
+    mesh = MeshData(V, F, texture=io.read_texture(gradient(tmp_path / "photo.png")))
+    io.write_map(tmp_path / f"cat{suffix}", mesh, uv)
+    there = trimesh.load(tmp_path / f"cat{suffix}", process=False, force="mesh")
+    colours = there.visual.to_color().vertex_colors[:, :2] / 255
+    np.testing.assert_allclose(colours, uv, atol=1 / 16)
+    image = plot_texture(V, F, io.map_of(io.read_mesh(tmp_path / f"cat{suffix}")), picture=tmp_path / "photo.png")
+    drawn = image.axes[1].images[0]
+    pixels, (left, right, low, high) = np.asarray(drawn.get_array()), drawn.get_extent()
+    inner = uv[np.setdiff1d(np.arange(len(V)), boundary_edges(F, len(V)))]
+    column = (inner[:, 0] - left) / (right - left) * pixels.shape[1]
+    row = (high - inner[:, 1]) / (high - low) * pixels.shape[0]
+    found = pixels[row.astype(int), column.astype(int), :3]
+    # The light in the plane darkens all colours alike, so that their shares stay.
+    expected = np.column_stack([inner, np.full(len(inner), 0.5)])
+    shares = [c / c.sum(axis=1, keepdims=True) for c in (found, expected)]
+    assert np.abs(shares[0] - shares[1]).max() < 0.05
+
+
+def test_the_checkerboard_is_a_picture_that_repeats(tmp_path):
+    from PIL import Image
+
+    texture = io.checkerboard()
+    (tmp_path / "board.png").write_bytes(texture.data)
+    pixels = np.asarray(Image.open(tmp_path / "board.png"))
+    assert pixels.shape == (512, 512, 3)
+    assert io.read_texture(tmp_path / "board.png") == texture
+    assert (pixels[0] != pixels[-1]).any(axis=1).all()
+    assert (pixels[:, 0] != pixels[:, -1]).any(axis=1).all()
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) == 2
+
+
+def test_a_picture_is_repeated_and_its_glass_is_white(tmp_path):
+    from PIL import Image
+
+    Image.fromarray(np.array([[[255, 0, 0, 255], [0, 0, 0, 0]]], dtype=np.uint8)).save(tmp_path / "two.png")
+    V, F = grid(2, 2)
+    image = plot_texture(V, F, 2 * V - 1, picture=tmp_path / "two.png").axes[1].images[0].get_array()
+    middle = image[len(image) // 3]
+    red = middle[:, 0] > 2 * middle[:, 1]
+    covered = np.flatnonzero(middle[:, 3] == 1)
+    # Two units across, half of each red.
+    assert np.count_nonzero(np.diff(red[covered].astype(int))) in (3, 4)
+    assert 0.4 < red[covered].mean() < 0.6
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_a_picture_that_is_missing_is_named_and_nothing_is_written(suffix, tmp_path, qhm):
+    (tmp_path / "in.obj").write_text(SQUARE + HALVES)
+    (tmp_path / "text.png").write_text("no picture")
+    before = sorted(tmp_path.iterdir())
+    for name, message in (("gone.png", "no such file"), ("text.png", "no PNG or JPEG")):
+        for command in (("polish", tmp_path / "in.obj", "-o", tmp_path / f"out{suffix}"),
+                        ("plot", tmp_path / "in.obj", "-o", tmp_path / "out.png")):  # fmt: skip
+            status, _, told = qhm(*command, "--picture", tmp_path / name)
+            assert status == 2
+            assert name in told
+            assert message in told
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_picture_that_is_damaged_is_named(tmp_path):
+    V, F = grid(2, 2)
+    whole = gradient(tmp_path / "photo.png").read_bytes()
+    (tmp_path / "half.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(MeshFileError, match=r"half\.png: is a damaged picture"):
+        save_texture_figure(tmp_path / "out.png", V, F, V, picture=tmp_path / "half.png")
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_what_goes_with_an_obj_replaces_nothing_of_the_users(tmp_path, qhm):
+    (tmp_path / "in.obj").write_text(SQUARE + HALVES)
+    picture = gradient(tmp_path / "out-texture.png")
+    kept = picture.read_bytes()
+    status, _, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--picture", picture)
+    assert status == 2
+    assert "would replace another file" in told
+    assert picture.read_bytes() == kept
+    assert not (tmp_path / "out.obj").exists()
+    status, _, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.ply", "--material")
+    assert status == 2
+    assert ".ply has room for none" in told
+
+
+def test_commands_from_format_to_format(tmp_path, qhm):
+    """An STL is laid flat into a GLB, that is judged in single precision, and what is lost is told beforehand."""
+    trimesh = pytest.importorskip("trimesh", reason="an independent writer of STL")
+    V, F = cat(8)
+    trimesh.Trimesh(V, F, process=False).export(tmp_path / "cat.stl")
+    status, said, told = qhm(
+        "flatten", tmp_path / "cat.stl", "-o", tmp_path / "flat.glb", "--unit-square", "--material"
+    )
+    assert status == 0, said + told
+    assert "flat.glb will not have: digits beyond single precision" in told
+    status, said, told = qhm("check", tmp_path / "flat.glb")
+    assert status == 0, said + told
+    status, said, told = qhm("map", tmp_path / "flat.glb", "--to", "disk", "-o", tmp_path / "disk.ply")
+    assert status == 0, said + told
+    quads = "f 1/1 2/2 3/3 4/4\n"
+    (tmp_path / "quad.obj").write_text(SQUARE + quads)
+    status, said, told = qhm("polish", tmp_path / "quad.obj", "-o", tmp_path / "quad.glb")
+    assert status == 0, said + told
+    assert "polygons, of which it has the triangles" in told
+    status, _, told = qhm("flatten", tmp_path / "cat.stl", "-o", tmp_path / "flat.stl")
+    assert status == 2
+    assert ".stl files cannot be written" in told
+
+
+def test_seams_do_not_go_into_an_off_file(tmp_path, qhm):
+    torn = SQUARE.replace("vt 0 1\n", "vt 0 1\nvt 5 5\nvt 6 6\n") + "f 1/1 2/2 3/3\nf 1/5 3/6 4/4\n"
+    (tmp_path / "torn.obj").write_text(torn)
+    status, _, told = qhm("repair", tmp_path / "torn.obj", "-o", tmp_path / "out.off")
+    assert status == 2
+    assert "seams" in told
+    status, _, told = qhm("polish", tmp_path / "torn.obj", "-o", tmp_path / "out.off")
+    assert status == 2
+    assert not (tmp_path / "out.off").exists()
