@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.transfer import SurfaceMap
     from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
     from quasiharmonic.curves import Rails
+    from quasiharmonic.cuts.finding import find_cuts
     from quasiharmonic.descent import Descent
     from quasiharmonic.energy.energies import Energy
     from quasiharmonic.energy.measures import Distortion, distortion
@@ -70,6 +71,7 @@ _HOME = {
     "diagnose": "exact.diagnosis",
     "distance_error": "flattening.distances",
     "distortion": "energy.measures",
+    "find_cuts": "cuts.finding",
     "flatten": "flattening.flattened",
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
@@ -118,6 +120,7 @@ __all__ = [
     "diagnose",
     "distance_error",
     "distortion",
+    "find_cuts",
     "flatten",
     "flipped_triangles",
     "harmonise",

@@ -42,7 +42,7 @@ def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain
     edges : (k, 2) array of int, optional
         Edges to be cut in any case.
     gain : float
-        What cuts must be worth beyond those that make a disk, as `quasiharmonic.cuts.finding.find_cuts` has it: 0.1
+        What cuts must be worth beyond those that make a disk, as `quasiharmonic.find_cuts` has it: 0.1
         for surfaces that are to lie flat with little distortion. By default there are no others.
 
     Returns
@@ -52,7 +52,7 @@ def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain
     Raises
     ------
     ValueError
-        As `quasiharmonic.cuts.finding.find_cuts`.
+        As `quasiharmonic.find_cuts`.
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))

@@ -49,8 +49,8 @@ def find_cuts(
         Edges not to be cut, such as diagonals of faces of four corners; every vertex must have others.
     gain : float
         By how much a cut must lower the mean symmetric Dirichlet energy (0 without distortion), for each piece of
-        its length that is as long as the square root of the surface's area. Positive; more of it means fewer cuts,
-        and `numpy.inf` none but those that make disks.
+        its length that is as long as the square root of the surface's area. An end inside counts as a tenth of such a
+        piece. Positive; more of it means fewer cuts, and `numpy.inf` none but those that make disks.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def find_cuts(
     A starfish is cut to the end of each of its three arms and nearly the shortest way from one to the next:
 
     >>> import numpy as np
-    >>> from quasiharmonic.cuts.finding import find_cuts
+    >>> from quasiharmonic import find_cuts
     >>> from quasiharmonic.surfaces import starfish
     >>> V, F = starfish(3, 12)
     >>> cut = find_cuts(V, F, gain=0.5)
