@@ -1,0 +1,155 @@
+"""Work that leaves Blender alive: in a thread, its progress shown, ended by Esc with nothing changed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import bpy
+
+from quasiharmonic import Step
+
+from .surface import Refused
+
+# Seconds between two looks at a thread.
+_LOOK = 0.05
+
+
+class Job:
+    """A function in a thread of its own.
+
+    Parameters
+    ----------
+    work : callable
+        Called with a callback that is to be called with every step.
+    """
+
+    def __init__(self, work: Callable[[Callable[[Step], None]], Any]) -> None:
+        self.step: Step | None = None
+        self.steps = 0
+        self.error: BaseException | None = None
+        self.result: Any = None
+        self._work = work
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask it to end at its next step."""
+        self._stopped.set()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was asked to end."""
+        return self._stopped.is_set()
+
+    @property
+    def running(self) -> bool:
+        """Whether it is still at work."""
+        return self._thread.is_alive()
+
+    def wait(self) -> None:
+        """Until it ends."""
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            self.result = self._work(self._heard)
+        except BaseException as error:
+            self.error = error
+
+    def _heard(self, step: Step) -> None:
+        self.step = step
+        self.steps += 1
+        if self.stopped:
+            raise KeyboardInterrupt
+
+
+class Working(bpy.types.Operator):
+    """An operator whose work is a `Job`; `prepare` says what it is, `finish` takes over what came out."""
+
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 (as Blender has it)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Whether there is a mesh to work on."""
+        thing = context.active_object
+        return thing is not None and thing.type == "MESH"
+
+    def prepare(self, context: bpy.types.Context) -> Callable[[Callable[[Step], None]], Any]:
+        """What to do in the thread, where Blender's data is not touched."""
+        raise NotImplementedError
+
+    def finish(self, context: bpy.types.Context, result: Any) -> None:
+        """Take over what came out."""
+        raise NotImplementedError
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do it at once, as scripts ask for it."""
+        return self._guarded(context, self._at_once)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Do it in a thread, as buttons ask for it."""
+        if bpy.app.background:
+            return self.execute(context)
+        return self._guarded(context, self._begin)
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Look after the thread."""
+        if event.type == "ESC" and event.value == "PRESS":
+            self._job.stop()
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        manager = context.window_manager
+        manager.progress_update(self._job.steps % 100)
+        if self._job.step is not None:
+            state = f"{self.bl_label}: step {self._job.steps}, energy {self._job.step.energy:.4g} (Esc cancels)"
+            context.workspace.status_text_set(state)
+        if self._job.running:
+            return {"RUNNING_MODAL"}
+        manager.event_timer_remove(self._timer)
+        manager.progress_end()
+        context.workspace.status_text_set(None)
+        return self._guarded(context, self._end)
+
+    def _at_once(self, context: bpy.types.Context) -> set[str]:
+        self._job = Job(self.prepare(context))
+        self._job.start()
+        self._job.wait()
+        return self._end(context)
+
+    def _begin(self, context: bpy.types.Context) -> set[str]:
+        self._job = Job(self.prepare(context))
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(_LOOK, window=context.window)
+        manager.progress_begin(0, 100)
+        manager.modal_handler_add(self)
+        self._job.start()
+        return {"RUNNING_MODAL"}
+
+    def _end(self, context: bpy.types.Context) -> set[str]:
+        if self._job.stopped or isinstance(self._job.error, KeyboardInterrupt):
+            self.report({"INFO"}, f"{self.bl_label}: cancelled, nothing has changed")
+            return {"CANCELLED"}
+        if self._job.error is not None:
+            raise self._job.error
+        self.finish(context, self._job.result)
+        return {"FINISHED"}
+
+    def _guarded(self, context: bpy.types.Context, act: Callable[[bpy.types.Context], set[str]]) -> set[str]:
+        """Act in object mode, where a mesh's data is up to date; what is wrong becomes a report."""
+        mode = context.active_object.mode
+        if mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        try:
+            return act(context)
+        except (Refused, ValueError, ImportError) as error:
+            self.report({"ERROR"}, f"{self.bl_label}: {error}")
+            return {"CANCELLED"}
+        finally:
+            if mode != "OBJECT":
+                bpy.ops.object.mode_set(mode=mode)
