@@ -3,9 +3,9 @@
 
 A sphere onto a disk, a torus onto a square, a surface with two handles onto the letter O without its hole. Neither
 closed surfaces nor handles fit into the plane: the surfaces are cut along edges first, the red lines, of which those on
-the far side are not drawn. Every vertex on a cut has a copy for each further side of it, at the end of the list;
-triangles keep their order. Beside a cut there are triangles with all three vertices on it, for which a straight side of
-the target has no room: 19 edges of the torus are split for that. All three maps are bijective.
+the far side are not drawn. In the file that is written they are seams: vertices and faces of the surface stay as they
+are, and a vertex on a cut has several places in the plane. Beside a cut there may be triangles with all three vertices
+on it, for which a straight side of the target has no room: their edges are split. All three maps are bijective.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from common import RED, FloatArray, panels, run, save
-from quasiharmonic import cut_open, io
+from quasiharmonic import io
 from quasiharmonic.cli import main as qhm
-from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.plot import plot_map, plot_surface
 from quasiharmonic.plot.shading import view
 
@@ -73,17 +72,12 @@ def solids(size: int) -> dict[str, tuple[str, Mesh]]:
     }
 
 
-def cut_lines(ax: Axes, V: FloatArray, F: NDArray[np.int64]) -> int:
-    """Draw where the surface is cut; how many edges that are."""
-    opened = cut_open(V, F)
-    (loop,) = boundary_loops(opened.F, len(opened.V))
-    ends = opened.origin[np.stack([loop, np.roll(loop, -1)], axis=1)]
+def cut_lines(ax: Axes, V: FloatArray, F: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
+    """Draw where the surface is cut."""
     seen = view(V, F)
     near = np.zeros(len(V), dtype=bool)
     near[F[~seen.inside]] = True
     ax.add_collection(LineCollection(seen.points[ends[near[ends].all(axis=1)]], colors=[RED], lw=1.5))
-    # Each edge of the cut is there from both sides.
-    return len(ends) // 2
 
 
 def main(output: Path, size: int = 12) -> dict[str, Any]:
@@ -97,15 +91,17 @@ def main(output: Path, size: int = 12) -> dict[str, Any]:
             facts = json.loads(Path(report).read_text())
             flat = io.read_mesh(written)
         plot_surface(V, F, axes[0][k])
-        edges = cut_lines(axes[0][k], V, F)
-        axes[0][k].set_title(f"{name}, cut along {edges} edges", size=10)
-        plot_map(flat.V, flat.F, io.map_of(flat), ax=axes[1][k])
+        mapped = io.mapped(flat)
+        cut_lines(axes[0][k], V, F, mapped.seams[(mapped.seams < len(V)).all(axis=1)])
+        axes[0][k].set_title(f"{name}, cut along {len(mapped.seams)} edges", size=10)
+        opened = mapped.opened()
+        assert opened.uv is not None
+        plot_map(opened.V, opened.F, opened.uv, ax=axes[1][k])
         axes[1][k].set_title(f"--to {to}", size=10)
         numbers[name] = {
             "triangles": len(F),
             "handles": (2 - len(V) + len(F) // 2) // 2,
-            "edges cut": edges,
-            "vertices copied": facts["copied_vertices"],
+            "edges cut": facts["cut_edges"],
             "vertices added": facts["added_vertices"],
             "exit status": status,
             "bijective": facts["bijective"],

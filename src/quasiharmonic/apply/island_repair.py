@@ -22,7 +22,8 @@ from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
 from quasiharmonic.exact.diagnosis.obstruction import Obstruction
 from quasiharmonic.exact.predicates import orientation
-from quasiharmonic.mesh.seams import Island, fans, renumbered
+from quasiharmonic.mesh.fans import fans, renumbered
+from quasiharmonic.mesh.seams import Island
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import boundary_edges, components
 from quasiharmonic.problem import Problem

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.arrays import IntArray, check_range, named_edges
-from quasiharmonic.mesh.seams import fans
+from quasiharmonic.mesh.fans import fans, numbered
 from quasiharmonic.mesh.topology import edge_keys
 
 
@@ -58,13 +58,4 @@ def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     strange = ~np.isin(wanted, sides)
     if strange.any():
         raise ValueError(f"{named_edges(cut[strange])}: no triangle has such a side")
-    split, _ = fans(F, np.isin(sides, wanted))
-    # Fans are numbered by first appearance, so each is first met where the numbers seen so far grow.
-    vertex = F.ravel()[np.diff(np.maximum.accumulate(split.ravel()), prepend=-1) > 0]
-    order = np.argsort(vertex, kind="stable")
-    keeps = np.diff(vertex[order], prepend=-1) > 0
-    kept, copies = order[keeps], order[~keeps]
-    own = np.empty(vertex.size, dtype=np.int64)
-    own[kept] = vertex[kept]
-    own[copies] = np.arange(n, n + copies.size)
-    return Corners(own[split], np.concatenate([np.arange(n), vertex[copies]]))
+    return Corners(*numbered(F, fans(F, np.isin(sides, wanted))[0], n))

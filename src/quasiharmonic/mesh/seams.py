@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import (
     BoolArray,
@@ -27,6 +27,7 @@ from quasiharmonic.arrays import (
     triangle_rows,
     vertex_array,
 )
+from quasiharmonic.mesh.fans import fans, numbered, renumbered
 from quasiharmonic.mesh.topology import edge_keys
 
 
@@ -256,15 +257,12 @@ class SeamedMesh:
         origin : (n + c,) int64
             The old vertex that each is.
         """
-        split = np.full(self.F.shape, -1)
-        split[self.mapped] = fans(self._welded, None if cut is None else cut[self.mapped])[0]
-        corners = np.unique(split[self.mapped].ravel(), return_index=True)[1]
-        vertex = self.F[self.mapped].ravel()[corners]
-        further = np.ones(len(vertex), dtype=np.bool_)
-        further[np.unique(vertex, return_index=True)[1]] = False
-        number = vertex.copy()
-        number[further] = len(self.V) + np.arange(np.count_nonzero(further))
-        return np.where(split >= 0, number[split], -1), np.concatenate([np.arange(len(self.V)), vertex[further]])
+        F = self.F[self.mapped]
+        FT = np.full(self.F.shape, -1)
+        FT[self.mapped], origin = numbered(
+            F, fans(self._welded, None if cut is None else cut[self.mapped])[0], len(self.V)
+        )
+        return FT, origin
 
     def _moved(self, uv: FloatArray, places: Sequence[FloatArray]) -> SeamedMesh:
         """Bring the islands' places into the rows of the map, new rows where others use the same."""
@@ -288,75 +286,3 @@ class SeamedMesh:
             at = np.minimum(np.searchsorted(wanted, corner), row.size - 1)
             FT = np.where(wanted[at] == corner, len(uv) + at, FT)
         return SeamedMesh(self.V, self.F, FT, np.concatenate([uv, now[vertex]]))
-
-
-def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Split vertices at which triangles touch without being joined by edges.
-
-    Parameters
-    ----------
-    F : (f, 3) int64
-        Triangles, of any kind.
-    cut : (f, 3) bool, optional
-        At which sides, from each corner to the next, triangles are not joined whatever they share.
-
-    Returns
-    -------
-    split : (f, 3) int64
-        The same triangles with a vertex of its own for every fan around one: now a surface, with a boundary where
-        an edge was not shared by exactly two triangles that are wound alike.
-    component : (f,) int64
-        The component of each triangle; both are numbered by first appearance.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    corner = np.arange(F.size).reshape(-1, 3)
-    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
-    ahead = corner[:, (1, 2, 0)].ravel()
-    key = edge_keys(tail, head, int(F.max(initial=0)) + 1)
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    first = first[np.diff(first, append=key.size) == 2]
-    one, other = order[first], order[first + 1]
-    opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
-    if cut is not None:
-        opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
-    one, other = one[opposed], other[opposed]
-    # The half-edge of a corner begins there: a joined pair identifies begin with end and end with begin.
-    joined = np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other])
-    ones = np.ones(joined[0].size, dtype=np.int8)
-    split = connected_components(coo_array((ones, joined), shape=(F.size, F.size)), directed=False)[1]
-    pairs = one // 3, other // 3
-    component = connected_components(coo_array((ones[: one.size], pairs), shape=(len(F), len(F))), directed=False)[1]
-    return _by_appearance(split).reshape(-1, 3), _by_appearance(component)
-
-
-def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
-    """Give the vertices of some triangles numbers without gaps.
-
-    Parameters
-    ----------
-    split : (k, 3) int64
-        Triangles, as `fans` has them.
-    F : (k, 3) int64
-        The same triangles by the vertices that were split. These decide the order: one that was not split and has
-        no gap keeps its numbers.
-
-    Returns
-    -------
-    renumbered : (k, 3) int64
-    first : (m,) int64
-        For every vertex a corner that it is at, as an index into the flattened triangles.
-    """
-    _, first, own = np.unique(split.ravel(), return_index=True, return_inverse=True)
-    order = np.argsort(F.ravel()[first], kind="stable")
-    return np.argsort(order)[own.reshape(-1, 3)], first[order]
-
-
-def _by_appearance(label: NDArray[np.integer]) -> IntArray:
-    """Labels numbered in the order in which they appear."""
-    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
-    rank = np.empty(first.size, dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(first.size)
-    return rank[inverse.ravel()]
