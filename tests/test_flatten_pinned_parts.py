@@ -136,3 +136,23 @@ def test_the_command_takes_several(tmp_path, capsys):
     written = read_mesh(tmp_path / "out.obj")
     np.testing.assert_array_equal(map_of(written)[[3, second + 9]], (V + 7)[[3, second + 9]])
     assert certify(written.F, map_of(written)).bijective
+
+
+def test_the_command_s_messages_have_the_file_s_numbers(tmp_path, capsys, rng):
+    V, F, (_, second) = several(disk(4), disk(4))
+    number, order = rng.permutation(len(V)), rng.permutation(len(F))
+    places, triangles = np.empty_like(V), number[F][order]
+    places[number] = V
+    mesh = MeshData(np.column_stack([places, 0 * places[:, 0]]), triangles)
+    pins = number[[3, second + 9]]
+    write_obj(tmp_path / "in.obj", mesh.with_map(np.full((len(V), 2), 0.5)))
+    (tmp_path / "pins.txt").write_text("".join(f"{v}\n" for v in pins))
+    call = ["flatten", str(tmp_path / "in.obj"), "--fixed", str(tmp_path / "pins.txt"), "-o", str(tmp_path / "out.obj")]
+    assert main(call) == 1
+    assert f"Vertices {pins.min()}, {pins.max()} are held in one place" in capsys.readouterr().out
+    # With room for both, every triangle is where the file has it.
+    write_obj(tmp_path / "in.obj", mesh.with_map(places + 7))
+    assert main(call) == 0
+    written = read_mesh(tmp_path / "out.obj")
+    np.testing.assert_array_equal(written.F, triangles)
+    assert certify(triangles, map_of(written)).bijective

@@ -423,7 +423,7 @@ def test_vertices_of_no_triangle_are_counted_all_the_same():
 @pytest.mark.parametrize(
     ("rails", "message"),
     [
-        (lambda loop: Rails([SQUARE], on={int(loop[3]): 1}), "told to be on curve 1, but there are only curves 0 … 0"),
+        (lambda loop: Rails([SQUARE], on={int(loop[3]): 1}), "on refers to curve 1, but there are only curves 0 … 0"),
         (lambda loop: Rails([SQUARE], on={int(loop[3]): 0.5}), "on must hold integer"),
         (lambda loop: Rails([]), "no curve to slide along"),
         (lambda loop: Rails([SQUARE], corner_angle=200), "corner_angle is between 0 and 180"),

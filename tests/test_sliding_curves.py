@@ -146,6 +146,8 @@ def test_transformed():
 @pytest.mark.parametrize(
     ("pieces", "message"),
     [
+        ([[(0, 0), ("a", 0)]], "piece 0 of the curve must hold real numbers"),
+        ([[(0, 0), (1,)]], "piece 0 of the curve is not an array: its rows differ in length"),
         ([], "at least one piece"),
         ([[(0, 0)]], r"piece 0 of the curve must have shape \(2, 2\), \(3, 2\) or \(4, 2\), not \(1, 2\)"),
         ([[(0, 0), (1, 0)], [(1, 0), (np.nan, 1)]], "piece 1 of the curve is not finite"),

@@ -141,6 +141,39 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     return array
 
 
+def held_vertices(fixed: ArrayLike, n: int) -> IntArray:
+    """Vertices of ``n`` that are held, ``fixed`` everywhere, each once, as (k,) int64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When they are not; names the first that are none, or are named more than once.
+    """
+    array = index_array("fixed", fixed)
+    if array.ndim != 1:
+        raise ValueError(f"fixed must have shape (k,), not {array.shape}")
+    check_range("fixed", array, n)
+    times = np.bincount(array, minlength=n)
+    if times.max(initial=0) > 1:
+        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
+    return array
+
+
+def held_places(target: ArrayLike, k: int) -> FloatArray:
+    """Where ``k`` vertices are held, ``target`` everywhere, as (k, 2) float64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When that is not what it is; names the first rows that are not finite.
+    """
+    array = real_array("target", target)
+    if array.shape != (k, 2):
+        raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
+    check_finite("target", "row", "rows", array)
+    return array
+
+
 def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
     """Raise a ValueError that names the first rows, such as ``one`` vertex, with NaN or infinite numbers."""
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, index_array, named
-from quasiharmonic.atlas.mapped import MappedAtlas, each_island, in_place_of
+from quasiharmonic.atlas.mapped import MappedAtlas, MappedIsland, each_island, faced, in_place_of, naming
 from quasiharmonic.atlas.packing import packed
 from quasiharmonic.atlas.verdict import is_mirrored
 from quasiharmonic.energy.deformation import positive_weights
 from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening import flattened
 from quasiharmonic.flattening.layout import in_unit_square, side_by_side
 from quasiharmonic.mesh.seams import Island, SeamedMesh
@@ -139,7 +141,8 @@ def flatten(
     start : bool
         Begin with the places that the islands have.
     fixed : (k,) array of int, optional
-        Vertices of the mesh that are held at their places. An island with such a vertex stays where these put it.
+        Vertices of the mesh that are held at their places. An island with such a vertex stays where these put it, the
+        others are laid beside, and none over another.
     weights : (f,) array, optional
         How much each triangle's distortion counts.
     unit_square, gap, **rest
@@ -164,6 +167,9 @@ def flatten(
             own |= {"fixed": pins, "target": island.uv[pins]}
         return flattened.flatten(island.V, island.F, **own, **rest)
 
+    faces = faced(mesh, reflect=start)
+    if held is not None and held.size and len(faces) > 1 and not any(mirrored for _, mirrored in faces):
+        return _held_together(mesh, held, weights, start, {"gap": gap, **rest})
     mapped = each_island(mesh, lay, reflect=start)
     uv = [island.result.uv for island in mapped.islands]
     if held is None and len(uv) > 1:
@@ -172,6 +178,46 @@ def flatten(
         sizes = np.cumsum([len(places) for places in uv])[:-1]
         uv = np.split(in_unit_square(np.concatenate(uv)), sizes)
     return replace(mapped, mesh=mesh.with_places(uv))
+
+
+def _held_together(
+    mesh: SeamedMesh, fixed: IntArray, weights: FloatArray | None, start: bool, rest: dict[str, Any]
+) -> MappedAtlas:
+    """Several islands of which some have vertices held, as surfaces of one mesh: they mind each other."""
+    islands = mesh.islands
+    for island in islands:
+        with naming(island, len(islands)):
+            flattened.flattenable(island.V, island.F)
+    # Numbered as the mesh is, where it has no seams, so that messages say what its owner reads.
+    order, by_mesh = (np.argsort(_joined(islands, name), kind="stable") for name in ("vertices", "triangles"))
+    number = np.argsort(order)
+    ends = np.cumsum([len(island.V) for island in islands])
+    numbers = np.split(number, ends[:-1])
+    pins = [_held(island, fixed) for island in islands]
+    own: dict[str, Any] = {} if weights is None else {"weights": weights[np.sort(_joined(islands, "triangles"))]}
+    if start:
+        own["start"] = _joined(islands, "uv")[order]
+    result = flattened.flatten(
+        _joined(islands, "V")[order],
+        np.concatenate([of[island.F] for island, of in zip(islands, numbers, strict=True)])[by_mesh],
+        fixed=np.concatenate([of[held] for held, of in zip(pins, numbers, strict=True)]),
+        target=np.concatenate([island.uv[held] for island, held in zip(islands, pins, strict=True)]),
+        **own,
+        **rest,
+    )
+    # What was done was done to all of them, and is told once.
+    told = [result, *[replace(result, stages=[], history=[], diagnosis=None, seconds=0.0) for _ in islands[1:]]]
+    places = [result.uv[of] for of in numbers]
+    done = [
+        MappedIsland(island.triangles, False, replace(one, uv=uv, certificate=certify(island.F, uv)))
+        for island, one, uv in zip(islands, told, places, strict=True)
+    ]
+    return MappedAtlas(mesh.with_places(places), tuple(done))
+
+
+def _joined(islands: Sequence[Island], name: str) -> Any:
+    """What islands have, one after the other."""
+    return np.concatenate([getattr(island, name) for island in islands])
 
 
 def pack(mesh: SeamedMesh, *, margin: float = 1 / 256) -> SeamedMesh:

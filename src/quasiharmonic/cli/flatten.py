@@ -168,9 +168,12 @@ def _check_pattern(options: argparse.Namespace) -> None:
 
 
 def _mean_energy(mapped: MappedAtlas) -> float | None:
-    """Of one island; JSON has neither infinity nor NaN, which pins far apart may bring about."""
-    energy = mapped.islands[0].result.history[-1].energy
-    return energy if len(mapped.islands) == 1 and isfinite(energy) else None
+    """Of one island, if there is a map whose energy was lowered; JSON has neither infinity nor NaN."""
+    first = mapped.islands[0].result
+    if len(mapped.islands) > 1 or not (first.certificate.bijective and first.history):
+        return None
+    energy = first.history[-1].energy
+    return energy if isfinite(energy) else None
 
 
 def _numbers(path: Path) -> list[float]:

@@ -23,11 +23,14 @@ def sizes(domain: Domain) -> dict[str, Any]:
 def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
     """Sentences about a map that was searched for and written, island by island."""
     from quasiharmonic.arrays import counted
+    from quasiharmonic.result import Status
 
     lines = [f"wrote {output}: {judged.summary()}"]
     results = [island.result for island in mapped.islands]
     if not judged.injective:
         lines.append(mapped.status.value)
+    # Surfaces may each be injective where pins forbid that they keep apart.
+    if not judged.injective or mapped.status is Status.IMPOSSIBLE:
         lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
     iterations = sum(result.iterations for result in results)
     seconds = sum(result.seconds for result in results)

@@ -72,12 +72,12 @@ class Piece(NamedTuple):
 def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
     """Piece ``i`` of a curve, checked; long arcs in several, Bézier curves that turn on the spot in two or three."""
     if isinstance(piece, Arc):
-        rows = [np.asarray(x, dtype=np.float64) for x in (piece.centre, piece.a, piece.b)]
+        rows = [real_array(f"piece {i} of the curve", x) for x in (piece.centre, piece.a, piece.b)]
         if any(row.shape != (2,) for row in rows):
             raise ValueError(f"piece {i} of the curve: an arc has a centre and two axes of shape (2,)")
         control, ends = np.stack(rows), (float(piece.first), float(piece.last))
     else:
-        control, ends = np.array(piece, dtype=np.float64), (0.0, 0.0)
+        control, ends = real_array(f"piece {i} of the curve", piece), (0.0, 0.0)
         if control.ndim != 2 or control.shape[1] != 2 or not 2 <= len(control) <= 4:
             raise ValueError(f"piece {i} of the curve must have shape (2, 2), (3, 2) or (4, 2), not {control.shape}")
     if not (np.isfinite(control).all() and np.isfinite(ends).all()):

@@ -69,13 +69,10 @@ class Rails:
         on = {} if on is None else on
         if not isinstance(on, Mapping):
             raise ValueError(f"on must say which vertex is on which curve, as in {{12: 0}}, and is {type(on).__name__}")
-        told = zip(index_array("on", list(on)).tolist(), index_array("on", list(on.values())).tolist(), strict=True)
-        self.on: dict[int, int] = dict(told)
+        vertices, numbers = index_array("on", list(on)), index_array("on", list(on.values()))
+        check_range("on", numbers, len(self.curves), "curve", "curves")
+        self.on: dict[int, int] = dict(zip(vertices.tolist(), numbers.tolist(), strict=True))
         self.held = index_array("held", held).ravel()
-        wrong = [v for v, k in self.on.items() if not 0 <= k < len(self.curves)]
-        if wrong:
-            there = f"only curves 0 … {len(self.curves) - 1}"
-            raise ValueError(f"vertex {wrong[0]} is told to be on curve {self.on[wrong[0]]}, but there are {there}")
         if not 0 <= corner_angle <= 180:
             raise ValueError(f"corner_angle is between 0 and 180 degrees, not {corner_angle}")
         if not 0 <= tolerance < 1:

@@ -21,11 +21,8 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
-    check_finite,
-    check_range,
-    index_array,
-    named,
-    real_array,
+    held_places,
+    held_vertices,
 )
 from quasiharmonic.descent import RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.energy.energies import SymmetricDirichlet
@@ -150,19 +147,10 @@ def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray,
     ValueError
         When there is none, one is no vertex or held twice, or a place is missing or not finite.
     """
-    vertices, places = index_array("fixed", fixed), real_array("target", target)
-    if vertices.ndim != 1 or not vertices.size:
-        raise ValueError(f"fixed must have shape (k,) with k > 0, not {vertices.shape}")
-    check_range("fixed", vertices, n)
-    times = np.bincount(vertices, minlength=n)
-    if times.max() > 1:
-        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
-    if places.shape != (vertices.size, 2):
-        raise ValueError(
-            f"target must have shape ({vertices.size}, 2), a position for every fixed vertex, not {places.shape}"
-        )
-    check_finite("target", "row", "rows", places)
-    return vertices, places
+    vertices = held_vertices(fixed, n)
+    if not vertices.size:
+        raise ValueError("fixed names no vertex: leave it and target out, or name one")
+    return vertices, held_places(target, vertices.size)
 
 
 # In powers of two: how many times further apart pins may be than the surface is large, or nearer, for energies.

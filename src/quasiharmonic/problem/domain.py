@@ -14,8 +14,7 @@ from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
     ReadOnly,
-    check_range,
-    index_array,
+    held_vertices,
     named,
     triangle_array,
     vertex_array,
@@ -65,7 +64,7 @@ class Domain(ReadOnly):
         self.F = triangle_array(F, len(self.V))
         self.edges = surface_edges(self.F, len(self.V))
         self.loops = trace_loops(self.edges.boundary)
-        self.fixed = _fixed(fixed, len(self.V))
+        self.fixed = held_vertices(fixed, len(self.V))
         self._seal()
         self._empty_caches()
 
@@ -177,14 +176,3 @@ class Domain(ReadOnly):
             exponent = int(np.frexp(np.max(np.abs(self.V)))[1])
             self._meshes[kind] = ReferenceMesh(np.ldexp(self.V, -exponent), self.F, kind)
         return self._meshes[kind]
-
-
-def _fixed(fixed: ArrayLike, n: int) -> IntArray:
-    array = index_array("fixed", fixed)
-    if array.ndim != 1:
-        raise ValueError(f"fixed must have shape (k,), not {array.shape}")
-    check_range("fixed", array, n)
-    times = np.bincount(array, minlength=n)
-    if times.max(initial=0) > 1:
-        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
-    return array

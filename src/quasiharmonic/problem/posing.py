@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, check_finite, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, held_places
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.frame import Frame
@@ -98,7 +98,7 @@ class Problem(ReadOnly):
 
     def _pose(self, domain: Domain, target: ArrayLike, reference: Reference | None) -> None:
         self.domain = domain
-        self.target = _target(target, len(domain.fixed))
+        self.target = held_places(target, len(domain.fixed))
         self.reference = reference
         self._seal()
 
@@ -184,11 +184,3 @@ class Problem(ReadOnly):
         area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in self.domain.loops)
         # The frame is of unit size, so rounding stays far below this.
         return area > -1e-12 and bool(np.any(self.target != self.target[0]))
-
-
-def _target(target: ArrayLike, k: int) -> FloatArray:
-    array = real_array("target", target)
-    if array.shape != (k, 2):
-        raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
-    check_finite("target", "row", "rows", array)
-    return array
