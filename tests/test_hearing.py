@@ -162,7 +162,7 @@ def stuck():
 
 def crossing():
     """A target that crosses itself a thousand times."""
-    V, F = cat(30)
+    V, F = cat(60)
     (loop,) = boundary_loops(F, len(V))
     target = arc_length(V[loop], letter("R")[0])
     return V, F, loop, target + 0.3 * np.random.default_rng(0).standard_normal(target.shape)
