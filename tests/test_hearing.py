@@ -63,6 +63,33 @@ def test_what_a_callback_raises_comes_out(impatient):
     assert seen == [1, 1]
 
 
+def test_one_who_has_stopped_it_is_not_asked_again(impatient):
+    seen = []
+
+    def stop(step):
+        seen.append(step)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    @heard
+    def interrupted(*, callback):
+        try:
+            callback(1)
+            still_at_it()
+        except KeyboardInterrupt:
+            still_at_it()
+            return "the best so far"
+
+    assert interrupted(callback=stop) == "the best so far"
+    assert seen == [1, 1]
+
+
+def test_what_is_no_callback_is_left_to_who_judges_it():
+    V, F, fixed, target = star_problem(n=60)
+    with pytest.raises((TypeError, ValueError), match="callback"):
+        injective_map(V, F, fixed, target, callback=5)
+
+
 def test_what_a_callback_does_is_its_own_affair(impatient):
     seen, states = [], []
 
@@ -135,7 +162,7 @@ def stuck():
 
 def crossing():
     """A target that crosses itself a thousand times."""
-    V, F = cat(30)
+    V, F = cat(60)
     (loop,) = boundary_loops(F, len(V))
     target = arc_length(V[loop], letter("R")[0])
     return V, F, loop, target + 0.3 * np.random.default_rng(0).standard_normal(target.shape)

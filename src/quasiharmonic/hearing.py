@@ -32,12 +32,14 @@ class _Hearing:
 
     def tell(self, step: Any) -> None:
         """Call the callback."""
-        self._told = [step]
+        # Once it has raised, what is left to be done is done undisturbed.
+        self._told = []
         # What it does takes part in nothing that is going on here.
         token = _HEARING.set(None)
         try:
             with np.errstate(**self._errors):
                 self._callback(step)
+            self._told = [step]
         finally:
             _HEARING.reset(token)
             self._when = time.monotonic()

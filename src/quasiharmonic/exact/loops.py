@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.predicates import SegmentRelation, box_pairs, orientation, segment_relation
-from quasiharmonic.hearing import still_at_it
 
 SignArray = NDArray[np.int8]
 
@@ -102,7 +101,6 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
     found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
     number = 0
     for i, j in box_pairs(np.minimum(p, q), np.maximum(p, q)):
-        still_at_it()
         relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
         near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
         i, j, relation = i[near], j[near], relation[near]

@@ -232,8 +232,11 @@ def harmonise_map(
     if status is not Status.INTERRUPTED:
         converged = status is Status.POLISHED and descent.history[-1].flipped == 0
         if not certificate.injective:
-            diagnosis = diagnose(problem)
-            status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
+            try:
+                diagnosis = diagnose(problem)
+                status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
+            except KeyboardInterrupt:
+                status = Status.INTERRUPTED
         elif not (descent.best < first or converged):
             status = Status.UNIMPROVED
     return MapResult(
