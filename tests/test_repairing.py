@@ -338,7 +338,7 @@ class TestCommand:
         assert [len(island["moved"]) > 0 for island in facts["islands"]] == [True, False, True]
         said = capsys.readouterr()
         assert f"wrote {out}: 3 islands: {facts['inverted_before']} triangles inverted before, 0 now" in said.out
-        assert "some.mtl, which is nowhere" in said.err
+        assert said.err == ""
 
     @pytest.mark.slow
     def test_the_other_commands_take_seams(self, uv_file, tmp_path, capsys):
