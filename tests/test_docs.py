@@ -15,6 +15,7 @@ PAGES = (
     FOLDER / "README.md",
     FOLDER / "docs" / "index.md",
     FOLDER / "docs" / "existence.md",
+    FOLDER / "docs" / "files.md",
     FOLDER / "docs" / "flatten.md",
     FOLDER / "docs" / "howto.md",
     FOLDER / "docs" / "method.md",

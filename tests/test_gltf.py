@@ -258,14 +258,17 @@ def test_what_is_too_large_for_single_precision(tmp_path):
         (lambda tree: tree["asset"].update(version="1.0"), "glTF 2.0"),
         (lambda tree: tree.update(extensionsUsed=["KHR_draco_mesh_compression"]), "without compression"),
         (lambda tree: tree.update(meshes=[]), "no triangles"),
-        (lambda tree: tree.update(meshes=3), "damaged"),
+        (lambda tree: tree.update(meshes=3), "meshes are no list"),
         (
             lambda tree: tree["meshes"].__setitem__(0, {"primitives": tree["meshes"][0]["primitives"] * 999}),
             "too often",
         ),
         (lambda tree: tree.update(scenes=[{"nodes": [7]}]), "damaged"),
         (lambda tree: tree["meshes"][0]["primitives"][0].update(indices=99), "damaged"),
-        (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=1), "shape"),
+        (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=1), "number of vertices"),
+        (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=0), "3 numbers a vertex"),
+        (lambda tree: tree["meshes"][0]["primitives"][0].update(targets=[{"POSITION": 7}]), "damaged"),
+        (lambda tree: tree.update(images=[3]), "images are no list"),
     ],
 )
 def test_what_is_damaged_is_named(change, message, tmp_path):

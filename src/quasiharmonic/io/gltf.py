@@ -25,6 +25,10 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _SHAPES = {width: shape for shape, width in _WIDTHS.items()}
 # What is packed by these cannot be read without libraries of their own.
 _PACKED = "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"
+_LISTS = (
+    *("accessors", "bufferViews", "buffers", "images", "materials", "textures"),
+    *("animations", "cameras", "meshes", "nodes", "scenes", "skins"),
+)
 _PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX 20": "image/ktx2"}
 # What goes wrong in a document whose parts are not what they should be.
 DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
@@ -168,8 +172,9 @@ def load(path: str | os.PathLike[str]) -> Document:
     data = read_bytes(path)
     try:
         text, chunk = _chunks(data) if data[:4] == b"glTF" else (data, None)
-        tree = json.loads(text)
+        tree = json.loads(text, parse_constant=_no_number)
         version = str(tree["asset"]["version"])
+        _check_lists(tree)
     except (*DAMAGE, RecursionError) as error:
         raise MeshFileError(path, f"is no glTF file: {error}") from error
     if not version.startswith("2."):
@@ -216,6 +221,18 @@ def whole(value: object) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
         raise ValueError(f"{ascii(value)[:40]} where a whole number should be")
     return value
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no JSON")
+
+
+def _check_lists(tree: dict[str, Any]) -> None:
+    """Raise a ValueError where what should be lists of objects is not."""
+    for name in _LISTS:
+        there = tree.get(name, [])
+        if not isinstance(there, list) or not all(isinstance(one, dict) for one in there):
+            raise ValueError(f"its {name} are no list of objects")
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:

@@ -111,7 +111,9 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
     """
     document = load(path)
     try:
-        mesh = _mesh(document, os.fspath(path))
+        # What is beyond all numbers is told where it is found.
+        with np.errstate(over="ignore", invalid="ignore"):
+            mesh = _mesh(document, os.fspath(path))
     except (*DAMAGE, RecursionError) as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
         raise MeshFileError(path, f"is damaged: {text}") from error
@@ -164,8 +166,7 @@ def _parts(document: Document) -> tuple[list[Pool], list[Part], IntArray, list[t
             key = json.dumps([attributes, targets], sort_keys=True)
             if key not in known:
                 known[key] = len(pools)
-                # Read, not believed: a count may say anything.
-                count = len(document.numbers(attributes["POSITION"]))
+                count = _common_count(document, [attributes, *targets])
                 pools.append(Pool(attributes, targets, m, vertices, count))
                 vertices += count
             pool = pools[known[key]]
@@ -190,6 +191,15 @@ def _parts(document: Document) -> tuple[list[Pool], list[Part], IntArray, list[t
             triangles.append(pool.first + own)
             faces += len(own)
     return pools, parts, np.concatenate(triangles), statements
+
+
+def _common_count(document: Document, of: list[dict[str, int]]) -> int:
+    """How many vertices some attributes have, which are read, since a count may say anything."""
+    count = len(document.numbers(of[0]["POSITION"]))
+    for name, accessor in (pair for attributes in of for pair in attributes.items()):
+        if len(document.numbers(accessor)) != count:
+            raise ValueError(f"{name} has another number of vertices than POSITION")
+    return count
 
 
 def _triangles(corners: IntArray, mode: int) -> IntArray:
@@ -221,8 +231,8 @@ def _attribute(document: Document, pools: list[Pool], name: str, width: int | No
     for pool, table in zip(pools, tables, strict=True):
         if table is None:
             continue
-        if len(table) != pool.count or table.shape[1] > width:
-            raise ValueError(f"{name} has another shape than its vertices")
+        if table.shape[1] > width:
+            raise ValueError(f"{name} has {table.shape[1]} numbers a vertex")
         rows = slice(pool.first, pool.first + pool.count)
         numbers[rows, : table.shape[1]] = table
         numbers[rows, table.shape[1] :] = 1.0

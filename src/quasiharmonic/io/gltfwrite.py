@@ -65,7 +65,7 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     if mesh.polygons is not None:
         lost.append("polygons, of which it has the triangles")
     if mesh.extra is not None and _colours(mesh) is None:
-        lost.append("what stands behind the coordinates of vertices and is no colour")
+        lost.append("what stands behind the coordinates of some vertices, or is no colour")
     if mesh.FN is not None and _normals(mesh) is None:
         lost.append("normals, which some faces lack")
     words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}

@@ -118,7 +118,7 @@ def not_in_ply(mesh: MeshData) -> list[str]:
     if mesh.statements.strip():
         lost.append("groups, names of materials and other statements")
     if mesh.extra is not None and _colours(mesh) is None:
-        lost.append("what stands behind the coordinates of vertices and is no colour")
+        lost.append("what stands behind the coordinates of some vertices, or is no colour")
     if mesh.FN is not None and _normals(mesh) is None:
         lost.append("normals, of which a vertex has several")
     return lost
