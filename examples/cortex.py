@@ -44,8 +44,8 @@ from numpy.typing import NDArray
 from common import INK, RED, FloatArray, colorbar, panels, run, save
 from quasiharmonic import certify, distortion
 from quasiharmonic.arrays import IntArray
+from quasiharmonic.energy.distances import SurfaceDistances, surface_distances
 from quasiharmonic.flattening.distance_descent import keep_distances
-from quasiharmonic.flattening.distances import SurfaceDistances, surface_distances
 from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.plot.shading import lit

@@ -12,16 +12,16 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from quasiharmonic import distortion, surfaces
+from quasiharmonic.energy.distances import surface_distances
 from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.distance_cascade import kept_by_coarse
 from quasiharmonic.flattening.distance_descent import DistanceDescent, keep_distances, kept
 from quasiharmonic.flattening.distance_energy import DistanceEnergy
-from quasiharmonic.flattening.distances import distance_error, surface_distances
 from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.geodesics import straight_segments
 from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.mesh.geodesics import straight_segments
 from quasiharmonic.result import Status
 from shared.told import Told
 
@@ -177,8 +177,8 @@ def test_scale_is_the_best_there_is(dome):
 
 def test_isometries_have_no_error_and_a_point_has_all(flat):
     V, F = flat
-    assert distance_error(rolled(V, 50.0), F, turned(V, 0.3), rings=5, crossings=20).mean < 1e-5
-    point = distance_error(V, F, np.zeros_like(V), rings=5)
+    assert surface_distances(rolled(V, 50.0), F, rings=5, crossings=20).error(turned(V, 0.3)).mean < 1e-5
+    point = distortion(V, F, np.zeros_like(V), rings=5).distances
     assert (point.mean, point.scale) == (1.0, 1.0)
 
 
@@ -188,7 +188,7 @@ def test_isometries_have_no_error_and_a_point_has_all(flat):
         ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
         ({"sources": 2.5}, "sources must be a whole number"),
         ({"crossings": -1}, "crossings must be a whole number of at least 0"),
-        ({"uv": np.zeros((3, 2))}, "uv must have shape (4, 2), a position for every vertex, not (3, 2)"),
+        ({"uv": np.zeros((3, 2))}, "a pair refers to vertex 3, but there are only vertices 0 … 2"),
         ({"uv": np.full((4, 2), np.nan)}, "uv is not finite at vertices 0, 1, 2, 3"),
         ({"V": np.zeros((4, 4))}, "V must have shape"),
         ({"V": [[0, 0], [1, 0], [2, 0], [0, 1]]}, "triangle 0 of zero area"),
@@ -199,12 +199,13 @@ def test_isometries_have_no_error_and_a_point_has_all(flat):
 def test_bad_input_is_named(options, message):
     given = {"V": [[0, 0], [1, 0], [1, 1], [0, 1]], "F": [[0, 1, 2], [0, 2, 3]], "uv": np.eye(4)[:, :2], **options}
     with pytest.raises(ValueError, match=re.escape(message)):
-        distance_error(**given)
+        uv = given.pop("uv")
+        surface_distances(**given).error(uv)
 
 
 def test_figures_come_with_how_they_were_taken(dome):
     V, F = dome
-    found = distance_error(V, F, V[:, :2], rings=3, sources=25, crossings=2)
+    found = surface_distances(V, F, rings=3, sources=25, crossings=2).error(V[:, :2])
     told = found.to_dict()
     assert (told["rings"], told["sources"], told["targets"], told["crossings"]) == (3, 25, None, 2)
     assert told["pairs"] == found.relative.size
@@ -314,7 +315,7 @@ def test_distances_are_kept_better_and_the_map_stays_bijective(dome):
     start = V[:, :2]
     steps = Told()
     result = keep_distances(V, F, start, rings=8, callback=steps.append)
-    before, after = (distance_error(V, F, uv, rings=8) for uv in (start, result.uv))
+    before, after = (distortion(V, F, uv, rings=8).distances for uv in (start, result.uv))
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
     assert certify(F, result.uv).bijective
@@ -339,7 +340,7 @@ def test_what_can_be_unrolled_is_unrolled(flat):
     V, F = flat
     start = np.stack([V[:, 0] * (1 + 0.5 * V[:, 0]), V[:, 1]], axis=1)
     result = keep_distances(rolled(V, 1.0), F, start, rings=8, tolerance=1e-6)
-    assert distance_error(V, F, result.uv, rings=8).mean < 5e-3
+    assert distortion(V, F, result.uv, rings=8).distances.mean < 5e-3
 
 
 def test_no_boundary_runs_into_itself():

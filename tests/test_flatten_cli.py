@@ -9,10 +9,9 @@ import sys
 import numpy as np
 import pytest
 
-from quasiharmonic import atlas, io
+from quasiharmonic import atlas, distortion, io
 from quasiharmonic.cli import main
 from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.distances import distance_error
 from quasiharmonic.surfaces import cat, grid
 
 
@@ -125,13 +124,16 @@ def test_distances(head, tmp_path, capsys):
     for energy in ("symmetric-dirichlet", "distances"):
         assert run("flatten", head, "-o", out, "--energy", energy, "--rings", 4, "--json", report) == 0
         facts = json.loads(report.read_text())
-        assert ("distance_error" in facts) == (energy == "distances")
+        assert ("distances" in facts["distortion"]) == (energy == "distances")
         assert run("measure", out, "--distances", "--rings", 4, "--json", tmp_path / "measured.json") == 0
-        errors.append(json.loads((tmp_path / "measured.json").read_text())["distance_error"])
-    assert facts["distance_error"] == pytest.approx(errors[1])
+        errors.append(json.loads((tmp_path / "measured.json").read_text())["distances"])
+    assert facts["distortion"]["distances"] == pytest.approx(errors[1])
     assert errors[1]["mean"] < 0.9 * errors[0]["mean"]
     V, F = cat(6)
-    assert facts["distance_error"]["mean"] == distance_error(V, F, io.map_of(io.read_mesh(out)), rings=4).mean
+    assert (
+        facts["distortion"]["distances"]["mean"]
+        == distortion(V, F, io.map_of(io.read_mesh(out)), rings=4).distances.mean
+    )
     # What belongs beside the figure is beside it.
     assert (errors[1]["rings"], errors[1]["crossings"], errors[1]["sources"]) == (4, 5, len(V))
     said = capsys.readouterr().out

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from quasiharmonic.exact.certificate import Certificate, certify, flipped_triangles, is_injective
     from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
     from quasiharmonic.flattening.distance_descent import keep_distances
-    from quasiharmonic.flattening.distances import distance_error
     from quasiharmonic.flattening.flattened import flatten
     from quasiharmonic.flattening.patterns import write_pattern
     from quasiharmonic.mesh.refinement import Refined, refine
@@ -69,7 +68,6 @@ _HOME = {
     "certify": "exact.certificate",
     "cut_open": "apply.cutting",
     "diagnose": "exact.diagnosis",
-    "distance_error": "flattening.distances",
     "distortion": "energy.measures",
     "find_cuts": "cuts.finding",
     "flatten": "flattening.flattened",
@@ -118,7 +116,6 @@ __all__ = [
     "certify",
     "cut_open",
     "diagnose",
-    "distance_error",
     "distortion",
     "find_cuts",
     "flatten",

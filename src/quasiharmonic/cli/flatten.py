@@ -81,7 +81,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import atlas, io
     from quasiharmonic.cli import judging, material, progress, report, seams
     from quasiharmonic.energy.measures import distortion
-    from quasiharmonic.flattening.distances import distance_error
     from quasiharmonic.flattening.patterns import write_pattern
 
     began = time.perf_counter()
@@ -124,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
     judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, mapped.mesh)))
     with report.after_writing(options.output):
         flat = io.without_idle(judged.V, judged.F, judged.uv)
-        measured = distortion(*flat)
+        measured = distortion(*flat, rings=options.rings if options.energy == "distances" else None)
         facts = {
             **mapped.to_dict(),
             **judged.to_dict(),
@@ -141,10 +140,8 @@ def run(options: argparse.Namespace) -> int:
         }
         worst = measured.summary("isometric").maximum
         lines = [report.of_maps(mapped, judged, options.output), *found.notes, f"stretched {worst:.3g} times at worst"]
-        if options.energy == "distances":
-            error = distance_error(*flat, rings=options.rings)
-            facts["distance_error"] = error.to_dict()
-            lines.append(error.summary())
+        if measured.distances is not None:
+            lines.append(measured.distances.summary())
         if options.pattern is not None:
             facts["pattern"] = str(options.pattern)
             write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)

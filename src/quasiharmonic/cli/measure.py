@@ -45,7 +45,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.cli import report
     from quasiharmonic.energy.measures import distortion
-    from quasiharmonic.flattening.distances import distance_error
 
     report.check_json(options.json, inputs=(options.input, options.export))
     if options.export is not None:
@@ -53,17 +52,15 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(options.input)
     V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
     with report.about(options.input):
-        found = distortion(V, F, uv)
-        off = distance_error(V, F, uv, rings=options.rings) if options.distances else None
+        found = distortion(V, F, uv, rings=options.rings if options.distances else None)
     if options.export is not None:
         # What is coloured by first is what bounds the error of a texture.
         values = {"isometric": found.isometric, **found.per_triangle()}
         io.write_per_triangle(options.export, V, F, uv, values)
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
     lines = [_table(found, len(mesh.F))]
-    if off is not None:
-        facts["distance_error"] = off.to_dict()
-        lines.append(off.summary())
+    if found.distances is not None:
+        lines.append(found.distances.summary())
     report.emit(facts, options.json, "\n".join(lines))
     return 0
 

@@ -18,6 +18,7 @@ import time
 
 import numpy as np
 
+from quasiharmonic.energy.distances import SurfaceDistances, sampled
 from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.exact.certificate import certify
@@ -25,7 +26,6 @@ from quasiharmonic.flattening.cascade import COARSEST, RATIO, STEPS, carried, cl
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.distance_descent import DistanceDescent, followed, in_scale, sampling_of
 from quasiharmonic.flattening.distance_energy import DistanceEnergy
-from quasiharmonic.flattening.distances import SurfaceDistances, sampled
 from quasiharmonic.flattening.hierarchy import Hierarchy, Level
 from quasiharmonic.flattening.piece import Piece, Settings
 from quasiharmonic.flattening.touching_up import LOWEST, thick_energy, touched_up

@@ -25,12 +25,12 @@ from quasiharmonic.arrays import (
     real_array,
     whole_number,
 )
+from quasiharmonic.energy.distances import Sampling, SurfaceDistances, sampled
 from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
-from quasiharmonic.flattening.distances import Sampling, SurfaceDistances, sampled
 from quasiharmonic.flattening.piece import Piece, Settings
 from quasiharmonic.hearing import heard
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
@@ -61,7 +61,7 @@ def keep_distances(
     """Bring distances in the plane near to distances along the surface; every map on the way is bijective.
 
     What is lowered is the mean, over a sample of pairs of vertices at most ``rings`` edges apart, of how far their
-    distance is off, as `distance_error` measures it but for errors below 30 % counting by their squares; and a small
+    distance is off, as `quasiharmonic.distortion` measures it but for errors below 30 % counting by their squares; and a small
     share of the symmetric Dirichlet energy, which keeps triangles from collapsing
     (`quasiharmonic.flattening.distance_energy`). The sample has 2,500 vertices, or all if there are no more, with 120
     others each, drawn at random, always the same; for fewer rings up to 4,000 vertices, for more down to 1,000, and
@@ -108,14 +108,14 @@ def keep_distances(
     A dome seen from above, its rim pressed together, is spread out:
 
     >>> import numpy as np
-    >>> from quasiharmonic.flattening.distances import distance_error
+    >>> from quasiharmonic import distortion
     >>> from quasiharmonic.surfaces import disk
     >>> flat, F = disk(12)
     >>> V = np.column_stack([flat, np.sqrt(1.1 - (flat**2).sum(axis=1))])
     >>> result = keep_distances(V, F, flat, rings=8)
     >>> result.certificate.bijective
     True
-    >>> errors = [distance_error(V, F, uv, rings=8).mean for uv in (flat, result.uv)]
+    >>> errors = [distortion(V, F, uv, rings=8).distances.mean for uv in (flat, result.uv)]
     >>> errors[1] < 0.5 * errors[0]
     True
     """

@@ -22,8 +22,8 @@ from scipy.sparse import csr_array
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.distances import SurfaceDistances
 from quasiharmonic.energy.energies import Deformation, QuadraticForm
-from quasiharmonic.flattening.distances import SurfaceDistances
 
 # Errors below this count by their squares, larger ones by their size (δ). On a cortex 0.1 has 3 % less of a mean error
 # and 11 % more of a root mean square.

@@ -9,7 +9,7 @@ way along edges has k of them. What is measured here, all of which belongs besid
   on a cortex of 9,465 vertices a thousand sources leave the mean uncertain by 0.3 % of the distances. To compare maps
   that does not matter, as long as it is the same sample; for a figure to be quoted take all vertices as sources.
 - *Along the surface*: the shortest chain of straight segments that cross at most so many edges each
-  (`quasiharmonic.flattening.geodesics`), on the surface as it has been cut: no way leads across a cut. Never too short,
+  (`quasiharmonic.mesh.geodesics`), on the surface as it has been cut: no way leads across a cut. Never too short,
   and with 5 crossings 0.2 % too long on average on a folded surface, with 3 crossings 0.6 %.
 - *In the plane*: straight, whatever lies between.
 - *Scale*: the map as a whole is scaled by the factor for which the mean error is least.
@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, real_array, whole_number
-from quasiharmonic.flattening.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
 from quasiharmonic.hearing import still_at_it
+from quasiharmonic.mesh.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
 
 # The farthest vertices are looked for up to so many mean edges for each ring.
 _REACH = 1.3
@@ -68,7 +68,7 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class DistanceError:
-    """How far the distances of a map are off; made by `distance_error`.
+    """How far the distances of a map are off; made by `SurfaceDistances.error`, or by `quasiharmonic.distortion` with ``rings``.
 
     Attributes
     ----------
@@ -256,58 +256,6 @@ def sampled(
     length = chain_lengths(segments, source, row, target, float(_REACH * sampling.rings * mean_edge))
     order = np.argsort(source[row], kind="stable")
     return SurfaceDistances(source[row][order], target[order], length[order], replace(sampling, sources=source.size))
-
-
-def distance_error(
-    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int = 20, sources: int = 1000, crossings: int = 5
-) -> DistanceError:
-    """Measure how far the distances of a map are off.
-
-    Sources are drawn at random among the vertices, always the same; from each the distances to all vertices at most
-    ``rings`` edges away are compared, along the surface against straight in the plane. All pairs count alike, and the
-    map is scaled as a whole such that their mean error is least. To judge several maps of one surface, sample it once
-    with `surface_distances` and ask that for the ``error`` of each.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) array
-        Rest positions.
-    F : (f, 3) array of int
-        Triangles of a surface, consistently oriented.
-    uv : (n, 2) array
-        The map, injective or not.
-    rings, sources, crossings
-        As `surface_distances` has them. Shortest paths are chains of straight segments that cross at most
-        ``crossings`` edges each: never too short, and with 5 on average 0.2 % too long where a surface is folded.
-
-    Returns
-    -------
-    DistanceError
-        With `~DistanceError.mean`, `~DistanceError.median` and `~DistanceError.rms` of ``|relative|``, and in
-        `~DistanceError.sampling` what belongs beside them.
-
-    Raises
-    ------
-    ValueError
-        As `surface_distances` does, or when ``uv`` has the wrong shape or is not finite.
-
-    Examples
-    --------
-    A square of 2 by 2 stretched to 4 by 2: lengths are off by up to a half, of which scaling takes a part.
-
-    >>> import numpy as np
-    >>> from quasiharmonic.surfaces import grid
-    >>> V, F = grid(12, 12)
-    >>> found = distance_error(V, F, V * [2, 1], rings=4)
-    >>> bool(0.15 < found.mean < 0.35), bool(0.5 < found.scale < 1)
-    (True, True)
-    >>> distance_error(V, F, 3 * V, rings=4).mean < 1e-2
-    True
-    """
-    n = len(np.asarray(V))
-    if np.shape(uv) != (n, 2):
-        raise ValueError(f"uv must have shape ({n}, 2), a position for every vertex, not {np.shape(uv)}")
-    return surface_distances(V, F, rings=rings, sources=sources, crossings=crossings).error(uv)
 
 
 def _along_curve(points: FloatArray) -> IntArray:
