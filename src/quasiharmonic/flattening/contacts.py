@@ -188,7 +188,7 @@ class Rim:
         radius = (_LOOKOUT * _REACH * around)[:, None]
         here, there = _planar(p), _planar(q)
         boxes = here - radius, here + radius, np.minimum(here, there), np.maximum(here, there)
-        found = [pairs[:, (pairs[0] != pairs[1]) & (pairs[0] != self._next[pairs[1]])] for pairs in _stacked(boxes)]
+        found = [self._apart(*pairs) for pairs in box_pairs_between(*boxes)]
         i, j = np.concatenate(found, axis=1) if found else np.zeros((2, 0), dtype=np.int64)
         reach = _REACH * np.minimum(around[i], length[j])
         d, normal, s = _nearest(p[i], p[j], q[j])
@@ -197,15 +197,20 @@ class Rim:
         # The way from the vertex to the edge leads through the outside, at both of its ends ...
         head = self._next[j]
         faced = ((q - p)[j].conj() * normal).imag < 0
-        faced = np.where(s == 0, ~self._within(p, j, normal), faced)
-        faced = np.where(s == 1, ~self._within(p, head, normal), faced)
-        faced &= ~self._within(p, i, -normal)
+        for place, at in ((0, j), (1, head)):
+            those = np.flatnonzero(s == place)
+            faced[those] = ~self._within(p, at[those], normal[those])
         # ... and is not an edge of the boundary.
         end = np.where(s == 0, j, np.where(s == 1, head, -1))
-        joined = (self._next[i] == end) | (self._previous[i] == end)
-        kept = np.flatnonzero(faced & ~joined)
-        corners = np.stack([self._vertex[i], self._vertex[j], self._vertex[head]])[:, kept]
+        kept = np.flatnonzero(faced & (self._next[i] != end) & (self._previous[i] != end))
+        kept = kept[~self._within(p, i[kept], -normal[kept])]
+        corners = self._vertex[np.stack([i[kept], j[kept], head[kept]])]
         return Contacts(corners, reach[kept])
+
+    def _apart(self, i: IntArray, j: IntArray) -> IntArray:
+        """Pairs (2, k) without those of a vertex and an edge of its own."""
+        apart = np.flatnonzero((i != j) & (i != self._next[j]))
+        return np.stack([i[apart], j[apart]])
 
     def _within(self, p: ComplexArray, i: IntArray, direction: ComplexArray) -> BoolArray:
         """Whether directions from vertices of the boundary lead into the surface."""
@@ -214,10 +219,6 @@ class Rim:
         convex = (ahead.conj() * behind).imag > 0
         inside: BoolArray = np.where(convex, left & right, left | right)
         return inside
-
-
-def _stacked(boxes: tuple[FloatArray, FloatArray, FloatArray, FloatArray]) -> list[IntArray]:
-    return [np.stack([i, j]) for i, j in box_pairs_between(*boxes)]
 
 
 def _planar(w: ComplexArray) -> FloatArray:

@@ -157,6 +157,7 @@ class GuardedDescent(FreeDescent):
         self._weight, self._slack = next(self._stages)
         super().__init__(GuardedEnergy(energy), uv, linear_solver, fixed)  # type: ignore[arg-type]
         self._near = self._ahead = rim.contacts(self.w)
+        self._room = self._near.room(self.w)
         self._known = Contacts.none().corners
 
     @property
@@ -206,7 +207,7 @@ class GuardedDescent(FreeDescent):
         if there is not None:
             near = self._rim.contacts(w)
             # Pairs that only face each other since count by how near they were, or no step might be short enough.
-            before = min(self._near.room(self.w), near.room(self.w), _NARROWER)
+            before = min(self._room, near.room(self.w), _NARROWER)
             if near.room(w) < _NARROWER * before or self._rim.meets_itself(self.positions(w)):
                 return value, None
             self._ahead = near
@@ -217,6 +218,7 @@ class GuardedDescent(FreeDescent):
         if moved:
             # The last map that was accepted is the one that was gone to.
             self._near = self._ahead
+            self._room = self._near.room(self.w)
         return moved
 
 
