@@ -24,7 +24,8 @@ from quasiharmonic.linsolve.superlu import SuperLU
 _ORDERING = "amf"
 # Below this many unknowns there is nothing to do in parallel, and from this many threads on no more is gained.
 SEQUENTIAL_BELOW, _MOST_THREADS = 30_000, 4
-# What limits the threads of other libraries limits rslab's, which is told a number and looks at none of these.
+# What limits the threads of other libraries limits rslab's in factoring, where it is told a number. Its solves, a tenth of
+# the time, take what RAYON_NUM_THREADS allows, whatever they are told (1.7).
 _LIMITS = "OMP_NUM_THREADS", "RAYON_NUM_THREADS"
 # What rslab says of a pivot that is zero, by an exception of no class of its own.
 _SINGULAR = "rank-deficient"
