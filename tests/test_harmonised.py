@@ -14,6 +14,7 @@ from quasiharmonic.energy.energies import MIPS, AreaPreserving, Combination, Ene
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.regularisers import Conformal
+from quasiharmonic.linsolve import available
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.search.harmonised import Harmonised
 from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map
@@ -317,7 +318,7 @@ class TestHarmonise:
         assert stopped.injective
         assert len(stopped.history) == 13
 
-    @pytest.mark.parametrize("linear_solver", ["superlu", "qdldl"])
+    @pytest.mark.parametrize("linear_solver", available())
     def test_other_linear_solvers(self, linear_solver):
         V, F, uv, fixed = bowl()
         result = harmonise(V, F, uv, fixed=fixed, energy="mips", linear_solver=linear_solver)

@@ -397,7 +397,7 @@ class TestLinearSolver:
         with pytest.raises(ValueError, match="superlu"):
             injective_map(*star_problem(n=60), linear_solver="magic")
 
-    @pytest.mark.parametrize("name", ["superlu", "qdldl"])
+    @pytest.mark.parametrize("name", quasiharmonic.linsolve.available())
     def test_named_one_is_used_and_agrees(self, name):
         best, other = injective_map(*star_problem()), injective_map(*star_problem(), linear_solver=name)
         assert other.linear_solver == name
@@ -441,6 +441,8 @@ class TestLinearSolver:
     def test_another_backend_takes_over(self, monkeypatch):
         problem = Problem(*turned_ring(180))
         best, *others = quasiharmonic.linsolve.available(problem.domain.laplacian().solver.nnz)
+        if not others:
+            pytest.skip("SuperLU is the only linear solver here")
 
         def fail(values):
             raise NotPositiveDefinite("as asked")

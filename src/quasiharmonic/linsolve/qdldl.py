@@ -1,4 +1,4 @@
-"""QDLDL, a small LDLᵀ factorisation with wheels for every platform: the default where MKL does not exist."""
+"""QDLDL, a small LDLᵀ factorisation with wheels for every platform: for small systems where MKL is not installed."""
 
 from __future__ import annotations
 

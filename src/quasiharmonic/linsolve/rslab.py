@@ -22,9 +22,12 @@ from quasiharmonic.linsolve.superlu import SuperLU
 # Minimum fill. Left to itself rslab tries several orders. Its nested dissection takes five times as long to analyse
 # (300,000 unknowns: 3.3 s against 0.3 to 0.6) for a factor that is never twice as quick. It takes no order of ours.
 _ORDERING = "amf"
+# Supernodes of fewer columns are merged: half of rslab's own number, up to a tenth off factor and solve of large ones.
+_NEMIN = 8
 # Below this many unknowns there is nothing to do in parallel, and from this many threads on no more is gained.
 SEQUENTIAL_BELOW, _MOST_THREADS = 30_000, 4
-# What limits the threads of other libraries limits rslab's, which is told a number and looks at none of these.
+# What limits the threads of other libraries limits rslab's in factoring, where it is told a number. Its solves, a tenth
+# of the time, take what RAYON_NUM_THREADS allows, whatever they are told (1.7).
 _LIMITS = "OMP_NUM_THREADS", "RAYON_NUM_THREADS"
 # What rslab says of a pivot that is zero, by an exception of no class of its own.
 _SINGULAR = "rank-deficient"
@@ -54,7 +57,7 @@ class Rslab(LinearSolver):
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
         self._symbolic: Any = self._tried(
-            lambda: rslab.analyze(pattern, path="ldlt", ordering=_ORDERING, threads=threads)
+            lambda: rslab.analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=_NEMIN, threads=threads)
         )
         self._numeric: Any = None
         self._second: LinearSolver | None = None
