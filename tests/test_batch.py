@@ -122,7 +122,7 @@ class TestFinding:
         with pytest.raises(ValueError, match=r"list.txt: line 2: .*nowhere"):
             names(stars / "list.txt")
         (stars / "list.txt").write_bytes(b"\x89PNG\r\n\x1a\0")
-        with pytest.raises(ValueError, match=r"line 1: there is no folder and no OBJ or OFF file '\\udc89PNG'"):
+        with pytest.raises(ValueError, match=r"line 1: there is no folder and no mesh file '\\udc89PNG'"):
             names(stars / "list.txt")
         with pytest.raises(ValueError, match="there is no folder, list or mesh"):
             names(stars / "none")

@@ -232,6 +232,17 @@ def test_single_precision_is_what_is_judged(tmp_path):
     np.testing.assert_array_equal(certify(again.F, io.map_of(again)).degenerate, [0])
 
 
+def test_vertices_that_single_precision_joins_are_told_before(tmp_path):
+    """Two triangles that touch at a corner without sharing it, and one that is too small to keep its corners."""
+    V = np.array([[0, 0], [1, 0], [0, 1], [0, 0], [-1, 0], [0, -1], [5, 5], [5 + 1e-9, 5], [5, 6.0]])
+    mesh = MeshData(V, np.arange(9).reshape(3, 3))
+    (digits, joined) = io.not_held("out.glb", mesh)
+    assert digits.startswith("digits")
+    assert joined.startswith("2 vertices at positions that others have too")
+    io.write_map(tmp_path / "out.glb", mesh, V)
+    assert len(io.read_mesh(tmp_path / "out.glb").V) == 7
+
+
 def test_what_is_too_large_for_single_precision(tmp_path):
     V, F = cat(4)
     mesh = MeshData(V, F)

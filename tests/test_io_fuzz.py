@@ -1,4 +1,8 @@
+import copy
+import json
 import tempfile
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +16,7 @@ from quasiharmonic.io import obj as obj_module
 from quasiharmonic.io import off as off_module
 from quasiharmonic.io.objlines import read_obj_lines
 from shared.damaged import VALID, damaged
+from shared.gltf_files import SQUARE, square
 
 quick = settings(max_examples=150, deadline=None)
 
@@ -181,7 +186,46 @@ def test_damaged_files(name, data):
     assert 0 <= handles.min() <= handles.max() < 4
 
 
-@pytest.mark.parametrize("name", ["fuzz.obj", "fuzz.off"])
+def branches(node, path=()):
+    """Where the values of a document are."""
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from branches(value, (*path, key))
+
+
+odd_values = st.one_of(
+    st.sampled_from([None, True, "", "x", [], {}, [0], [1] * 16, 1e999, "data:,x", "VEC4", "MAT4", 5121, 5125]),
+    st.integers(-2, 7),
+    st.integers(10**9, 10**20),
+)
+
+
+@quick
+@given(data=st.data())
+def test_odd_documents(data):
+    """A glTF file with values in it that are not what they should be is refused, or can be written again."""
+    made = square(TEXCOORD_0=SQUARE[:, :2], NORMAL=SQUARE)
+    made.tree |= {"nodes": [{"mesh": 0, "scale": [1, 2, 3]}], "scenes": [{"nodes": [0]}], "images": [{"uri": "a.png"}]}
+    made.tree["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": made.accessor(SQUARE)}]
+    tree = json.loads(made.gltf())
+    for _ in range(data.draw(st.integers(1, 2))):
+        *above, last = data.draw(st.sampled_from(sorted(branches(tree), key=str)))
+        reduce(lambda node, key: node[key], above, tree)[last] = copy.deepcopy(data.draw(odd_values))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "odd.gltf"
+        path.write_text(json.dumps(tree))
+        try:
+            mesh = io.read_mesh(path)
+        except MeshFileError as error:
+            str(error).encode()
+            return
+        torn = np.arange(mesh.F.size).reshape(-1, 3)
+        io.write_mapped(path, replace(mesh, vt=np.arange(2.0 * mesh.F.size).reshape(-1, 2), FT=torn))
+        np.testing.assert_array_equal(io.read_mesh(path).F, mesh.F)
+
+
+@pytest.mark.parametrize("name", ["fuzz.obj", "fuzz.off", "fuzz.ply", "fuzz.glb", "fuzz.stl"])
 @quick
 @given(data=st.binary(max_size=200))
 def test_arbitrary_bytes(name, data):

@@ -196,6 +196,17 @@ def test_a_picture_that_is_damaged_is_named(tmp_path):
     assert not (tmp_path / "out.png").exists()
 
 
+def test_a_picture_is_drawn_on_the_surface_alone(tmp_path, qhm):
+    (tmp_path / "in.obj").write_text(SQUARE + HALVES)
+    asked = "plot", tmp_path / "in.obj", "-o", tmp_path / "out.png", "--picture", gradient(tmp_path / "photo.png")
+    status, _, told = qhm(*asked, "--kind", "distortion")
+    assert status == 2
+    assert "--kind distortion" in told
+    status, said, told = qhm(*asked[:4], "--picture", tmp_path / "out.png")
+    assert status == 2
+    assert qhm(*asked)[0] == 0
+
+
 def test_what_goes_with_an_obj_replaces_nothing_of_the_users(tmp_path, qhm):
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
     picture = gradient(tmp_path / "out-texture.png")

@@ -118,7 +118,7 @@ def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
             place = Path(os.path.abspath(path.parent / text))
             if not (place.is_dir() or (place.suffix.lower() in READERS and place.is_file())):
                 raise ValueError(
-                    f"{path}: line {number}: there is no folder and no OBJ or OFF file {text[:100]!r}; "
+                    f"{path}: line {number}: there is no folder and no mesh file {text[:100]!r}; "
                     "a list names one in every line"
                 )
             base = path.parent if place.is_relative_to(path.parent) else Path(place.anchor)

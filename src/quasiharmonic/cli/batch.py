@@ -72,12 +72,12 @@ def add_parser(commands: Commands) -> None:
     solver.add_argument(
         "--to",
         metavar="OUTLINE",
-        help=f"take every OBJ and OFF file, its boundary to go to {targets.FORMS}",
+        help=f"take every mesh file, its boundary to go to {targets.FORMS}",
     )
     solver.add_argument(
         "--flatten",
         action="store_true",
-        help="take every OBJ and OFF file and lay it flat, its boundary free, without overlap",
+        help="take every mesh file and lay it flat, its boundary free, without overlap",
     )
     solver.add_argument(
         "--cut", action="store_true", help="with --to and --flatten: cut what does not lie flat, along seams"

@@ -14,12 +14,12 @@ from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.gltf import DAMAGE, Document, load, whole
 from quasiharmonic.io.meshdata import Carried, MeshData
-from quasiharmonic.io.ply import normal_lines
-from quasiharmonic.io.stl import welded
+from quasiharmonic.io.normals import normal_lines
+from quasiharmonic.io.welding import welded
 
 PLACES = "TEXCOORD_0"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_CAREFREE = "POSITION", "NORMAL", "COLOR_0", PLACES
+_READ = "POSITION", "NORMAL", "COLOR_0", PLACES
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class CarriedGltf(Carried):
         found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]
         if any(pool.targets for pool in self.pools):
             found.append("morph targets")
-        names = sorted({name for pool in self.pools for name in pool.attributes if name not in _CAREFREE})
+        names = sorted({name for pool in self.pools for name in pool.attributes if name not in _READ})
         return found + [f"{name} of vertices" for name in names]
 
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray, counted
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.gltf import Document, embed_pictures
 from quasiharmonic.io.gltfmesh import PLACES, CarriedGltf, Pool
 from quasiharmonic.io.meshdata import MeshData
-from quasiharmonic.io.ply import normal_rows
+from quasiharmonic.io.normals import normal_rows
 from quasiharmonic.io.textures import Texture
 
 _EXACT = 2.0**-53
@@ -62,6 +62,11 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
         missing = embed_pictures(carried.document.copy(), carried.folder)
         return [f"the picture {name}, which is not beside {mesh.source} or is none" for name in missing]
     lost = ["digits beyond single precision"] if carried is None else [*carried.further()]
+    with np.errstate(over="ignore"):
+        apart = len(np.unique(mesh.V.astype(np.float32), axis=0))
+    if apart < len(mesh.V):
+        same = counted("vertex", "vertices", len(mesh.V) - apart)
+        lost.append(f"{same} at positions that others have too in single precision")
     if mesh.polygons is not None:
         lost.append("polygons, of which it has the triangles")
     if mesh.extra is not None and _colours(mesh) is None:
@@ -71,7 +76,7 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}
     if words & {b"o", b"g", b"s"}:
         lost.append("groups")
-    if b"mtllib" in words:
+    if b"mtllib" in words and mesh.texture is None:
         lost.append("what materials look like")
     return lost
 

@@ -13,6 +13,7 @@ from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.meshdata import Carried, MeshData, polygon_mesh, vertex_places
+from quasiharmonic.io.normals import normal_lines, normal_rows
 from quasiharmonic.io.plytables import Column, Element, PlyTables, decoded, encoded
 from quasiharmonic.io.textual import read_bytes
 
@@ -150,20 +151,6 @@ def _mesh(tables: PlyTables, source: str) -> MeshData:
         source=source,
     )
     return replace(mesh, carried=CarriedPly(tables, mesh.V, mesh.F))
-
-
-def normal_lines(normals: FloatArray) -> bytes:
-    """Normals (k, 3) as the lines of an OBJ file."""
-    return ("vn %r %r %r\n" * len(normals) % tuple(normals.ravel().tolist())).encode()
-
-
-def normal_rows(lines: bytes) -> FloatArray | None:
-    """Normals (k, 3) of the lines of an OBJ file; None where one is not three numbers."""
-    try:
-        rows = [[float(word) for word in line.split(b"#")[0].split()[1:]] for line in lines.splitlines()]
-        return np.array(rows, dtype=np.float64).reshape(len(rows), 3)
-    except ValueError:
-        return None
 
 
 def _table(element: Element, *names: str) -> FloatArray | None:

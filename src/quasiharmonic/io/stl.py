@@ -7,10 +7,11 @@ import re
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.meshdata import MeshData
 from quasiharmonic.io.textual import read_bytes
+from quasiharmonic.io.welding import welded
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
@@ -55,25 +56,6 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
     except ValueError as error:
         raise MeshFileError(path, str(error)) from error
-
-
-def welded(points: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Make one of points that are equal.
-
-    Parameters
-    ----------
-    points : (k, d) float64
-
-    Returns
-    -------
-    unique : (n, d) float64
-        In the order in which they come first.
-    which : (k,) int64
-        For each point its row of ``unique``.
-    """
-    _, first, which = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    return points[first[order]], np.argsort(order)[which.ravel()]
 
 
 def _binary(data: bytes) -> FloatArray | None:
