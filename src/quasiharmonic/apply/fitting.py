@@ -22,6 +22,9 @@ from quasiharmonic.targets.contours import corners as corners_of
 from quasiharmonic.targets.contours import in_unit
 from quasiharmonic.targets.nesting import filled
 
+# Outlines of several islands stand so far apart, as a share of their width.
+_GAP = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -92,6 +95,7 @@ def laid_along(
     corners: AskedCorners | None = None,
     corner_angle: float = 20.0,
     reference: Reference | None = None,
+    beside: int = 0,
 ) -> Fitted:
     """Lay a surface's boundary along an outline, whose holes are filled for a surface that has none.
 
@@ -105,6 +109,8 @@ def laid_along(
         Both as `boundary_to` takes them.
     reference : {"equilateral", "rest", "corrected"}, optional
         As `Problem` takes it.
+    beside : int
+        Which copy of the outline, from the left: several islands have one each, side by side.
 
     Returns
     -------
@@ -115,6 +121,9 @@ def laid_along(
     ValueError
         As `boundary_to` and `Problem`; when corners are none of the boundary.
     """
+    if beside:
+        right = beside * (1 + _GAP) * float(np.ptp(np.concatenate(contours)[:, 0]))
+        contours = [contour + np.array([right, 0.0]) for contour in contours]
     whole = filled(contours)
     holes = len(contours) - len(whole)
     try:

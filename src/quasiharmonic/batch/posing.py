@@ -19,9 +19,6 @@ from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.mesh.seams import Island, SeamedMesh
 from quasiharmonic.targets.asked_corners import AskedCorners, read_corners
 
-# Outlines of several islands stand so far apart, as a share of their width.
-_GAP = 0.05
-
 
 class Posed(NamedTuple):
     """The problem of one island.
@@ -96,11 +93,8 @@ def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings
 def _onto(island: Island, k: int, asked: AskedCorners | None, settings: dict[str, Any]) -> Fitted:
     """An island laid along the outline; the ``k``-th one has it further to the right, for itself."""
     contours = _outline(settings["to"], _changed(settings["to"]))
-    if k:
-        right = k * (1 + _GAP) * float(np.ptp(np.concatenate(contours)[:, 0]))
-        contours = [contour + np.array([right, 0.0]) for contour in contours]
     corners = None if asked is None else asked.within(island.vertices)
-    return laid_along(island.V, island.F, contours, corners=corners, reference=settings["reference"])
+    return laid_along(island.V, island.F, contours, corners=corners, reference=settings["reference"], beside=k)
 
 
 def _changed(to: str) -> int:

@@ -104,10 +104,9 @@ def run(options: argparse.Namespace) -> int:
     if len(islands) > 1 and options.slide and options.to is not None:
         raise ValueError(f"--slide is for one island on the outline, and there are {len(islands)}")
     posed: list[Posed] = []
-    apart = targets.width(options) if options.to is not None and len(islands) > 1 else 0.0
 
     def solved(island: Island) -> MapResult:
-        one = targets.pose(options, island, fixed, apart * len(posed))
+        one = targets.pose(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
         chosen = options.strategy, options.polish, options.max_iterations, options.linear_solver

@@ -108,7 +108,7 @@ def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np
         )
 
 
-def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None, right: float) -> Posed:
+def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None, beside: int) -> Posed:
     """Make the problem that the options ask for of an island.
 
     Parameters
@@ -117,8 +117,8 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     island : Island
     fixed : (k,) int64 or None
         The mesh's vertices to hold where their vt are; boundaries, if None.
-    right : float
-        How far the outline is shifted to the right, for its own place beside those of other islands.
+    beside : int
+        Which copy of the outline is its own, from the left.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     if options.to is None:
         posed = Posed(held_in_place(island, fixed, reference=options.reference))
     else:
-        posed = _onto_outline(options, island, right)
+        posed = _onto_outline(options, island, beside)
     if options.to is not None and not options.refine:
         with report.about(options.input):
             _check_room(posed.fitted.problem, options.to)
@@ -142,14 +142,12 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
             edges = "edge" if posed.fitted.added == 1 else "edges"
             posed.notes.append(f"split {posed.fitted.added} {edges}: new vertices are at the end of the list")
     if options.slide:
-        _slide(options, posed, island, right)
+        _slide(options, posed)
     return posed
 
 
-def _onto_outline(options: argparse.Namespace, island: Island, right: float) -> Posed:
+def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> Posed:
     """Lay the boundary along an outline."""
-    import numpy as np
-
     from quasiharmonic.apply.fitting import laid_along
     from quasiharmonic.cli import report
     from quasiharmonic.targets import outline
@@ -159,13 +157,17 @@ def _onto_outline(options: argparse.Namespace, island: Island, right: float) -> 
     except ValueError as error:
         text = str(error)
         raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
-    if right:
-        contours = [contour + np.array([right, 0.0]) for contour in contours]
     corners = None if options.corners is None else read_corners(options.corners).within(island.vertices)
     angle = 20.0 if options.corner_angle is None else options.corner_angle
     with report.about(f"{options.input} --to {options.to}"):
         fitted = laid_along(
-            island.V, island.F, contours, corners=corners, corner_angle=angle, reference=options.reference
+            island.V,
+            island.F,
+            contours,
+            corners=corners,
+            corner_angle=angle,
+            reference=options.reference,
+            beside=beside,
         )
     posed = Posed(fitted)
     if options.corners == "auto" and fitted.held:
@@ -180,18 +182,7 @@ def _onto_outline(options: argparse.Namespace, island: Island, right: float) -> 
     return posed
 
 
-def width(options: argparse.Namespace) -> float:
-    """How far outlines stand apart, of which every island has one of its own."""
-    from quasiharmonic.targets import outline
-
-    contours = outline(options.to, font=options.font)
-    low, high = (float(pick(c[:, 0])) for pick, c in ((min, contours[0]), (max, contours[0])))
-    for contour in contours:
-        low, high = min(low, float(contour[:, 0].min())), max(high, float(contour[:, 0].max()))
-    return 1.05 * (high - low)
-
-
-def _slide(options: argparse.Namespace, posed: Posed, island: Island, right: float) -> None:
+def _slide(options: argparse.Namespace, posed: Posed) -> None:
     """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
     from dataclasses import replace
 
