@@ -92,6 +92,24 @@ def test_only_the_map_changes(tmp_path):
     assert "JOINTS_0 of vertices" in io.not_held("out.ply", mesh)
 
 
+def test_what_others_refer_to_stays(tmp_path):
+    """Two sets of coordinates by one accessor, and two meshes by the same: only what is the map's changes."""
+    made = square(TEXCOORD_0=SQUARE[:, :2])
+    first = made.tree["meshes"][0]["primitives"][0]
+    first["attributes"]["TEXCOORD_1"] = shared = first["attributes"]["TEXCOORD_0"]
+    made.mesh({"attributes": {"POSITION": made.accessor(SQUARE + 5), "TEXCOORD_0": shared}, "indices": 2})
+    mesh = read(made, tmp_path)
+    uv = 0.5 * mesh.V[:, :2]
+    io.write_map(tmp_path / "out.glb", mesh, uv)
+    data = (tmp_path / "out.glb").read_bytes()
+    one, other = (shape["primitives"][0]["attributes"] for shape in opened(data)[0]["meshes"])
+    np.testing.assert_array_equal(numbers(data, one["TEXCOORD_1"]), SQUARE[:, :2])
+    for attributes, rows in ((one, uv[:4]), (other, uv[4:])):
+        np.testing.assert_array_equal(
+            numbers(data, attributes["TEXCOORD_0"]), np.column_stack([rows[:, 0], 1 - rows[:, 1]])
+        )
+
+
 def test_vertices_are_split_along_seams_with_all_that_they_have(tmp_path):
     colours = np.arange(12, dtype="u1").reshape(4, 3) * 10
     made = square(TEXCOORD_0=SQUARE[:, :2], COLOR_0=colours)

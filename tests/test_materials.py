@@ -202,7 +202,7 @@ def test_a_picture_is_drawn_on_the_surface_alone(tmp_path, qhm):
     status, _, told = qhm(*asked, "--kind", "distortion")
     assert status == 2
     assert "--kind distortion" in told
-    status, said, told = qhm(*asked[:4], "--picture", tmp_path / "out.png")
+    status, *_ = qhm(*asked[:4], "--picture", tmp_path / "out.png")
     assert status == 2
     assert qhm(*asked)[0] == 0
 

@@ -125,6 +125,10 @@ def test_an_obj_as_ply(tmp_path):
         (MIXED.replace(b"4 0 1 2 3", b"4 0 1 2 9"), "refers to vertex 9"),
         (MIXED.replace(b"4 0 1 2 3", b"4 0 1 2 1"), "vertex twice"),
         (MIXED.replace(b"3 3 2 4 6", b"-3 3 2 4 6"), "no uchar"),
+        (
+            swapped(MIXED).replace(b"list uchar int", b"list char int").replace(b"\4\0\0\0\0", b"\xff\0\0\0\0"),
+            "of -1 num",
+        ),
         (MIXED.replace(b".1 2 0", b"nan 2 0"), "not finite"),
         (MIXED.replace(b".1 2 0", b"1_0 2 0"), "underscore"),
         (MIXED.replace(b"8 0 0 .5 0 .5 .5 0 .5", b"4 0 0 .5 0"), "4 numbers of texcoord and 4 corners"),
