@@ -15,11 +15,12 @@ converges faster.
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import Deformation
+from quasiharmonic.energy.energies import QuadraticForm
 from quasiharmonic.energy.line_search import backtrack, extend
 from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.exact.certificate import is_injective
@@ -52,13 +53,44 @@ def _out_of_units(w: ComplexArray, exponent: int) -> FloatArray:
     return np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
 
 
+class Lowered(Protocol):
+    """What `NewtonDescent` asks of an energy: a barrier on a mesh, such as `DeformationEnergy`.
+
+    What ``deform`` makes of a map is handed to the other methods as it is, and is nobody else's concern.
+
+    Attributes
+    ----------
+    F : (f, 3) int64
+    g : (3, f) complex128
+        As `NewtonSystem` has them: each quadratic form of ``curvature_of`` is on one of these triangles.
+    """
+
+    F: IntArray
+    g: ComplexArray
+
+    def deform(self, w: ComplexArray) -> Any:
+        """What the other methods read of a map (n,)."""
+
+    def value_of(self, moment: Any, /) -> float:
+        """The energy; ``inf`` where a triangle is inverted."""
+
+    def gradient_of(self, moment: Any, n: int, /) -> ComplexArray:
+        """The derivative by ``n`` positions; (n,) complex128."""
+
+    def curvature_of(self, moment: Any, /, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivatives; ``negative`` as `Energy.curvature` has it."""
+
+    def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
+        """How far along a direction each triangle's area first vanishes; (f,) float64."""
+
+
 class NewtonDescent:
     """The map at hand and how to get to the next.
 
     Parameters
     ----------
-    energy : DeformationEnergy
-        A barrier, for maps in units of ``2 ** exponent``.
+    energy : Lowered
+        For maps in units of ``2 ** exponent``.
     uv : (n, 2) float64
         An injective map.
     fixed : (k,) int64
@@ -79,9 +111,7 @@ class NewtonDescent:
         Of the unit of computation.
     """
 
-    def __init__(
-        self, energy: DeformationEnergy, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
-    ) -> None:
+    def __init__(self, energy: Lowered, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str) -> None:
         self.energy = energy
         self.fixed, self._pinned = fixed, uv[fixed]
         self.exponent = exponent
@@ -167,9 +197,9 @@ class NewtonDescent:
         """The displacement of the free vertices under a load on them, the matrix being factored."""
         return self.system.solve(load)
 
-    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
-        """The energy of a map (n,) complex128, and the map with its Jacobians if it may be gone on from: if its energy
-        is below a bound and every triangle, exactly, positive.
+    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
+        """The energy of a map (n,) complex128, and the map with what was made of it if it may be gone on from: if its
+        energy is below a bound and every triangle, exactly, positive.
         """
         deformation = self.energy.deform(w)
         value = self.energy.value_of(deformation)
@@ -185,7 +215,7 @@ class NewtonDescent:
         limit = FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
         start, before = self.w, self.value
 
-        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
             return self.tried(start + t * full, bound)
 
         taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=HALVINGS)

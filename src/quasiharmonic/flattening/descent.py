@@ -6,14 +6,14 @@ One vertex is held, or the map could drift. It may turn: the raised diagonal of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import Deformation, Energy, QuadraticForm
-from quasiharmonic.energy.newton_descent import NewtonDescent
+from quasiharmonic.energy.energies import Energy, QuadraticForm
+from quasiharmonic.energy.newton_descent import Lowered, NewtonDescent
 from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
 from quasiharmonic.flattening.reweighted import ReweightedDirichlet
@@ -33,7 +33,7 @@ _NARROWER = 0.3
 class _Moment(NamedTuple):
     """A map as a `GuardedEnergy` reads it."""
 
-    surface: Deformation
+    surface: Any
     w: ComplexArray
 
 
@@ -42,7 +42,7 @@ class GuardedEnergy:
 
     Parameters
     ----------
-    surface : DeformationEnergy
+    surface : Lowered
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class GuardedEnergy:
         The factor on each contact's barrier.
     """
 
-    def __init__(self, surface: DeformationEnergy) -> None:
+    def __init__(self, surface: Lowered) -> None:
         self.surface = surface
         self.F, self.g = surface.F, surface.g
         self.contacts, self.strangers, self.stiffness = Contacts.none(), Contacts.none(), 0.0
@@ -92,7 +92,7 @@ class FreeDescent(NewtonDescent):
 
     Parameters
     ----------
-    energy : DeformationEnergy
+    energy : Lowered
     uv : (n, 2) float64
         An injective map, of about unit size.
     linear_solver : str
@@ -101,7 +101,7 @@ class FreeDescent(NewtonDescent):
     """
 
     def __init__(
-        self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str, fixed: Sequence[int] | IntArray = (0,)
+        self, energy: Lowered, uv: FloatArray, linear_solver: str, fixed: Sequence[int] | IntArray = (0,)
     ) -> None:
         super().__init__(energy, uv, np.asarray(fixed, dtype=np.int64), 0, linear_solver)
 
@@ -111,7 +111,7 @@ class FreeDescent(NewtonDescent):
         return self.positions(self.w)
 
     @property
-    def surface(self) -> DeformationEnergy:
+    def surface(self) -> Lowered:
         """The energy of the surface alone."""
         return self.energy
 
@@ -121,7 +121,8 @@ class FreeDescent(NewtonDescent):
         return self.value
 
     def turn_to(self, density: Energy) -> None:
-        """Go on with another density on the same triangles."""
+        """Go on with another density on the same triangles; only of a `DeformationEnergy`, which has one."""
+        assert isinstance(self.surface, DeformationEnergy)
         self.surface.energy = density
         self.value = self.energy.value_of(self._deformation)
         self._cut, self._idle = True, 0
@@ -142,11 +143,11 @@ class GuardedDescent(FreeDescent):
         The surface's boundary.
     """
 
-    energy: GuardedEnergy  # type: ignore[assignment]
+    energy: GuardedEnergy
 
     def __init__(
         self,
-        energy: DeformationEnergy,
+        energy: Lowered,
         uv: FloatArray,
         linear_solver: str,
         rim: Rim,
@@ -155,20 +156,20 @@ class GuardedDescent(FreeDescent):
         self._rim, self._linear_solver = rim, linear_solver
         self._stages = iter(_STAGES)
         self._weight, self._slack = next(self._stages)
-        super().__init__(GuardedEnergy(energy), uv, linear_solver, fixed)  # type: ignore[arg-type]
+        super().__init__(GuardedEnergy(energy), uv, linear_solver, fixed)
         self._near = self._ahead = rim.contacts(self.w)
         self._room = self._near.room(self.w)
         self._known = Contacts.none().corners
 
     @property
-    def surface(self) -> DeformationEnergy:
+    def surface(self) -> Lowered:
         """The energy of the surface alone."""
         return self.energy.surface
 
     @property
     def distortion(self) -> float:
         """The value of the surface's energy alone."""
-        return self.energy.surface.value_of(self._deformation.surface)  # type: ignore[attr-defined]
+        return self.energy.surface.value_of(self._deformation.surface)
 
     def ease(self) -> bool:
         """Lower the weight of the contacts; False at the last."""
@@ -191,7 +192,7 @@ class GuardedDescent(FreeDescent):
             known, strangers = self._near.split(self._known, self.w.size)
         self.energy.contacts, self.energy.strangers = known, strangers
         self.energy.stiffness = self._weight * max(self.distortion, _LEAST_ENERGY) / len(self.energy.F)
-        self.value = self.energy.value_of(self._deformation)  # type: ignore[arg-type]
+        self.value = self.energy.value_of(self._deformation)
         return super().step(self._slack * tolerance)
 
     def assemble(self, negative: float) -> None:
@@ -201,7 +202,7 @@ class GuardedDescent(FreeDescent):
             stiffness, free = self.energy.stiffness, self.system.free
             self.system.add_blocks(*(stiffness * part[free] for part in self.energy.strangers.blocks(self.w)))
 
-    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
         """As of `NewtonDescent`; besides, the boundary does not meet itself, and no gap becomes much narrower."""
         value, there = super().tried(w, bound)
         if there is not None:
@@ -248,10 +249,12 @@ def descend(descent: FreeDescent, density: Energy, tolerance: float) -> Iterator
         After every step; a status after the last.
     """
     values = [np.inf, descent.distortion]
-    far = isinstance(descent.surface.energy, ReweightedDirichlet)
+    surface = descent.surface
+    far = isinstance(surface, DeformationEnergy) and isinstance(surface.energy, ReweightedDirichlet)
     while True:
         if far:
-            descent.surface.energy = ReweightedDirichlet.at(descent.distortion / float(descent.surface.share.sum()))
+            assert isinstance(surface, DeformationEnergy)
+            surface.energy = ReweightedDirichlet.at(descent.distortion / float(surface.share.sum()))
         with np.errstate(all="ignore"):
             outcome = descent.step(tolerance)
         values.append(descent.distortion)

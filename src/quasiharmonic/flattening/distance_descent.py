@@ -248,7 +248,7 @@ class DistanceDescent(GuardedDescent):
 
     def __init__(self, energy: DistanceEnergy, uv: FloatArray, linear_solver: str, rim: Rim) -> None:
         self._between = energy
-        super().__init__(energy, uv, linear_solver, rim)  # type: ignore[arg-type]
+        super().__init__(energy, uv, linear_solver, rim)
 
     def assemble(self, negative: float) -> None:
         """Fill in the matrix of the triangles and contacts, and of the pairs what is on the diagonal."""
