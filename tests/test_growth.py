@@ -150,7 +150,9 @@ class TestAllocations:
                 assert here.flipped >= 0
 
         iterate()
-        assert peak(iterate)[0] / len(problem.F) < 205
+        # SuperLU's factor is seen: SciPy hands out a copy of it, from which the signs of the pivots are read.
+        most = 650 if objective.laplacian.solver.name == "superlu" else 205
+        assert peak(iterate)[0] / len(problem.F) < most
 
     def test_of_coarsening_and_the_way_back(self):
         V, F, loop, _ = posed(80, "C")
