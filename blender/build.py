@@ -14,6 +14,7 @@ import zipfile
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+EXTENSION = HERE / "extension"
 # Blender's names of platforms, and the tags of wheels that run there.
 PLATFORMS = {
     "linux-x64": ["manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"],
@@ -64,13 +65,13 @@ def collect(folder: Path, platform: str) -> list[Path]:
 def write(target: Path, wheels: list[Path], platform: str) -> None:
     """The zip: manifest, modules, licence, wheels."""
     listed = "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels)
-    manifest = (HERE / "blender_manifest.toml").read_text(encoding="utf-8")
+    manifest = (EXTENSION / "blender_manifest.toml").read_text(encoding="utf-8")
     manifest += f'version = "{version()}"\nplatforms = ["{platform}"]\nwheels = [\n{listed}]\n'
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("blender_manifest.toml", manifest)
         archive.write(HERE.parent / "LICENSE", "LICENSE")
-        for name in ("__init__", "surface", "job", "operators", "panel"):
-            archive.write(HERE / f"{name}.py", f"{name}.py")
+        for module in sorted(EXTENSION.glob("*.py")):
+            archive.write(module, module.name)
         for wheel in wheels:
             archive.write(wheel, f"wheels/{wheel.name}", compress_type=zipfile.ZIP_STORED)
 

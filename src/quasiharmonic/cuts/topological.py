@@ -77,7 +77,9 @@ def _extra_edges(graph: EdgeGraph, distance: FloatArray, before: IntArray) -> In
     # The least of such weights, none of them zero, are the longest ways around; their order is all that counts.
     rank = np.empty(number.size)
     rank[np.lexsort((number, -around))] = np.arange(1, number.size + 1)
-    tree = minimum_spanning_tree(csr_array((rank, (one, other)), shape=(len(graph.F), len(graph.F))))
+    # SciPy before 1.17 has spanning trees of graphs with 32-bit indices only.
+    ends = one.astype(np.int32), other.astype(np.int32)
+    tree = minimum_spanning_tree(csr_array((rank, ends), shape=(len(graph.F), len(graph.F))))
     crossed = np.isin(rank, tree.data)
     return np.sort(number[~crossed])
 

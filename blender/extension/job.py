@@ -15,6 +15,8 @@ from .surface import Refused
 # Seconds between two looks at a thread.
 _LOOK = 0.05
 
+Work = Callable[[Callable[[Step], None]], Any]
+
 
 class Job:
     """A function in a thread of its own.
@@ -25,7 +27,7 @@ class Job:
         Called with a callback that is to be called with every step.
     """
 
-    def __init__(self, work: Callable[[Callable[[Step], None]], Any]) -> None:
+    def __init__(self, work: Work) -> None:
         self.step: Step | None = None
         self.steps = 0
         self.error: BaseException | None = None
@@ -80,7 +82,7 @@ class Working(bpy.types.Operator):
         thing = context.active_object
         return thing is not None and thing.type == "MESH"
 
-    def prepare(self, context: bpy.types.Context) -> Callable[[Callable[[Step], None]], Any]:
+    def prepare(self, context: bpy.types.Context) -> Work:
         """What to do in the thread, where Blender's data is not touched."""
         raise NotImplementedError
 
@@ -142,13 +144,13 @@ class Working(bpy.types.Operator):
 
     def _guarded(self, context: bpy.types.Context, act: Callable[[bpy.types.Context], set[str]]) -> set[str]:
         """Act in object mode, where a mesh's data is up to date; what is wrong becomes a report."""
-        mode = context.active_object.mode
+        self.mode = mode = context.active_object.mode
         if mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         try:
             return act(context)
         except (Refused, ValueError, ImportError) as error:
-            self.report({"ERROR"}, f"{self.bl_label}: {error}")
+            self.report({"ERROR"}, f"{self.bl_label}: {' '.join(str(error).split())}")
             return {"CANCELLED"}
         finally:
             if mode != "OBJECT":

@@ -8,17 +8,20 @@ from typing import Any
 import bpy
 import numpy as np
 
-from quasiharmonic import Step, atlas, repair, targets
+from quasiharmonic import Step, atlas, repair
 from quasiharmonic.apply.fitting import laid_along
-from quasiharmonic.atlas import seaming
+from quasiharmonic.arrays import IntArray, counted
+from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh, seaming
 from quasiharmonic.atlas.mapped import each_island
 from quasiharmonic.energy.polishing import polished
-from quasiharmonic.mesh.seams import Island, SeamedMesh
+from quasiharmonic.exact.convexity import not_convex
+from quasiharmonic.exact.overlapping import lying_on_others
 from quasiharmonic.result import MapResult, Status
 from quasiharmonic.search.solving import solve
+from quasiharmonic.targets.asked_corners import AskedCorners
 
-from . import surface
-from .job import Working
+from . import outline, surface
+from .job import Work, Working
 from .surface import Refused
 
 _ENERGIES = [
@@ -26,56 +29,74 @@ _ENERGIES = [
     ("mips", "Angles", "MIPS energy: angles alone"),
     ("blend", "Worst stretch", "A blend that minds the worst triangles"),
 ]
-Work = Callable[[Callable[[Step], None]], Any]
 
 
 class UvWorking(Working):
     """An operator on the UVs of the active object."""
 
-    whole: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="All islands", description="Also islands without a selected face", default=False
-    )
+    def read(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
+        """The active object's mesh; in edit mode without islands that are not selected, unless the ``whole`` is meant."""
+        chosen_only = not whole and self.mode == "EDIT"
+        self.surface = surface.read(context.active_object.data, chosen_only=chosen_only)
+        return self.surface.mesh
 
-    def read(self, context: bpy.types.Context) -> surface.Surface:
-        """The active object's mesh."""
-        chosen_only = not self.whole and context.active_object.mode != "OBJECT"
-        self._surface = surface.read(context.active_object.data, chosen_only=chosen_only)
-        return self._surface
+    def read_map(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
+        """As `read`, of a mesh that has a UV layer."""
+        mesh = self.read(context, whole=whole)
+        surface.require_map(self.surface)
+        return mesh
 
-    def take(self, context: bpy.types.Context, mapped: SeamedMesh) -> None:
+    def take(self, context: bpy.types.Context, mapped: SeamedMesh, remark: str = "") -> None:
         """Write a map, and say what it is as Blender has it."""
-        data = context.active_object.data
-        verdict = atlas.certify(surface.write(data, self._surface, mapped))
+        verdict = atlas.certify(surface.write(context.active_object.data, self.surface, mapped))
+        lost = np.setdiff1d(verdict.flipped, atlas.certify(mapped).flipped)
+        if lost.size:
+            remark = f"{counted('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
         kind = "INFO" if verdict.injective else "WARNING"
-        self.report({kind}, f"{self.bl_label}: {' '.join(verdict.summary().splitlines()[:3])}")
+        self.report({kind}, f"{self.bl_label}: {remark}{_told(verdict)}")
+
+
+class ChosenWorking(UvWorking):
+    """One that in edit mode minds what is selected."""
+
+    whole: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="All islands", description="In edit mode also islands without a selected face", default=False
+    )
 
 
 class QHM_OT_check(UvWorking):
-    """Select the faces whose UVs are flipped, without area, or in islands that overlap; decided exactly."""
+    """Select the faces whose UVs are flipped or without area, or lie on others; decided exactly."""
 
     bl_idname = "uv.qhm_check"
     bl_label = "Check UVs"
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Judge."""
-        self.whole = True
-        mesh = self.read(context).mesh
-        surface.require_map(self._surface)
-        return lambda heard: atlas.certify(mesh)
+        mesh = self.read_map(context)
+
+        def work(heard: Callable[[Step], None]) -> tuple[AtlasVerdict, IntArray, IntArray]:
+            verdict = atlas.certify(mesh)
+            return verdict, _lying(mesh, verdict), _bent(mesh, self.surface.polygons, verdict)
+
+        return work
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Select and tell."""
-        lying = {k for pair in result.overlapping.tolist() for k in pair}
-        lying |= {k for k, one in enumerate(result.islands) if one.injective and not one.bijective}
-        wrong = [result.flipped, *(result.islands[k].triangles for k in sorted(lying))]
-        wrong += [result.islands[k].triangles for k in result.mirrored.tolist()]
-        count = surface.select_faces(context.active_object.data, self._surface, np.unique(np.concatenate(wrong)))
-        sound = result.bijective and not lying and not result.mirrored.size
-        text = " ".join(result.summary().splitlines()[:3])
-        self.report({"INFO" if sound else "WARNING"}, f"Check UVs: {count} faces selected. {text}")
+        verdict, lying, bent = result
+        data = context.active_object.data
+        flipped = surface.select_faces(data, self.surface, verdict.flipped)
+        count = surface.select_faces(data, self.surface, np.union1d(verdict.flipped, lying))
+        context.tool_settings.mesh_select_mode = (False, False, True)
+        text = f"{counted('face', 'faces', count)} selected, of which {flipped} flipped. {_told(verdict)}"
+        if len(bent):
+            text += (
+                f" {counted('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
+            )
+        sound = verdict.bijective and not len(verdict.overlapping)
+        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {text}")
 
 
-class QHM_OT_repair(UvWorking):
+class QHM_OT_repair(ChosenWorking):
     """Right flipped faces; borders stay, and so does every UV that need not move."""
 
     bl_idname = "uv.qhm_repair"
@@ -86,20 +107,19 @@ class QHM_OT_repair(UvWorking):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Repair."""
-        mesh = self.read(context).mesh
-        surface.require_map(self._surface)
+        mesh = self.read_map(context, whole=self.whole)
         unmirror = self.unmirror
         return lambda heard: repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, unmirror=unmirror, callback=heard)
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Write and tell."""
-        mesh = self._surface.mesh
-        surface.write(context.active_object.data, self._surface, SeamedMesh(mesh.V, mesh.F, result.FT, result.uv))
-        self.report({"INFO" if result.injective else "WARNING"}, f"Repair UVs: {result.summary().splitlines()[0]}")
+        mesh = self.surface.mesh
+        reasons = " ".join(island.reason for island in result.islands if island.reason)
+        self.take(context, SeamedMesh(mesh.V, mesh.F, result.FT, result.uv), f"{reasons} " if reasons else "")
 
 
 class QHM_OT_flatten(UvWorking):
-    """Lay the surface flat, borders free, without flips or overlap; cut at marked seams, or where the UVs are."""
+    """Lay the mesh flat, borders free, without flips or overlap; cut at marked seams, or where the UVs are."""
 
     bl_idname = "uv.qhm_flatten"
     bl_label = "Flatten"
@@ -113,8 +133,7 @@ class QHM_OT_flatten(UvWorking):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Cut and flatten."""
-        self.whole = True
-        mesh, polygons = self.read(context).mesh, self._surface.polygons
+        mesh, polygons = self.read(context), self.surface.polygons
         seams = surface.marked_seams(context.active_object.data)
         cut, pack, energy = self.cut, self.pack, self.energy
 
@@ -134,7 +153,7 @@ class QHM_OT_flatten(UvWorking):
         self.take(context, result)
 
 
-class QHM_OT_reduce(UvWorking):
+class QHM_OT_reduce(ChosenWorking):
     """Reduce stretch with borders kept or free; no face flips on the way."""
 
     bl_idname = "uv.qhm_reduce_stretch"
@@ -146,8 +165,7 @@ class QHM_OT_reduce(UvWorking):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Polish."""
-        mesh = self.read(context).mesh
-        surface.require_map(self._surface)
+        mesh = self.read_map(context, whole=self.whole)
         free, energy = self.free, self.energy
 
         def work(heard: Callable[[Step], None]) -> SeamedMesh:
@@ -163,7 +181,7 @@ class QHM_OT_reduce(UvWorking):
         self.take(context, result)
 
 
-class QHM_OT_fit(UvWorking):
+class QHM_OT_fit(ChosenWorking):
     """Fit an island to an outline: a rectangle, a disk, a letter, or a curve of the scene."""
 
     bl_idname = "uv.qhm_fit"
@@ -171,7 +189,7 @@ class QHM_OT_fit(UvWorking):
     to: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Outline",
         items=[
-            ("RECTANGLE", "Rectangle", "The unit square's width, with the height below"),
+            ("RECTANGLE", "Rectangle", "As wide as the unit square, and as high as is said below"),
             ("DISK", "Disk", "A disk in the unit square"),
             ("LETTER", "Letter", "A letter in Blender's own font"),
             ("CURVE", "Curve", "A closed curve, text or flat mesh of the scene, seen from above"),
@@ -182,14 +200,15 @@ class QHM_OT_fit(UvWorking):
     curve: bpy.props.StringProperty(name="Curve", description="Name of the object")  # type: ignore[valid-type]
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """Lay the boundary along the outline, and map."""
-        mesh = self.read(context).mesh
+        """Lay the boundary along the outline, its corners at what looks like some, and map."""
+        mesh = self.read(context, whole=self.whole)
         if len(mesh.islands) != 1:
-            raise Refused(f"There are {len(mesh.islands)} islands: select a face of the one to fit, in edit mode")
+            raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select a face of the one to fit")
         contours = self._contours(context)
+        corners = AskedCorners("auto") if self.to == "RECTANGLE" else None
 
         def find(island: Island, heard: Callable[[Step], None]) -> MapResult:
-            problem = laid_along(island.V, island.F, contours).problem
+            problem = laid_along(island.V, island.F, contours, corners=corners).problem
             result = solve(problem, callback=heard)
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
@@ -205,36 +224,46 @@ class QHM_OT_fit(UvWorking):
         self.take(context, result)
 
     def _contours(self, context: bpy.types.Context) -> list[Any]:
-        """The outline in the unit square."""
+        """The outline, in the unit square but for rectangles that are higher."""
         if self.to == "RECTANGLE":
-            return targets.rectangle(1.0, self.height)
+            return outline.rectangle(self.height)
         if self.to == "DISK":
-            found = targets.disk()
-        elif self.to == "CURVE":
-            thing = bpy.data.objects.get(self.curve)
-            if thing is None:
-                raise Refused(f"There is no object {self.curve!r}: name a curve of the scene")
-            found = targets.nested(surface.contours(context, thing))
-        else:
-            found = targets.nested(self._letter(context))
-        low = np.min([c.min(axis=0) for c in found], axis=0)
-        size = float(np.max([c.max(axis=0) for c in found], axis=0).max() - low.min())
-        size = float((np.max([c.max(axis=0) for c in found], axis=0) - low).max())
-        return [(contour - low) / size for contour in found]
+            return outline.disk()
+        if self.to == "LETTER":
+            return outline.of_letter(self.letter)
+        return outline.of_named(context, self.curve)
 
-    def _letter(self, context: bpy.types.Context) -> list[Any]:
-        if not self.letter.strip():
-            raise Refused("Name a letter")
-        text = bpy.data.curves.new("qhm letter", type="FONT")
-        text.body = self.letter
-        thing = bpy.data.objects.new("qhm letter", text)
-        context.collection.objects.link(thing)
-        try:
-            context.view_layer.update()
-            return surface.contours(context, thing)
-        finally:
-            bpy.data.objects.remove(thing)
-            bpy.data.curves.remove(text)
+
+def _told(verdict: AtlasVerdict) -> str:
+    """The first lines of a verdict, on one."""
+    return " ".join(verdict.summary().splitlines()[:3])
+
+
+def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
+    """Triangles that share area with others, among islands without flipped ones; ascending."""
+    concerned = set(verdict.overlapping.ravel().tolist())
+    concerned |= {k for k, one in enumerate(verdict.islands) if one.injective and not one.bijective}
+    if not concerned:
+        return np.empty(0, dtype=np.int64)
+    triangles = np.concatenate([verdict.islands[k].triangles for k in sorted(concerned)])
+    turned = np.isin(triangles, _mirrored(verdict))
+    FT = np.where(turned[:, None], mesh.FT[triangles, ::-1], mesh.FT[triangles])
+    return np.sort(triangles[lying_on_others(FT, mesh.uv)])
+
+
+def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
+    """Faces that are not convex in the plane though none of their triangles is flipped; ascending."""
+    uv = mesh.uv.copy()
+    # Every loop has a row of its own here.
+    uv[mesh.FT[_mirrored(verdict)]] *= [-1.0, 1.0]
+    return np.setdiff1d(not_convex(polygons, mesh.FT, uv), polygons.of_triangle[verdict.flipped])
+
+
+def _mirrored(verdict: AtlasVerdict) -> IntArray:
+    """Triangles of mirrored islands."""
+    return np.concatenate(
+        [np.empty(0, dtype=np.int64), *(verdict.islands[k].triangles for k in verdict.mirrored.tolist())]
+    )
 
 
 CLASSES = (QHM_OT_check, QHM_OT_repair, QHM_OT_flatten, QHM_OT_reduce, QHM_OT_fit)

@@ -1,0 +1,113 @@
+"""Outlines to fit an island to: rectangle, disk, and whatever of the scene has an outline seen from above."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from quasiharmonic import targets
+from quasiharmonic.arrays import FloatArray, IntArray
+
+from .surface import Refused, numbers
+
+# Points of an outline nearer than this, as a share of its size, are one.
+_SAME = 1e-6
+
+
+def rectangle(height: float) -> list[FloatArray]:
+    """One of width 1."""
+    return [targets.rectangle(1.0, height)]
+
+
+def disk() -> list[FloatArray]:
+    """A disk in the unit square."""
+    return _in_unit_square([targets.disk()])
+
+
+def of_letter(letter: str) -> list[FloatArray]:
+    """A letter in Blender's own font.
+
+    Raises
+    ------
+    Refused
+        When it is blank.
+    """
+    if not letter.strip():
+        raise Refused("name a letter")
+    text = bpy.data.curves.new("qhm letter", type="FONT")
+    text.body = letter
+    thing = bpy.data.objects.new("qhm letter", text)
+    try:
+        return of_object(thing)
+    finally:
+        bpy.data.objects.remove(thing)
+        bpy.data.curves.remove(text)
+
+
+def of_named(context: bpy.types.Context, name: str) -> list[FloatArray]:
+    """The object of some name.
+
+    Raises
+    ------
+    Refused
+        When there is none, or it has no outline.
+    """
+    thing = context.scene.objects.get(name)
+    if thing is None:
+        raise Refused(f"the scene has no object {name!r}: name a closed curve")
+    return of_object(thing.evaluated_get(context.evaluated_depsgraph_get()))
+
+
+def of_object(thing: bpy.types.Object) -> list[FloatArray]:
+    """Closed contours (k, 2), in the unit square, of a curve, text or mesh object that is seen from above.
+
+    Raises
+    ------
+    Refused
+        When it has none.
+    """
+    try:
+        data = thing.to_mesh()
+    except RuntimeError:
+        raise Refused(f"{thing.name} has no outline: choose a closed curve") from None
+    turn = np.array(thing.matrix_world)[:2, :3]
+    points = numbers(data.vertices, "co", 3, np.float32).astype(np.float64) @ turn.T
+    ends = numbers(data.edges, "vertices", 2, np.int32).astype(np.int64)
+    if len(data.polygons):
+        # Of what is filled, the edges of one face only.
+        sides = numbers(data.loops, "edge_index", 1, np.int32).ravel()
+        ends = ends[np.bincount(sides, minlength=len(ends)) == 1]
+    thing.to_mesh_clear()
+    if not len(ends):
+        raise Refused(f"{thing.name} has no outline: choose a closed curve, without bevel")
+    # A filled curve has points twice where its faces meet its outline.
+    unit = np.ptp(points, axis=0).max() * _SAME or 1.0
+    _, first, same = np.unique((points / unit).round(), axis=0, return_index=True, return_inverse=True)
+    found = [points[first][ring] for ring in _rings(same.ravel()[ends])]
+    if not found:
+        raise Refused(f"{thing.name} has no closed outline: choose a closed curve")
+    return _in_unit_square(targets.nested(found))
+
+
+def _in_unit_square(contours: list[FloatArray]) -> list[FloatArray]:
+    every = np.concatenate(contours)
+    low, size = every.min(axis=0), np.ptp(every, axis=0).max()
+    return [(contour - low) / size for contour in contours]
+
+
+def _rings(ends: IntArray) -> list[list[int]]:
+    """Vertices of the closed chains among some edges."""
+    near: dict[int, list[int]] = {}
+    for a, b in np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0).tolist():
+        near.setdefault(a, []).append(b)
+        near.setdefault(b, []).append(a)
+    rings, seen = [], set()
+    for first in near:
+        chain, here = [], first
+        while here not in seen:
+            seen.add(here)
+            chain.append(here)
+            here = next((v for v in near[here] if v not in seen), first)
+        if len(chain) > 2 and first in near[chain[-1]] and all(len(near[v]) == 2 for v in chain):
+            rings.append(chain)
+    return rings

@@ -1,0 +1,140 @@
+"""A Blender mesh as a surface with seams, and places back into its UV layer; nothing else of the mesh is touched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+
+from quasiharmonic.arrays import BoolArray, IntArray
+from quasiharmonic.mesh.polygons import Polygons
+from quasiharmonic.mesh.seams import SeamedMesh
+
+from .rounding import in_single_precision
+
+
+class Refused(Exception):
+    """What the user can do something about, in a sentence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The mesh of an object.
+
+    Attributes
+    ----------
+    mesh : SeamedMesh
+        Its triangles, as Blender itself draws them, with a row of places for every loop. Triangles that are not chosen
+        have rows of -1.
+    polygons : Polygons
+        The mesh's faces as rings of the triangles' corners.
+    loops : (f, 3) int64
+        The loop that each corner of a triangle is.
+    """
+
+    mesh: SeamedMesh
+    polygons: Polygons
+    loops: IntArray
+
+
+def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
+    """Read a mesh, its active UV layer, and which faces are chosen.
+
+    Parameters
+    ----------
+    data : bpy.types.Mesh
+        In object mode.
+    chosen_only : bool
+        Leave out islands none of whose faces is selected, if a face is.
+
+    Raises
+    ------
+    Refused
+        When there are no faces.
+    """
+    if not len(data.polygons):
+        raise Refused("the mesh has no faces")
+    V = numbers(data.vertices, "co", 3, np.float32).astype(np.float64)
+    vertex = numbers(data.loops, "vertex_index", 1, np.int32).astype(np.int64).ravel()
+    starts = np.append(numbers(data.polygons, "loop_start", 1, np.int32).ravel(), len(vertex)).astype(np.int64)
+    data.calc_loop_triangles()
+    T = numbers(data.loop_triangles, "loops", 3, np.int32).astype(np.int64)
+    # Every corner of a face is one of its triangles'.
+    polygons = Polygons(np.unique(T, return_index=True)[1], starts)
+    layer = data.uv_layers.active
+    uv = None if layer is None else numbers(layer.uv, "vector", 2, np.float32).astype(np.float64)
+    mesh = SeamedMesh(V, vertex[T]) if uv is None else SeamedMesh(V, vertex[T], T, uv)
+    if chosen_only:
+        mesh = _chosen(mesh, numbers(data.polygons, "select", 1, np.bool_).ravel()[polygons.of_triangle])
+    return Surface(mesh, polygons, T)
+
+
+def require_map(surface: Surface) -> None:
+    """Raise `Refused` where there is no UV layer."""
+    if surface.mesh.uv is None:
+        raise Refused("the mesh has no UV map: flatten it first")
+
+
+def marked_seams(data: bpy.types.Mesh) -> IntArray:
+    """The edges (k, 2) that are marked as seams, by vertices."""
+    marked = numbers(data.edges, "use_seam", 1, np.bool_).ravel()
+    return numbers(data.edges, "vertices", 2, np.int32).astype(np.int64)[marked]
+
+
+def write(data: bpy.types.Mesh, surface: Surface, mapped: SeamedMesh) -> SeamedMesh:
+    """Write places into the active UV layer; one is made if there is none.
+
+    Returns
+    -------
+    SeamedMesh
+        The map as Blender has it, in single precision.
+
+    Raises
+    ------
+    Refused
+        When the mesh has as many UV layers as it can have, none of them active.
+    """
+    layer = data.uv_layers.active or data.uv_layers.new(name="UVMap")
+    if layer is None:
+        raise Refused("the mesh has no room for another UV map")
+    rounded = in_single_precision(mapped)
+    places = numbers(layer.uv, "vector", 2, np.float32)
+    places[surface.loops[rounded.mapped]] = rounded.uv[rounded.FT[rounded.mapped]]
+    layer.uv.foreach_set("vector", places.ravel())
+    data.update()
+    return SeamedMesh(mapped.V, mapped.F, np.where(mapped.FT >= 0, surface.loops, -1), places.astype(np.float64))
+
+
+def select_faces(data: bpy.types.Mesh, surface: Surface, triangles: IntArray) -> int:
+    """Select the faces that some triangles are parts of, and no others; how many these are."""
+    polygons = surface.polygons
+    chosen = np.zeros(len(polygons), dtype=np.bool_)
+    chosen[polygons.of_triangle[triangles]] = True
+    corners = np.repeat(chosen, polygons.sizes)
+    data.polygons.foreach_set("select", chosen)
+    for items, name in ((data.vertices, "vertex_index"), (data.edges, "edge_index")):
+        touched = np.zeros(len(items), dtype=np.bool_)
+        touched[numbers(data.loops, name, 1, np.int32).ravel()[corners]] = True
+        items.foreach_set("select", touched)
+    data.update()
+    return int(np.count_nonzero(chosen))
+
+
+def numbers(items: Any, name: str, width: int, kind: type) -> Any:
+    """One attribute of all items of a Blender collection; (n, width) of the kind that Blender has it in."""
+    values = np.empty(len(items) * width, dtype=kind)
+    items.foreach_get(name, values)
+    return values.reshape(-1, width)
+
+
+def _chosen(mesh: SeamedMesh, selected: BoolArray) -> SeamedMesh:
+    """The islands in which a triangle is selected; all if none is."""
+    if not selected.any() or selected.all():
+        return mesh
+    FT = np.full_like(mesh.FT, -1)
+    for island in mesh.islands:
+        if selected[island.triangles].any():
+            FT[island.triangles] = mesh.FT[island.triangles]
+    return SeamedMesh(mesh.V, mesh.F, FT, mesh.uv)
