@@ -1,6 +1,7 @@
 """Thousands of generated problems, unattended: what is solved, how soon, and what is not.
 
     python benchmarks/campaign.py -n 10000 -o results.jsonl [--families maze,pins] [-j 2]
+    python benchmarks/campaign.py -n 1000 -o hard.jsonl --adversarial
     python benchmarks/campaign.py --summary results.jsonl
     python benchmarks/campaign.py --case maze:7:0.8
 
@@ -28,13 +29,14 @@ from typing import Any
 
 import numpy as np
 
-from problems import FAMILIES, Case, make, parse
+from problems import ADVERSARIAL, FAMILIES, Case, make, parse
 from quasiharmonic import Problem, solve
 from quasiharmonic.search.strategy import STRATEGIES
 
 Record = dict[str, Any]
 
 BANDS = 5
+_ALL = FAMILIES | ADVERSARIAL
 _DEFAULTS = {"strategy": "speed", "max_iterations": 2000}
 # Outcomes that are failures whether or not a solution is known to exist.
 _ALWAYS = "exception", "warning", "not finite", "crash", "timeout"
@@ -230,7 +232,7 @@ def summary(records: Sequence[Record]) -> str:
     # What crashed or ran out of time could not say so itself, but a family is feasible as a whole.
     solvable = {r["family"] for r in records if r.get("feasible")}
     feasible = [r for r in records if r["family"] in solvable]
-    for family in [f for f in FAMILIES if f in groups]:
+    for family in [f for f in _ALL if f in groups]:
         lines.append(_row(family + ("" if family in solvable else " ?"), groups[family]))
     lines += [
         _row("feasible", feasible),
@@ -270,7 +272,7 @@ def _by_stage(records: Sequence[Record]) -> list[str]:
     words = [count.most_common(1)[0][0] for count in names]
     lines = ["feasible problems solved up to each stage: the first, and after each fallback"]
     lines.append(f"{'family':10}{'of':>6}" + "".join(f"{word:>16}" for word in words))
-    families = [family for family in FAMILIES if any(r["family"] == family for r in records)]
+    families = [family for family in _ALL if any(r["family"] == family for r in records)]
     for family in [*families, "all"]:
         some = [r for r in records if family in (r["family"], "all")]
         depth = [len(r["stages"]) if r["outcome"] == "injective" else most + 1 for r in some]
@@ -309,7 +311,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=1000, help="problems of the campaign (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("results.jsonl"), help="records (%(default)s)")
-    parser.add_argument("--families", default=",".join(FAMILIES), help="separated by commas (all)")
+    parser.add_argument("--families", help="separated by commas (all of the kind)")
+    parser.add_argument("--adversarial", action="store_true", help="families that aim at where programs break")
     parser.add_argument("--strategy", choices=STRATEGIES, default="speed", help="%(choices)s (%(default)s)")
     parser.add_argument("--max-iterations", type=int, default=2000, help="linear solves a problem (%(default)s)")
     parser.add_argument("-j", "--processes", type=int, default=1, help="problems at a time (%(default)s)")
@@ -317,10 +320,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--summary", type=Path, metavar="RESULTS", help="summarise records and end")
     parser.add_argument("--case", action="append", metavar="NAME", help="run just this problem, e.g. maze:7:0.8")
     options = parser.parse_args(arguments)
-    families = options.families.split(",")
-    unknown = [family for family in families if family not in FAMILIES]
+    families = (
+        options.families.split(",") if options.families else list(ADVERSARIAL if options.adversarial else FAMILIES)
+    )
+    unknown = [family for family in families if family not in _ALL]
     if unknown:
-        parser.error(f"no family {', '.join(unknown)}; there are {', '.join(FAMILIES)}")
+        parser.error(f"no family {', '.join(unknown)}; there are {', '.join(_ALL)}")
     for name in options.case or ():
         try:
             parse(name)

@@ -95,3 +95,37 @@ def teeth(rng: Generator, difficulty: float) -> list[FloatArray]:
 def glyph(rng: Generator, difficulty: float) -> list[FloatArray]:
     """A letter, a digit or a sign."""
     return letter(_GLYPHS[int(rng.integers(len(_GLYPHS)))])
+
+
+def snowflake(rng: Generator, difficulty: float) -> list[FloatArray]:
+    """Koch's snowflake."""
+    return [points(koch(1 + int(3.99 * difficulty)))]
+
+
+def filling(rng: Generator, difficulty: float) -> list[FloatArray]:
+    """A band along Hilbert's curve."""
+    z = hilbert(1 + int(3.99 * difficulty))
+    step = np.diff(z)
+    into, out = np.append(step[0], step), np.append(step, step[-1])
+    # At a turn the corner of the band is off the curve by both normals, else by one.
+    side = rng.uniform(0.2, 0.45) * 1j * (into + out) / (1 + (into.conj() * out).real)
+    return [points(np.concatenate([z - side, (z + side)[::-1]]))]
+
+
+def koch(level: int) -> ComplexArray:
+    """Corners of Koch's snowflake, counter-clockwise, around 0; its shortest sides are 1 long."""
+    sixth = np.exp(1j * np.pi / 3)
+    z = 3.0**level / np.sqrt(3) * np.exp(2j * np.pi * np.arange(3) / 3 - 1j * np.pi / 6)
+    for _ in range(level):
+        third = (np.roll(z, -1) - z) / 3
+        z = np.stack([z, z + third, z + third + third / sixth, z + 2 * third], axis=1).ravel()
+    return z
+
+
+def hilbert(order: int) -> ComplexArray:
+    """Corners of Hilbert's curve, (4 ** order,), a step of 1 from each to the next."""
+    z = np.zeros(1, dtype=complex)
+    for k in range(order):
+        side, turned = 2**k, 1j * z.conj()
+        z = np.concatenate([turned, z + 1j * side, z + (1 + 1j) * side, 2 * side - 1 + 1j * (side - 1) - turned])
+    return z

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,32 @@ from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, componen
 
 Generator = np.random.Generator
 Plane = tuple[ComplexArray, IntArray]
+
+
+class Draft(NamedTuple):
+    """A planar mesh and a map of it, as a family makes them.
+
+    Attributes
+    ----------
+    z : (n,) complex128
+        The mesh at rest.
+    F : (f, 3) int64
+    image : (n,) complex128
+        Where its vertices go; only the fixed ones count, if no solution is known.
+    pins : (k,) int64
+        Interior vertices to hold.
+    feasible : bool
+        Whether the image is a solution.
+    unit : float
+        What the rest positions, brought to size 1, are multiplied by.
+    """
+
+    z: ComplexArray
+    F: IntArray
+    image: ComplexArray
+    pins: IntArray = np.empty(0, dtype=np.int64)
+    feasible: bool = True
+    unit: float = 1.0
 
 
 def points(z: ComplexArray) -> FloatArray:

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 import outlines
 import planar
-from planar import Mover, blank, flow, roughen, strongest
+from adversarial import ADVERSARIAL
+from planar import Draft, Mover, blank, flow, roughen, strongest
 from quasiharmonic import certify
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_loops
@@ -65,16 +66,6 @@ class Case(NamedTuple):
         return f"{self.family}:{self.seed}:{self.difficulty!r}"
 
 
-class Draft(NamedTuple):
-    """A planar mesh, where its vertices go (only at fixed ones, if no solution is known), and pins."""
-
-    z: ComplexArray
-    F: IntArray
-    image: ComplexArray
-    pins: IntArray = np.empty(0, dtype=np.int64)
-    feasible: bool = True
-
-
 def parse(name: str) -> tuple[str, int, float]:
     """Family, seed and difficulty of a `Case.name`.
 
@@ -87,8 +78,9 @@ def parse(name: str) -> tuple[str, int, float]:
         family, seed, difficulty = name.split(":")
     except ValueError:
         raise ValueError(f"{name!r} is no name of a problem, such as maze:7:0.8") from None
-    if family not in FAMILIES:
-        raise ValueError(f"there is no family {family!r}; there are {', '.join(FAMILIES)}")
+    known = FAMILIES | ADVERSARIAL
+    if family not in known:
+        raise ValueError(f"there is no family {family!r}; there are {', '.join(known)}")
     return family, int(seed), float(difficulty)
 
 
@@ -98,7 +90,7 @@ def make(family: str, seed: int, difficulty: float, *, triangles: int | None = N
     Parameters
     ----------
     family : str
-        One of `FAMILIES`.
+        One of `FAMILIES` or of `ADVERSARIAL`.
     seed : int
     difficulty : float
         From 0 to 1.
@@ -107,10 +99,11 @@ def make(family: str, seed: int, difficulty: float, *, triangles: int | None = N
     """
     rng = np.random.default_rng([zlib.crc32(family.encode()), seed, round(difficulty * 1e6)])
     size = _size(rng)
-    draft = FAMILIES[family](rng, difficulty, triangles or size)
+    draft = (FAMILIES | ADVERSARIAL)[family](rng, difficulty, triangles or size)
     fixed = np.concatenate([*boundary_loops(draft.F, len(draft.z)), draft.pins])
     image = planar.points(draft.image)
-    V = dressed(rng, draft.z, draft.F, difficulty)
+    # At the ends of what doubles hold there is no room for slivers besides.
+    V = draft.unit * dressed(rng, draft.z, draft.F, difficulty if draft.unit == 1 else 0.0)
     simple, hidden = None, None
     if draft.feasible:
         certificate = certify(draft.F, image)
