@@ -14,9 +14,10 @@ what is free of divergence in the one kind of element is the rotated gradient of
 1 give both the same energy. The curves of the middle panel lie on each other, to the last digits, and a descent of
 either takes the same steps.
 
-What is left is what V₄ does not see. Pins are not in it at all, and each inner loop may lie anywhere (right): the ring whose hole goes
-beyond its outer boundary is, to V₄, the ring whose hole stays, so that it is zero where V₃ is not. As the hole is free to go where it likes, the ring of
-Figure 6 takes fewer iterations: 192 for V₃'s 232. That is what V₄ adds.
+What is left is what V₄ does not see. Pins are not in it at all, and each inner loop may lie anywhere (right): the ring
+whose hole goes beyond its outer boundary is, to V₄, the ring whose hole stays, so that it is zero where V₃ is not. As
+the hole is free to go where it likes, the ring of Figure 6 takes fewer iterations: 192 for V₃'s 232. That is what V₄
+adds.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ V₁, V₂ and V₃ are never negative, and zero at the tensors of injective map
 
 V₄ is zero at the tensors of injective maps, and elsewhere too. It sees the target through ``C b`` only: it is blind to
 interior pins, and to a boundary loop's position relative to the others. Nor is it bounded below by zero, as its
-continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual, so at a rough tensor field V₄ may
-be negative, and on the way there it passes through zero at maps with inverted triangles. In Crouzeix–Raviart elements
-it is bounded, for there it is V₃ again, but for pins and for where loops lie (`EdgePoisson`).
+continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual, so at a rough tensor field V₄
+may be negative, and on the way there it passes through zero at maps with inverted triangles. In Crouzeix–Raviart
+elements it is bounded, for there it is V₃ again, but for pins and for where loops lie (`EdgePoisson`).
 """
 
 from __future__ import annotations
@@ -192,11 +192,11 @@ class Poisson(Functional):
 class EdgePoisson(Functional):
     """V₄ in Crouzeix–Raviart elements: linear on each triangle, continuous at the middles of edges.
 
-    Their discrete rotated gradients are orthogonal to those of linear elements, and together both are all vector fields that are
-    constant on triangles, on a disk (Arnold and Falk 1989). So the flux of the solution is the rotated gradient of
-    a linear element with the target's boundary, and since ``det 𝒜 = 1`` both have the same energy. The least of the one being the
-    least of the other, on a disk this is V₃ at the map without pins; with holes V₃ where each inner loop may be carried anywhere
-    as a whole. Hence it is never negative.
+    Their discrete rotated gradients are orthogonal to those of linear elements, and together both are all vector
+    fields that are constant on triangles, on a disk (Arnold and Falk 1989). So the flux of the solution is the rotated
+    gradient of a linear element with the target's boundary, and since ``det 𝒜 = 1`` both have the same energy. The
+    least of the one being the least of the other, on a disk this is V₃ at the map without pins; with holes V₃ where
+    each inner loop may be carried anywhere as a whole. Hence it is never negative.
     """
 
     name = "edge-poisson"
