@@ -8,11 +8,11 @@ Here V₃ takes 232 iterations, V₂ 242, V₁ 497, and all three go the same wa
 then a hole opens in the middle and within ten iterations fills the inner square. V₁'s detour by a corner does not
 occur: the mesh is its own image under half a turn and the start is undisturbed, so the middle stays the middle.
 
-V₄ does not get there: 74 triangles stay inverted. It fails too with tanh, with L-BFGS, with other steps and on rings of
-up to 17,000 triangles. In linear elements V₄ is not bounded below by zero, and its zeros, the injective maps, are
-saddle points: close around the tensor of V₃'s map it is negative in every one of twenty random directions. A
-slow descent, as this one is, leaves the smooth fields before it arrives. A fast one may not: turned by π/2, with tanh
-and a fine mesh, V₄ finds a map in 3 iterations.
+V₄ does not get there: 74 triangles stay inverted. It fails too with tanh, with L-BFGS, with other steps and on rings
+of up to 17,000 triangles. In linear elements V₄ is not bounded below by zero, and injective maps, which are among its
+zeros, are saddle points: close around the tensor of V₃'s map it is negative in every one of twenty random directions.
+A slow descent, as this one is, leaves the smooth fields before it arrives. A fast one may not: turned by π/2, with
+tanh and a fine mesh, V₄ finds a map in 3 iterations.
 """
 
 from __future__ import annotations

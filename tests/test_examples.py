@@ -68,6 +68,19 @@ def test_figure_06(example):
     assert numbers["V₄ with tanh, turned by π/2"]["flips"] == 0
 
 
+def test_edge_elements(example):
+    numbers = example("edge_elements", size=8, cells=12)
+    star, hole = numbers["star"], numbers["hole across the boundary"]
+    assert star["inverted where V₄ is zero"] > 20
+    assert abs(star["V₄ there"]) < 1e-12 < 0.5 < star["V₃ there"]
+    assert star["V₄ by edges less V₃, at most"] < 1e-7
+    assert star["iterations"]["V₄ by edges"] == star["iterations"]["V₃"]
+    assert abs(hole["V₄"]) < 1e-10
+    assert abs(hole["V₄ by edges"]) < 1e-10
+    assert hole["V₃"] > 0.1
+    assert numbers["ring turned by π"]["V₄ by edges"] < 400
+
+
 def test_figure_07(example):
     numbers = example("figure_07")
     assert numbers["tanh"]["|ξ| at |μ| = 0.9"] == pytest.approx(1.4722, abs=1e-4)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from quasiharmonic import solve
-from quasiharmonic.descent import LBFGS, Newton
+from quasiharmonic.descent import LBFGS, Newton, VectorAdam
 from quasiharmonic.field.functionals import FUNCTIONALS, neumann_target
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.operators import operators
+from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
-from quasiharmonic.surfaces import annulus, random_delaunay
+from quasiharmonic.surfaces import annulus, disk, random_delaunay
 from shared.meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 
 MESHES = surfaces()
@@ -183,7 +185,7 @@ class TestTheorems:
 
 
 def test_v4_can_be_negative():
-    """The paper's V₄ ≥ 0 (§7.3.4) holds in the continuous case only.
+    """The paper's V₄ ≥ 0 (§7.3.4, Proposition E.1) does not hold in linear elements.
 
     There V₄ = V₃ on a disk. Linear elements raise a Dirichlet energy and lower its dual, so on a coarse
     mesh with a rough tensor V₄ drops below zero. V₂ = V₃ + V₄ ≥ 0 still bounds it from below.
@@ -191,6 +193,117 @@ def test_v4_can_be_negative():
     V, F = random_delaunay(150, seed=3)
     problem = posed(V, F, noise=0.05)
     assert Objective(problem, "poisson").evaluate(random_xi(F)).value < -0.1
+
+
+def test_v4_vanishes_at_a_map_with_inverted_triangles():
+    """A counterexample to Propositions 7.1 and E.1 in linear elements, between 𝒜 = 1 and rough tensors."""
+    V, F = disk(10)
+    (loop,) = boundary_loops(F, len(V))
+    turn = np.angle(V[loop] @ (1, 1j))
+    problem = Problem(V, F, loop, (1 + 0.7 * np.cos(5 * turn))[:, None] * V[loop])
+    # An injective map exists, as the propositions ask.
+    assert solve(problem).injective
+
+    poisson, rough = Objective(problem, "poisson"), random_xi(F, 1.5)
+    along = brentq(lambda t: poisson.evaluate(t * rough).value, 0, 1, xtol=1e-15)
+    at, area = poisson.evaluate(along * rough), poisson.evaluate(0 * rough).dw.area.sum()
+    assert abs(at.value) < 1e-12 * area
+    assert at.dirichlet > 0.5 * area
+    assert np.count_nonzero(signed_areas(F, problem.frame.outward(at.w)) < 0) > 50
+    # It lies lower still farther on, so zero is no minimum either.
+    assert poisson.evaluate(rough).value < -0.1 * area
+
+
+def edge_matrices(problem, field):
+    """Crouzeix–Raviart elements by their definition: Laplacian, Neumann data and middles of edges, dense."""
+    V, F = problem.V, problem.F
+    pairs = np.sort(np.concatenate([F[:, (1, 2)], F[:, (2, 0)], F[:, (0, 1)]]), axis=1)
+    ends, number = np.unique(pairs, axis=0, return_inverse=True)
+    number = number.reshape(3, -1).T
+    L, g = np.zeros((len(ends), len(ends))), np.zeros(len(ends), complex)
+    middles = V[ends].mean(axis=1)
+    w = np.zeros(problem.n, complex)
+    w[problem.fixed] = problem.frame.inward(problem.target)
+    for corners, edges_of, (a11, a12, a22), (e1, _) in zip(
+        F, number, field.entries().T, V[F][:, 1:] - V[F][:, :1], strict=True
+    ):
+        # The frame in which a triangle's tensor is written has its first side along x.
+        x = e1 / np.hypot(*e1)
+        frame = np.stack([x, [-x[1], x[0]]])
+        A = frame.T @ [[a11, a12], [a12, a22]] @ frame
+        # The functions that are 1 at one middle and 0 at the other two.
+        grad = np.linalg.inv(np.column_stack([np.ones(3), middles[edges_of]]))[1:]
+        (bx, by), (cx, cy) = V[corners[1]] - V[corners[0]], V[corners[2]] - V[corners[0]]
+        L[np.ix_(edges_of, edges_of)] += 0.5 * (bx * cy - by * cx) * grad.T @ A @ grad
+    for tail, head in boundary_edges(F, problem.n):
+        g[np.flatnonzero((ends == sorted((tail, head))).all(axis=1))] = -1j * (w[head] - w[tail])
+    return L, g, w[ends].mean(axis=1)
+
+
+class TestEdgePoisson:
+    """V₄ in Crouzeix–Raviart elements, where what the paper says of it holds, and what it then is."""
+
+    @pytest.mark.parametrize("mesh", [0, 2, 4], ids=["disk", "annulus", "random annulus"])
+    def test_is_v4_by_the_elements_definition(self, mesh):
+        _, V, F = MESHES[mesh]
+        boundary = boundary_of(F)
+        target = bend(V[boundary]) + 0.05 * np.random.default_rng(0).standard_normal((len(boundary), 2))
+        problem = Problem(V, F, boundary, target, reference="rest")
+        at = Objective(problem, "edge-poisson").evaluate(random_xi(F))
+        L, g, b = edge_matrices(problem, at.field)
+        value = (g.conj() @ np.linalg.pinv(L, hermitian=True) @ g - g.conj() @ b).real / 2
+        assert at.value == pytest.approx(value, rel=1e-9)
+
+    @pytest.mark.parametrize("pins", [0, 5])
+    @pytest.mark.parametrize("mesh", [0, 1], ids=["disk", "bowl"])
+    @pytest.mark.parametrize("reference", ["equilateral", "rest"])
+    # At twice that the determinants of the rounded tensors differ from 1 in the sixth digit.
+    @pytest.mark.parametrize("scale", [0.0, 0.7, 1.0])
+    def test_is_v3_without_pins_on_a_disk(self, mesh, pins, reference, scale):
+        _, V, F = MESHES[mesh]
+        pinned = posed(V, F, pins, noise=0.05)
+        k = len(boundary_of(F))
+        free = Problem(V, F, pinned.fixed[:k], pinned.target[:k])
+        xi = random_xi(F, scale)
+        v4 = Objective(pinned, "edge-poisson", reference=reference).evaluate(xi)
+        v3 = Objective(free, "dirichlet", reference=reference).evaluate(xi)
+        # Frames take their size from the target, pins included.
+        unit = (pinned.frame.outward(np.array([1 + 0j])) - pinned.frame.outward(np.array([0j])))[0, 0]
+        unit /= (free.frame.outward(np.array([1 + 0j])) - free.frame.outward(np.array([0j])))[0, 0]
+        assert v4.value * unit**2 == pytest.approx(v3.value, rel=1e-8)
+        np.testing.assert_allclose(v4.gradient * unit**2, v3.gradient, atol=1e-7 * np.abs(v3.gradient).max())
+
+    @pytest.mark.parametrize("mesh", [2, 4], ids=["annulus", "random annulus"])
+    def test_is_v3_with_inner_loops_carried_to_where_it_is_least(self, mesh):
+        _, V, F = MESHES[mesh]
+        problem, xi = posed(V, F, noise=0.05), random_xi(F)
+        at = Objective(problem).evaluate(xi)
+        L, _, _ = matrices(problem, at)
+        inner = np.sort(min(problem.domain.loops, key=len))
+        assert not np.isin(inner, max(problem.domain.loops, key=len)).any()
+        # The response of the map to carrying the inner loop by one, and so the best place for it.
+        carried, fixed = np.zeros(problem.n), problem.fixed
+        carried[inner] = 1
+        free = np.setdiff1d(np.arange(problem.n), fixed)
+        carried[free] = -np.linalg.solve(L[np.ix_(free, free)], L[np.ix_(free, fixed)] @ carried[fixed])
+        gain = abs(carried @ L @ at.w) ** 2 / (carried @ L @ carried) / 2
+        assert gain > 1e-3
+        assert Objective(problem, "edge-poisson").evaluate(xi).value == pytest.approx(at.value - gain, rel=1e-9)
+
+    def test_descends_to_an_injective_map_where_linear_elements_do_not(self):
+        V, F = disk(10)
+        (loop,) = boundary_loops(F, len(V))
+        turn = np.angle(V[loop] @ (1, 1j))
+        problem = Problem(V, F, loop, (1 + 0.7 * np.cos(5 * turn))[:, None] * V[loop])
+        found = {
+            name: solve(problem, strategy=[VectorAdam(functional=name, iterations=100)])
+            for name in ("dirichlet", "edge-poisson", "poisson")
+        }
+        assert found["edge-poisson"].injective
+        # On V₃'s very path.
+        assert found["edge-poisson"].iterations == found["dirichlet"].iterations
+        np.testing.assert_allclose(found["edge-poisson"].uv, found["dirichlet"].uv, atol=1e-6)
+        assert not found["poisson"].injective
 
 
 class TestPoissonIsBlind:
@@ -222,7 +335,7 @@ class TestPoissonIsBlind:
             assert Objective(pinned, sighted).evaluate(xi).value > 1e-2
 
     def test_is_declared(self):
-        assert [name for name in PAPER if name not in SIGHTED] == ["poisson"]
+        assert [name for name in NAMES if name not in SIGHTED] == ["poisson", "edge-poisson"]
 
 
 class TestSettings:
@@ -234,7 +347,9 @@ class TestSettings:
             def gradient(self, at):
                 return at.dirichlet_gradient / (1 + at.dirichlet)
 
-        with pytest.raises(ValueError, match="functional must be one of neumann, sobolev, dirichlet, poisson, not"):
+        with pytest.raises(
+            ValueError, match="functional must be one of neumann, sobolev, dirichlet, poisson, edge-poisson, not"
+        ):
             LBFGS(functional="logarithm")
         monkeypatch.setitem(FUNCTIONALS, "logarithm", Logarithm)
         _, V, F = MESHES[0]

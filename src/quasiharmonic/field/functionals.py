@@ -1,13 +1,14 @@
-"""Functionals of the tensor field that vanish exactly at injective maps (§7.3).
+"""Functionals of the tensor field by which injective maps are found (§7.3).
 
-=========  =================================================  ======================
-name       value, summed over u and v                         solves beyond (u, v)
-=========  =================================================  ======================
-neumann    V₁ = ½ ‖L w − g‖²                                  1
-sobolev    V₂ = ½ ‖L w − g‖² in the norm of L†                1, with another factor
-dirichlet  V₃ = ½ wᴴ L w − area                               0
-poisson    V₄ = ½ gᴴ L† g − area                              1, with another factor
-=========  =================================================  ======================
+============  =================================================  ======================
+name          value, summed over u and v                         solves beyond (u, v)
+============  =================================================  ======================
+neumann       V₁ = ½ ‖L w − g‖²                                  1
+sobolev       V₂ = ½ ‖L w − g‖² in the norm of L†                1, with another factor
+dirichlet     V₃ = ½ wᴴ L w − area                               0
+poisson       V₄ = ½ gᴴ L† g − area                              1, with another factor
+edge-poisson  V₄ in Crouzeix–Raviart elements                    1, of three times the size
+============  =================================================  ======================
 
 Here ``L = Gᵀ A G``, ``w = u + i v`` is the quasi-harmonic map, and ``g = g_u + i g_v = −i D w`` the
 Neumann data that an injective map onto the target must have (eq. 17). ``V₂ = V₃ + V₄``.
@@ -15,15 +16,19 @@ Neumann data that an injective map onto the target must have (eq. 17). ``V₂ = 
 Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh, from which the
 gradient in the Beltrami coefficient μ and then that in ξ follow (`quasiharmonic.field.tensor`).
 
-V₄ sees the target through ``C b`` only: it is blind to interior pins, and to a boundary loop's position
-relative to the others. Alone it serves one loop, or loops kept concentric, and no pins. Nor is it bounded
-below by zero, as its continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual,
-so at a rough tensor field V₄ may be negative. The others are sums of squares.
+V₁, V₂ and V₃ are never negative, and zero at the tensors of injective maps and there only (Theorem 6.4).
+
+V₄ is zero at the tensors of injective maps, and elsewhere too. It sees the target through ``C b`` only: it is blind to
+interior pins, and to a boundary loop's position relative to the others. Nor is it bounded below by zero, as its
+continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual, so at a rough tensor field V₄
+may be negative, and on the way there it passes through zero at maps with inverted triangles. In Crouzeix–Raviart
+elements it is bounded, for there it is V₃ again, but for pins and for where loops lie (`EdgePoisson`).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from typing import Protocol
 
 import numpy as np
@@ -32,6 +37,7 @@ from quasiharmonic.arrays import ComplexArray, FloatArray, work
 from quasiharmonic.field.tensor import TensorField
 from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian
 from quasiharmonic.mesh.reference import Derivatives, ReferenceMesh
+from quasiharmonic.mesh.topology import edge_keys
 from quasiharmonic.problem import Problem
 
 
@@ -45,7 +51,7 @@ class Functional(ABC):
     """
 
     name: str
-    #: Whether a value of zero implies the given positions of pins and of every loop.
+    #: Whether the value is never negative, and zero for injective maps with pins and loops in their places only.
     sees_positions = True
 
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
@@ -183,6 +189,66 @@ class Poisson(Functional):
         return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
 
 
+class EdgePoisson(Functional):
+    """V₄ in Crouzeix–Raviart elements: linear on each triangle, continuous at the middles of edges.
+
+    Their discrete rotated gradients are orthogonal to those of linear elements, and together both are all vector
+    fields that are constant on triangles, on a disk (Arnold and Falk 1989). So the flux of the solution is the rotated
+    gradient of a linear element with the target's boundary, and since ``det 𝒜 = 1`` both have the same energy. The
+    least of the one being the least of the other, on a disk this is V₃ at the map without pins; with holes V₃ where
+    each inner loop may be carried anywhere as a whole. Hence it is never negative.
+    """
+
+    name = "edge-poisson"
+    sees_positions = False
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
+        super().__init__(problem, mesh)
+        F, n = problem.F, problem.n
+        opposite = edge_keys(F[:, (1, 2, 0)], F[:, (2, 0, 1)], n)
+        keys, number = np.unique(opposite, return_inverse=True)
+        #: Edge opposite each corner, (f, 3).
+        self._edges = number.reshape(-1, 3)
+        self._tail, self._head = problem.domain.edges.boundary.T
+        self._rim = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
+        # The same triangles with corners of their own.
+        self._apart = copy(mesh)
+        self._apart.F = np.arange(F.size).reshape(-1, 3)
+        self._apart.n = F.size
+        self._one_held: Laplacian | None = None
+        self._known: tuple[TensorField, ComplexArray] | None = None
+
+    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """``L† g`` at the middles of edges, up to a constant; (e,) complex128, edges ascending by their ends."""
+        # As of `Poisson.response`.
+        known = self._known
+        if known is None or known[0] is not at.field:
+            size = int(self._edges.max()) + 1
+            if self._one_held is None:
+                solver = at.operator.pattern.solver.name
+                self._one_held = Laplacian(self._edges, size, self._rim[:1], solver)
+            # The element of an edge has -2 times the gradient of the opposite corner's hat function.
+            held = self._one_held.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
+            load = np.zeros(size, dtype=np.complex128)
+            load[self._rim] = self._neumann_target(at.w)
+            known = self._known = at.field, held.respond(load)
+        return known[1]
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        middle = 0.5 * (at.w[self._tail] + at.w[self._head])
+        return 0.5 * work(self._neumann_target(at.w), self.response(at)[self._rim] - middle)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        middles = self.response(at)[self._edges]
+        corners = middles.sum(axis=1, keepdims=True) - 2 * middles
+        d = self._apart.derivatives(corners.ravel())
+        return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
+
+    def _neumann_target(self, w: ComplexArray) -> ComplexArray:
+        """Neumann data that the target asks for, by boundary edge; (k,) complex128."""
+        return -1j * (w[self._head] - w[self._tail])
+
+
 class Sobolev(Poisson):
     """V₂ = V₃ + V₄, the Neumann residual in the norm of L† (eq. 26).
 
@@ -200,7 +266,7 @@ class Sobolev(Poisson):
         return at.dirichlet_gradient + super().gradient(at)
 
 
-FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson)}
+FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson, EdgePoisson)}
 
 
 def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
