@@ -44,7 +44,7 @@ def _sizes(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _hub(rng: Generator, d: float, size: int) -> Draft:
-    """A vertex with up to 5,000 neighbours, in one ring or two, in an outline whose radii are of a wild distribution."""
+    """A vertex with up to 5,000 neighbours, in one ring or two, in an outline whose radii are wildly distributed."""
     spokes = round(10 ** (1 + 2.699 * d))
     rings = int(rng.integers(1, 3))
     ray = np.exp(2j * np.pi * np.arange(spokes) / spokes)

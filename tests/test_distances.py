@@ -198,9 +198,13 @@ def test_isometries_have_no_error_and_a_point_has_all(flat):
 )
 def test_bad_input_is_named(options, message):
     given = {"V": [[0, 0], [1, 0], [1, 1], [0, 1]], "F": [[0, 1, 2], [0, 2, 3]], "uv": np.eye(4)[:, :2], **options}
+    uv = given.pop("uv")
+
+    def measured():
+        return surface_distances(**given).error(uv)
+
     with pytest.raises(ValueError, match=re.escape(message)):
-        uv = given.pop("uv")
-        surface_distances(**given).error(uv)
+        measured()
 
 
 def test_figures_come_with_how_they_were_taken(dome):

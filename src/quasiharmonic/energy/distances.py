@@ -68,7 +68,7 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class DistanceError:
-    """How far the distances of a map are off; made by `SurfaceDistances.error`, or by `quasiharmonic.distortion` with ``rings``.
+    """How far the distances of a map are off; made by `SurfaceDistances.error`, and by `quasiharmonic.distortion`.
 
     Attributes
     ----------

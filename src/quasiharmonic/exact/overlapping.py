@@ -45,4 +45,5 @@ def lying_on_others(F: IntArray, uv: FloatArray) -> IntArray:
 def _parted_by_a_side(one: FloatArray, other: FloatArray) -> BoolArray:
     """Whether, of pairs of triangles (k, 3, 2), all of the other is to the right of a side of the first."""
     tail, head = one[:, :, None], one[:, (1, 2, 0), None]
-    return np.asarray((orientation(tail, head, other[:, None]) <= 0).all(axis=2).any(axis=1))
+    right = np.asarray(orientation(tail, head, other[:, None]) <= 0)
+    return np.asarray(np.any(np.all(right, axis=2), axis=1))
