@@ -93,13 +93,17 @@ def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
     from quasiharmonic.atlas.verdict import certify as certify_islands
     from quasiharmonic.exact.certificate import certify
     from quasiharmonic.mesh.seams import SeamedMesh
+    from quasiharmonic.mesh.topology import components
 
     V, F, uv = io.cut_at_seams(mesh)
     if precision == "float32":
         with np.errstate(over="ignore"):
             uv = uv.astype(np.float32).astype(np.float64)
-    verdict = certify_islands(SeamedMesh(V, F, F, uv))
-    return Judged(V, F, uv, certify(F, uv), verdict if len(verdict.islands) > 1 else None, mesh.faces)
+    # The parts of what has been opened at its seams are its islands.
+    part = components(F, len(V))[F[:, 0]]
+    alone = bool((part == part[:1]).all())
+    verdict = None if alone else certify_islands(SeamedMesh(V, F, F, uv))
+    return Judged(V, F, uv, certify(F, uv), verdict, mesh.faces)
 
 
 def tell_losses(output: Path, mesh: MeshData) -> None:

@@ -147,15 +147,20 @@ class SeamedMesh:
     @property
     def seams(self) -> IntArray:
         """Edges (k, 2) along which triangles meet on the surface, and not in the plane; by vertices, ascending."""
-        owner = self._owner()[1]
+        count, owner = self._owner()
         tail, head = self.F, self.F[:, (1, 2, 0)]
-        ends = np.sort(np.stack([tail, head], axis=2).reshape(-1, 2), axis=1)
-        here = np.stack([owner, owner[:, (1, 2, 0)]], axis=2).reshape(-1, 2)
-        here = np.where(tail.ravel()[:, None] <= head.ravel()[:, None], here, here[:, ::-1])
+        here, there = owner, owner[:, (1, 2, 0)]
+        upwards = tail < head
         # An edge whose ends are at other places for one of its triangles than for another.
-        edges, which, sides = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-        rows = np.unique(np.column_stack([which.ravel(), here]), axis=0)
-        return edges[(np.bincount(rows[:, 0], minlength=len(edges)) > 1) & (sides > 1)]
+        places = np.where(upwards, here, there) * (count + 1) + np.where(upwards, there, here)
+        key = edge_keys(tail, head, len(self.V)).ravel()
+        order = np.argsort(key, kind="stable")
+        first = np.flatnonzero(np.diff(key[order], prepend=-1))
+        sides = places.ravel()[order]
+        apart = np.minimum.reduceat(sides, first) < np.maximum.reduceat(sides, first) if first.size else first > 0
+        at = order[first[apart]]
+        ends = np.stack([tail.ravel()[at], head.ravel()[at]], axis=1)
+        return np.unique(np.sort(ends, axis=1), axis=0)
 
     def opened(self) -> SeamedMesh:
         """Return the mesh with a vertex for each of a vertex's places: the same map without seams.
