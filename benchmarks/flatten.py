@@ -80,7 +80,7 @@ def ours(V: FloatArray, F: IntArray) -> tuple[Found, list[tuple[float, float]]]:
 
 def tutte(V: FloatArray, F: IntArray) -> FloatArray:
     """Tutte's embedding, holes filled, of the longest loop onto a circle of the surface's area."""
-    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse import coo_array, csr_array, diags
     from scipy.sparse.linalg import spsolve
 
     loops = boundary_loops(F, len(V))
@@ -97,7 +97,7 @@ def tutte(V: FloatArray, F: IntArray) -> FloatArray:
     tail, head = filled.ravel(), np.roll(filled, -1, axis=1).ravel()
     graph = coo_array((np.ones(tail.size), (tail, head)), shape=(n, n)).tocsr()
     graph = ((graph + graph.T) > 0).astype(np.float64)
-    laplacian = (diags_array(graph @ np.ones(n)) - graph).tocsr()
+    laplacian = (csr_array(diags(graph @ np.ones(n))) - graph).tocsr()
     free = np.setdiff1d(np.arange(n), loop)
     if free.size:
         uv[free] = spsolve(laplacian[free][:, free].tocsc(), -laplacian[free][:, loop] @ uv[loop]).reshape(-1, 2)

@@ -5,7 +5,7 @@
 
 Each goes into a fresh environment, from this checkout, as the README's first command has it, and makes the demo's
 picture there. Packages come from pip's cache or the network, which decides the seconds: it is done twice, both times
-reported, and of the second the processor's share. Megabytes are of the files, over those of the empty environment.
+are reported, and of the second the processor's share. Megabytes are of the files, over those of the empty environment.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags
 
 from common import panels, run, save, show
 from quasiharmonic import Problem, quasi_harmonic_map, solve
@@ -303,7 +303,7 @@ def _stiffness(problem: Problem, A: FloatArray, reference: Reference) -> csc_arr
     op = operators(problem.V, problem.F, problem.reference or reference)
     f = len(problem.F)
     Gx, Gy = op.G[:f], op.G[f:]
-    a11, a12, a21, a22 = (diags_array(op.m * entry) for entry in A.reshape(f, 4).T)
+    a11, a12, a21, a22 = (csr_array(diags(op.m * entry)) for entry in A.reshape(f, 4).T)
     return csc_array(Gx.T @ (a11 @ Gx + a12 @ Gy) + Gy.T @ (a21 @ Gx + a22 @ Gy))
 
 

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from quasiharmonic import surfaces
-from quasiharmonic.linsolve import laplacian, mkl
+from quasiharmonic.linsolve import laplacian, mkl, takes_order
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh import dissection
 from quasiharmonic.mesh.dissection import nested_dissection
@@ -58,7 +58,7 @@ def pattern(n, tail, head):
     """A matrix with this graph that can be factored without pivoting."""
     A = sp.coo_array((-np.ones(tail.size), (tail, head)), shape=(n, n)).tocsr()
     A = A + A.T
-    return sp.csc_array(A + sp.diags_array(np.asarray(abs(A).sum(axis=1)).ravel() + 1))
+    return sp.csc_array(A + sp.csr_array(sp.diags(np.asarray(abs(A).sum(axis=1)).ravel() + 1)))
 
 
 def fill(n, tail, head, order=None):
@@ -221,7 +221,7 @@ def test_the_laplacian_is_the_same_in_any_order(monkeypatch, solver):
         map_ = operator.extend(w)
         answers.append((map_, operator.respond(w), operator.flux(map_)))
         ascending = bool(np.all(np.diff(operator.pattern.free) > 0))
-        assert ascending == (least > 0)
+        assert ascending == (least > 0 or not takes_order(solver))
         np.testing.assert_array_equal(np.sort(operator.pattern.free), np.setdiff1d(np.arange(len(V)), loop))
     for one, other in zip(*answers, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)

@@ -160,7 +160,8 @@ def smallest_cover(u: IntArray, v: IntArray) -> tuple[IntArray, IntArray]:
     from scipy.sparse.csgraph import maximum_bipartite_matching
 
     (us, i), (vs, j) = np.unique(u, return_inverse=True), np.unique(v, return_inverse=True)
-    edges = csr_array((np.ones(i.size), (i, j)), shape=(us.size, vs.size))
+    # SciPy 1.11 matches by 32-bit indices only.
+    edges = csr_array((np.ones(i.size), (i.astype(np.int32), j.astype(np.int32))), shape=(us.size, vs.size))
     mate = maximum_bipartite_matching(edges, perm_type="row")  # of each v, -1 if left out
     reached_u, reached_v = np.ones(us.size, dtype=bool), np.zeros(vs.size, dtype=bool)
     reached_u[mate[mate >= 0]] = False

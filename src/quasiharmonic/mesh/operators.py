@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array, vstack
+from scipy.sparse import csr_array, diags, vstack
 
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh
@@ -56,7 +56,7 @@ class Operators:
         """
         if a is None:
             a = np.tile([1.0, 0.0, 1.0], (self.m.size, 1))
-        a11, a12, a22 = (diags_array(self.m * entry) for entry in a.T)
+        a11, a12, a22 = (csr_array(diags(self.m * entry)) for entry in a.T)
         f = self.m.size
         Gx, Gy = self.G[:f], self.G[f:]
         return csr_array(Gx.T @ (a11 @ Gx + a12 @ Gy) + Gy.T @ (a12 @ Gx + a22 @ Gy))
