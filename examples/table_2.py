@@ -6,7 +6,23 @@ column, a little MIPS descended along with V₃ in tanh's tensors, below SBP on 
 scans: Lucy, Gargoyle, Bunny, David and Hand.
 
 SBP is another program. Its energy, MIPS with 1/128 of an area term, is `polish`'s ``"blend"``, which begins at an
-injective map where SBP has to find one: its column is what that energy comes to, and not SBP's path to it.
+injective map where SBP has to find one: its column is what that energy comes to, and not SBP's path to it. SBP itself
+was run once on seven scans of the same names, rebuilt, on letters (``benchmarks/records/letters.csv``, with TLC's
+seconds); its MIPS there, and that of our first map polished for it:
+
+=============== ===== ==============
+map             SBP   ours, polished
+=============== ===== ==============
+Lucy onto G     2.632 0.758
+Lucy onto S     2.535 0.669
+gargoyle onto G 1.680 1.262
+gargoyle onto H 1.271 0.759
+bunny onto R    0.649 0.335
+David onto A    0.118 0.086
+hand onto P     1.112 0.073
+=============== ===== ==============
+
+On the surfaces of our own:
 
 =============== ============ ====== =========== ====================
 map             SBP's energy si-log tanh + MIPS the paper's three

@@ -123,6 +123,12 @@ def test_figure_12(example):
     assert numbers["least MIPS"]["MIPS"] < numbers["si-log"]["MIPS"] < numbers["tanh"]["MIPS"]
 
 
+def test_figure_13(example):
+    numbers = example("figure_13")
+    assert numbers["problems"] == 68
+    assert numbers["SBP"]["MIPS"] < numbers["ours speed"]["MIPS"] < numbers["TLC-QN"]["MIPS"]
+
+
 def test_figure_17(example):
     numbers = example("figure_17", size=40)
     assert len(numbers) == 4

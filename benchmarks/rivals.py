@@ -1,0 +1,182 @@
+"""Beside TLC and Foldover-free, from records of theirs: what each solves, how soon, and how distorted.
+
+    python benchmarks/rivals.py                       # the records alone
+    python benchmarks/rivals.py --anew [-n 20] [-o ANEW.csv]
+
+With ``--anew`` our side is run again on the same problems, in their order, and judged as they were. Seconds then are of
+this machine and version and compare with the records' in kind only. ``records/README.md`` says where these come from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import problems
+from quasiharmonic import Problem, distortion, polish, solve
+from quasiharmonic.arrays import FloatArray
+
+RECORDS = Path(__file__).parent / "records"
+#: The programs in the order of the tables; those that ran every problem of the first 68.
+PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until first injective"
+#: Less than a tick of the clock they were measured with; in ratios it counts as that.
+TICK = 0.004
+
+
+class Run(NamedTuple):
+    """One program on one problem.
+
+    Attributes
+    ----------
+    problem, program : str
+    triangles : int
+    seconds : float
+        Of CPU, the solver alone.
+    injective, feasible : bool
+        By `certify`; whether a solution is known to exist.
+    start_flipped : int
+        Inverted triangles of Tutte's embedding.
+    mips, polished, stretch : float
+        Mean MIPS, the same after polishing, largest max(σ₁, 1/σ₂); NaN where the map is not injective.
+    """
+
+    problem: str
+    program: str
+    triangles: int
+    seconds: float
+    injective: bool
+    feasible: bool
+    start_flipped: int
+    mips: float
+    polished: float
+    stretch: float
+
+
+def recorded() -> list[Run]:
+    """All runs on generated problems."""
+    with (RECORDS / "rivals.csv").open(encoding="utf-8", newline="") as file:
+        return [
+            Run(
+                row["problem"],
+                row["program"],
+                int(row["triangles"]),
+                float(row["cpu_seconds"] or "nan"),
+                row["injective"] == "1",
+                row["known_feasible"] == "yes",
+                int(row["start_flipped"]),
+                *(float(row[name] or "nan") for name in ("mips_mean", "mips_polished", "isometric_max")),
+            )
+            for row in csv.DictReader(file)
+            if ":" in row["problem"]
+        ]
+
+
+def letters() -> list[dict[str, str]]:
+    """What TLC-PN and Foldover-free took on seven scans onto letters, and came to."""
+    with (RECORDS / "letters.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
+    """Of each problem that all programs ran, the run of each."""
+    by_problem: dict[str, dict[str, Run]] = {}
+    for run in runs:
+        if run.program in PROGRAMS:
+            by_problem.setdefault(run.problem, {})[run.program] = run
+    # A run of SBP that never came to an injective map has no moment at which it did.
+    needed = set(PROGRAMS[:-1])
+    return {name: row for name, row in by_problem.items() if needed <= row.keys()}
+
+
+def anew(rows: dict[str, dict[str, Run]], strategy: str) -> Iterator[Run]:
+    """Our side on the problems of some records, now."""
+    for name in rows:
+        made, _, triangles = name.partition(" triangles=")
+        case = problems.make(*problems.parse(made), triangles=int(triangles))
+        problem = Problem(case.V, case.F, case.fixed, case.target)
+        start = time.process_time()
+        result = solve(problem, strategy=strategy, max_iterations=2000)
+        seconds = time.process_time() - start
+        before = rows[name][PROGRAMS[0]].start_flipped
+        row: list[float] = [np.nan] * 3
+        if result.injective:
+            better = polish(case.V, case.F, result.uv, fixed=case.fixed, energy="mips")
+            found, after = (distortion(case.V, case.F, uv) for uv in (result.uv, better.uv))
+            row = [found.summary("mips").mean, after.summary("mips").mean, found.summary("isometric").maximum]
+        yield Run(name, f"now {strategy}", len(case.F), seconds, result.injective, case.feasible, before, *row)
+
+
+def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """What each program solved, its ratio of seconds to the first program's, and its distortion where all solved."""
+    first = programs[0]
+    lasting = [row for row in rows.values() if row[first].start_flipped]
+    shared = [row for row in lasting if all(name in row and row[name].injective for name in programs)]
+    table: dict[str, dict[str, Any]] = {}
+    for name in programs:
+        ran = [row[name] for row in rows.values() if name in row]
+        pairs = [row for row in lasting if name in row and row[name].injective and row[first].injective]
+        ratio = np.array([max(row[name].seconds, TICK) / max(row[first].seconds, TICK) for row in pairs])
+        table[name] = {
+            "feasible solved": sum(run.injective for run in ran if run.feasible),
+            "feasible": sum(row[first].feasible for row in rows.values()),
+            "unknown solved": sum(run.injective for run in ran if not run.feasible),
+            "unknown": sum(not row[first].feasible for row in rows.values()),
+            "ratio": [float(f"{q:.2g}") for q in np.percentile(ratio, (10, 50, 90))] if ratio.size else [],
+            "quicker": int((ratio < 1).sum()),
+            "of": int(ratio.size),
+            "MIPS": median([row[name].mips for row in shared]),
+            "polished": median([row[name].polished for row in shared]),
+        }
+    return table
+
+
+def median(values: Sequence[float]) -> float:
+    """To four digits; NaN of nothing."""
+    known: FloatArray = np.array(values)[np.isfinite(values)]
+    return float(f"{np.median(known):.4g}") if known.size else float("nan")
+
+
+def print_table(table: dict[str, dict[str, Any]]) -> None:
+    """In Markdown."""
+    first = next(iter(table))
+    print(f"| program | feasible | unknown | seconds / {first}: 10, 50, 90 % | quicker | MIPS | polished |")
+    print("|---|---|---|---|---|---|---|")
+    for name, row in table.items():
+        ratio = ", ".join(f"{q:g}" for q in row["ratio"])
+        solved = f"{row['feasible solved']}/{row['feasible']} | {row['unknown solved']}/{row['unknown']}"
+        quicker = f"{row['quicker']}/{row['of']}"
+        print(f"| {name} | {solved} | {ratio} | {quicker} | {row['MIPS']:g} | {row['polished']:g} |")
+
+
+def main() -> None:
+    """Print the tables; with ``--anew`` solve first."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anew", action="store_true", help="run our side again on the same problems")
+    parser.add_argument("-n", type=int, default=68, metavar="N", help="the first N problems (68)")
+    parser.add_argument("--strategy", default="speed", choices=["speed", "quality"], help="of ours, anew (speed)")
+    parser.add_argument("-o", "--output", type=Path, metavar="CSV", help="rows of what was run anew")
+    options = parser.parse_args()
+    rows = dict(list(on_common_problems(recorded()).items())[: options.n])
+    programs = list(PROGRAMS)
+    if options.anew:
+        runs = []
+        for run in anew(rows, options.strategy):
+            runs.append(run)
+            rows[run.problem][run.program] = run
+            print(f"{run.problem}: {run.seconds:.3g} s, {'injective' if run.injective else 'no map'}", file=sys.stderr)
+        programs.append(f"now {options.strategy}")
+        if options.output:
+            with options.output.open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file).writerows([Run._fields, *runs])
+    print_table(summary(rows, programs))
+
+
+if __name__ == "__main__":
+    main()
