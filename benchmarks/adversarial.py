@@ -15,7 +15,7 @@ from planar import Draft, blank, flow, roughen
 from quasiharmonic import Problem, quasi_harmonic_map
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.refinement import refine
-from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
+from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, edges
 
 Generator = np.random.Generator
 
@@ -87,7 +87,7 @@ def _hilbert(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _koch(rng: Generator, d: float, size: int) -> Draft:
-    """A disk onto Koch's snowflake: triangles of a lattice at the end, Tutte's embedding of them at rest."""
+    """A disk onto Koch's snowflake: a lattice with split edges at the end, Tutte's embedding of it at rest."""
     corners = outlines.koch(1 + int(3.99 * d))
     # Measured from a corner the corners are on the lattice, whose second direction leans by half of its height.
     reach = 3 * int(abs(corners).max() + 2)
@@ -100,10 +100,15 @@ def _koch(rng: Generator, d: float, size: int) -> Draft:
     inside = _within(lattice[triangles].mean(axis=1), corners)
     used, F = np.unique(triangles[inside], return_inverse=True)
     image, F = lattice[used], F.reshape(-1, 3)
-    (loop,) = boundary_loops(F, used.size)
+    # A lattice is harmonic as it is; half of its edges split, it is not.
+    inner = edges(F, len(image)).interior
+    refined = refine(planar.points(image), F, inner[rng.random(len(inner)) < 0.5])
+    image, F = refined.V[:, 0] + 1j * refined.V[:, 1], refined.F
+    (loop,) = boundary_loops(F, len(image))
     circle = np.exp(2j * np.pi * np.arange(loop.size) / loop.size)
     # Of equilateral triangles the cotangents are all the same.
-    rest = quasi_harmonic_map(Problem(planar.points(image), F, loop, planar.points(circle)))
+    on_circle = Problem(planar.points(image), F, loop, planar.points(circle), reference="equilateral")
+    rest = quasi_harmonic_map(on_circle)
     return Draft(rest[:, 0] + 1j * rest[:, 1], F, image)
 
 

@@ -61,7 +61,7 @@ def keep_distances(
     """Bring distances in the plane near to distances along the surface; every map on the way is bijective.
 
     What is lowered is the mean, over a sample of pairs of vertices at most ``rings`` edges apart, of how far their
-    distance is off, as `quasiharmonic.distortion` measures it but for errors below 30 % counting by their squares, and a
+    distance is off, as `quasiharmonic.distortion` measures it but for errors below 30 % counting by squares, and a
     small share of the symmetric Dirichlet energy, which keeps triangles from collapsing
     (`quasiharmonic.flattening.distance_energy`). The sample has 2,500 vertices, or all if there are no more, with 120
     others each, drawn at random, always the same; for fewer rings up to 4,000 vertices, for more down to 1,000, and
