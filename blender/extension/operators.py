@@ -16,6 +16,7 @@ from quasiharmonic.atlas.mapped import each_island
 from quasiharmonic.energy.polishing import polished
 from quasiharmonic.exact.convexity import not_convex
 from quasiharmonic.exact.overlapping import lying_on_others
+from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.result import MapResult, Status
 from quasiharmonic.search.solving import solve
 from quasiharmonic.targets.asked_corners import AskedCorners
@@ -35,7 +36,7 @@ class UvWorking(Working):
     """An operator on the UVs of the active object."""
 
     def read(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
-        """The active object's mesh; in edit mode without islands that are not selected, unless the ``whole`` is meant."""
+        """The active object's mesh; in edit mode without islands that are not selected, unless the whole is meant."""
         chosen_only = not whole and self.mode == "EDIT"
         self.surface = surface.read(context.active_object.data, chosen_only=chosen_only)
         return self.surface.mesh
@@ -138,9 +139,15 @@ class QHM_OT_flatten(UvWorking):
         cut, pack, energy = self.cut, self.pack, self.energy
 
         def work(heard: Callable[[Step], None]) -> SeamedMesh:
-            here = seaming.cut_along(mesh, seams, polygons=polygons) if len(seams) else mesh
+            here = mesh
+            if len(seams):
+                here = seaming.cut_along(mesh, seams, polygons=polygons)
+            elif 1 < len(polygons) == len(mesh.islands):
+                # As a new UV layer of Blender's is: every face fills the square.
+                here = SeamedMesh(mesh.V, mesh.F)
             if cut:
                 here = seaming.cut_apart(here, polygons=polygons)
+            _require_borders(here)
             mapped = atlas.flatten(here, energy=energy, callback=heard)
             if mapped.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
@@ -204,6 +211,7 @@ class QHM_OT_fit(ChosenWorking):
         mesh = self.read(context, whole=self.whole)
         if len(mesh.islands) != 1:
             raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select a face of the one to fit")
+        _require_borders(mesh)
         contours = self._contours(context)
         corners = AskedCorners("auto") if self.to == "RECTANGLE" else None
 
@@ -234,6 +242,12 @@ class QHM_OT_fit(ChosenWorking):
         return outline.of_named(context, self.curve)
 
 
+def _require_borders(mesh: SeamedMesh) -> None:
+    """Raise `Refused` where there is nothing along which to lay a surface flat."""
+    if any(not len(boundary_edges(island.F, len(island.vertices))) for island in mesh.islands):
+        raise Refused("the mesh, or a part of it, is closed: mark seams, or use Cut and Flatten")
+
+
 def _told(verdict: AtlasVerdict) -> str:
     """The first lines of a verdict, on one."""
     return " ".join(verdict.summary().splitlines()[:3])
@@ -253,10 +267,10 @@ def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
 
 def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
     """Faces that are not convex in the plane though none of their triangles is flipped; ascending."""
-    uv = mesh.uv.copy()
-    # Every loop has a row of its own here.
-    uv[mesh.FT[_mirrored(verdict)]] *= [-1.0, 1.0]
-    return np.setdiff1d(not_convex(polygons, mesh.FT, uv), polygons.of_triangle[verdict.flipped])
+    mirrored = polygons.of_triangle[_mirrored(verdict)]
+    front, back = (not_convex(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
+    bent = np.union1d(np.setdiff1d(front, mirrored), np.intersect1d(back, mirrored))
+    return np.setdiff1d(bent, polygons.of_triangle[verdict.flipped])
 
 
 def _mirrored(verdict: AtlasVerdict) -> IntArray:

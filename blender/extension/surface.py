@@ -8,14 +8,18 @@ from typing import Any
 import bpy
 import numpy as np
 
-from quasiharmonic.arrays import BoolArray, IntArray
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.mesh.polygons import Polygons
 from quasiharmonic.mesh.seams import SeamedMesh
 
 from .rounding import in_single_precision
 
+# Places of a vertex that are apart by no more than so many spacings of single precision are one: Blender's own unwraps
+# and primitives write it with different roundings into the loops around it.
+_ROUNDING = 4
 
-class Refused(Exception):
+
+class Refused(Exception):  # noqa: N818 (said to users, in the past tense)
     """What the user can do something about, in a sentence."""
 
 
@@ -26,8 +30,8 @@ class Surface:
     Attributes
     ----------
     mesh : SeamedMesh
-        Its triangles, as Blender itself draws them, with a row of places for every loop. Triangles that are not chosen
-        have rows of -1.
+        Its triangles, as Blender itself draws them, each corner at the row of the first loop that is at the same
+        place; triangles that are not chosen have rows of -1. Places are those of all loops.
     polygons : Polygons
         The mesh's faces as rings of the triangles' corners.
     loops : (f, 3) int64
@@ -64,8 +68,11 @@ def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
     # Every corner of a face is one of its triangles'.
     polygons = Polygons(np.unique(T, return_index=True)[1], starts)
     layer = data.uv_layers.active
-    uv = None if layer is None else numbers(layer.uv, "vector", 2, np.float32).astype(np.float64)
-    mesh = SeamedMesh(V, vertex[T]) if uv is None else SeamedMesh(V, vertex[T], T, uv)
+    if layer is None:
+        mesh = SeamedMesh(V, vertex[T])
+    else:
+        places = numbers(layer.uv, "vector", 2, np.float32)
+        mesh = SeamedMesh(V, vertex[T], _welded(vertex, places)[T], places.astype(np.float64))
     if chosen_only:
         mesh = _chosen(mesh, numbers(data.polygons, "select", 1, np.bool_).ravel()[polygons.of_triangle])
     return Surface(mesh, polygons, T)
@@ -102,7 +109,8 @@ def write(data: bpy.types.Mesh, surface: Surface, mapped: SeamedMesh) -> SeamedM
     rounded = in_single_precision(mapped)
     places = numbers(layer.uv, "vector", 2, np.float32)
     places[surface.loops[rounded.mapped]] = rounded.uv[rounded.FT[rounded.mapped]]
-    layer.uv.foreach_set("vector", places.ravel())
+    # Not into layer.uv, whose array undo shares: nothing could be undone.
+    data.attributes[layer.name].data.foreach_set("vector", places.ravel())
     data.update()
     return SeamedMesh(mapped.V, mapped.F, np.where(mapped.FT >= 0, surface.loops, -1), places.astype(np.float64))
 
@@ -127,6 +135,25 @@ def numbers(items: Any, name: str, width: int, kind: type) -> Any:
     values = np.empty(len(items) * width, dtype=kind)
     items.foreach_get(name, values)
     return values.reshape(-1, width)
+
+
+def _welded(vertex: IntArray, places: FloatArray) -> IntArray:
+    """For every loop the first one of its vertex that is at the same place, or off by rounding; (l,) int64."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    near = _ROUNDING * np.spacing(np.abs(places).max(axis=1))
+    order = np.argsort(vertex, kind="stable")
+    pairs = [np.empty((2, 0), dtype=np.int64)]
+    for step in range(1, int(np.bincount(vertex).max())):
+        one, other = order[:-step], order[step:]
+        same = vertex[one] == vertex[other]
+        one, other = one[same], other[same]
+        pairs.append(np.stack([one, other])[:, (np.abs(places[one] - places[other]).max(axis=1) <= near[one])])
+    ends = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(ends.shape[1], dtype=np.int8), tuple(ends)), shape=(len(vertex), len(vertex)))
+    label = connected_components(graph, directed=False)[1]
+    return np.unique(label, return_index=True)[1][label]
 
 
 def _chosen(mesh: SeamedMesh, selected: BoolArray) -> SeamedMesh:

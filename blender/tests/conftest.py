@@ -15,10 +15,7 @@ os.environ["BLENDER_USER_RESOURCES"] = _FOLDER.name
 bpy = pytest.importorskip("bpy")
 
 BUILD = Path(__file__).parents[1] / "build.py"
-
-
-def pytest_configure(config):
-    config.addinivalue_line("markers", "slow: seconds")
+MODULE = "bl_ext.user_default.quasiharmonic"
 
 
 @pytest.fixture(scope="session")
@@ -35,15 +32,20 @@ def extension(archive):
     """The extension, installed and enabled; its module's name."""
     done = bpy.ops.extensions.package_install_files(repo="user_default", filepath=str(archive), enable_on_install=True)
     assert done == {"FINISHED"}
-    return "bl_ext.user_default.quasiharmonic"
+    return MODULE
 
 
 @pytest.fixture(autouse=True)
-def _scene(extension):
-    """An empty file for each test."""
-    for thing in list(bpy.data.objects):
-        bpy.data.objects.remove(thing)
-    for meshes in (bpy.data.meshes, bpy.data.curves):
-        for one in list(meshes):
-            meshes.remove(one)
-    bpy.ops.ed.undo_push(message="empty")
+def _empty_scene(extension):
+    """Nothing of an earlier test."""
+    if bpy.context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    for items in (bpy.data.objects, bpy.data.meshes, bpy.data.curves):
+        for one in list(items):
+            items.remove(one)
+
+
+@pytest.fixture
+def said(capfd):
+    """What operators have reported since the last call."""
+    return lambda: capfd.readouterr().out

@@ -225,7 +225,8 @@ class Flattening:
     def _blind_to_scale(self, uv: FloatArray) -> bool:
         """Whether a map of twice the size would be as good."""
         w = in_units(uv, 0)
-        return abs(self._measure.value(2 * w) / self._measure.value(w) - 1) < _SAME
+        here, doubled = self._measure.value(w), self._measure.value(2 * w)
+        return abs(doubled - here) <= _SAME * here
 
     def _in_scale(self, uv: FloatArray) -> FloatArray:
         """A map scaled to the surface's area; only by a power of two, exactly, where more would invert a triangle."""
