@@ -138,11 +138,9 @@ def two_squares(shift, *, mirror=False):
     """Two squares of 4 by 4 quads, apart in space; the UVs of the second moved, or turned over."""
     V, flat, faces = scenes.quads(4)
     other = flat * [-1, 1] + [1, 0] if mirror else flat
-    return scenes.add_mesh(
-        np.concatenate([V, V + [2, 0, 0]]),
-        np.concatenate([faces, faces + len(V)]),
-        np.concatenate([flat, other + shift]),
-    )
+    beside = V + np.array([2, 0, 0])
+    both = np.concatenate([faces, faces + len(V)])
+    return scenes.add_mesh(np.concatenate([V, beside]), both, np.concatenate([flat, other + shift]))
 
 
 def test_check_selects_the_faces_that_lie_on_others(said):
@@ -230,9 +228,15 @@ def add_curve(name="ring"):
     return curve
 
 
-@pytest.mark.parametrize(
-    "fit", [{"to": "RECTANGLE", "height": 0.5}, {"to": "DISK"}, {"to": "LETTER", "letter": "S"}, {"to": "CURVE", "curve": "ring"}]
-)  # fmt: skip
+OUTLINES = [
+    {"to": "RECTANGLE", "height": 0.5},
+    {"to": "DISK"},
+    {"to": "LETTER", "letter": "S"},
+    {"to": "CURVE", "curve": "ring"},
+]
+
+
+@pytest.mark.parametrize("fit", OUTLINES)
 def test_fit(thing, fit):
     add_curve()
     bpy.context.view_layer.objects.active = thing
