@@ -7,7 +7,7 @@ import pytest
 
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.derivatives import derivative_error
-from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet
+from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet, UnsignedARAP
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.energy.springs import MassSpring
@@ -30,7 +30,7 @@ def bowl(n=60):
 
 
 @pytest.mark.parametrize(
-    "energy", [MIPS(), SymmetricDirichlet(), ARAP(), AreaPreserving()], ids=lambda e: type(e).__name__
+    "energy", [MIPS(), SymmetricDirichlet(), ARAP(), UnsignedARAP(), AreaPreserving()], ids=lambda e: type(e).__name__
 )
 def test_gradient_by_positions(energy):
     V, F, w = bowl()
@@ -89,6 +89,26 @@ def test_a_clockwise_planar_mesh_is_a_surface_seen_from_behind():
     assert DeformationEnergy(mirrored, F, ARAP()).value(as_complex(V)) == pytest.approx(0, abs=1e-20)
 
 
+def test_unsigned_arap_is_that_of_the_singular_values(rng):
+    """§11.1.1 by NumPy's singular values, inverted triangles included; there `ARAP` is dearer, elsewhere the same."""
+    V, F = random_delaunay(60, seed=5)
+    w = as_complex(V) + 0.15 * (rng.standard_normal((len(V), 2)) @ (1, 1j))
+    uv = np.stack([w.real, w.imag], axis=1)
+    rest, image = ((x[F[:, 1:]] - x[F[:, :1]]).transpose(0, 2, 1) for x in (V, uv))
+    J = image @ np.linalg.inv(rest)
+    s = np.linalg.svd(J, compute_uv=False)
+    flipped = np.linalg.det(J) < 0
+    assert 10 < flipped.sum() < len(F) - 10
+    share = np.linalg.det(rest) / np.linalg.det(rest).sum()
+    mean = np.sum(share * ((s - 1) ** 2).sum(axis=1))
+    assert DeformationEnergy(V, F, UnsignedARAP()).value(w) == pytest.approx(mean, rel=1e-12)
+    s[flipped, 1] *= -1
+    assert DeformationEnergy(V, F, ARAP()).value(w) == pytest.approx(np.sum(share * ((s - 1) ** 2).sum(axis=1)))
+    E = DeformationEnergy(V, F, UnsignedARAP())
+    assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6
+    assert E.value(np.conj(as_complex(V))) == pytest.approx(0, abs=1e-20)
+
+
 def test_inverted_triangles():
     V, F, w = bowl()
     mirrored = np.conj(w)
@@ -139,7 +159,7 @@ def test_collapse_of_shapes_that_only_grow_or_stand_still():
     np.testing.assert_allclose(E.steps_to_collapse(w, -w), 1, rtol=1e-7)
 
 
-@pytest.mark.parametrize("energy", [MIPS(), SymmetricDirichlet(), ARAP()], ids=name_of)
+@pytest.mark.parametrize("energy", [MIPS(), SymmetricDirichlet(), ARAP(), UnsignedARAP()], ids=name_of)
 def test_the_system_is_the_second_derivative(energy):
     V, F, w = bowl()
     fixed = boundary_of(F)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import islice
+from dataclasses import dataclass, replace
+from itertools import islice, pairwise
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from quasiharmonic.descent import (
     VectorAdam,
     reweighting,
 )
-from quasiharmonic.descent.base import SoFar, Steps
+from quasiharmonic.descent.base import FunctionalDescent, SoFar, Steps
 from quasiharmonic.descent.newton import SecondOrderModel
 from quasiharmonic.descent.patches import Patch, last_untangled
 from quasiharmonic.descent.random_restarts import left_of, nearest
@@ -223,6 +224,45 @@ def test_vector_adam_steps_are_of_the_schedules_length():
     objective = Objective(Problem(*star_problem()))
     first = path(VectorAdam(iterations=1, schedule=((0, 0.37),)), objective)[1]
     np.testing.assert_allclose(np.abs(first.xi), 0.37, rtol=1e-9)
+
+
+@pytest.mark.parametrize("momenta", [(0.9, 0.999), (0.0, 0.5), (0.6, 0.9)])
+def test_vector_adam_is_adam_with_the_moduli_of_complex_numbers(momenta):
+    """By Kingma and Ba's formulas, step by step."""
+    objective = Objective(Problem(*star_problem()))
+    maps = path(VectorAdam(iterations=6, schedule=((0, 0.1),), momenta=momenta), objective)
+    first, second = momenta
+    mean, square, xi = 0, 0, maps[0].xi
+    for k, (here, after) in enumerate(pairwise(maps), start=1):
+        mean = first * mean + (1 - first) * here.gradient
+        square = second * square + (1 - second) * np.abs(here.gradient) ** 2
+        xi = xi - 0.1 * (mean / (1 - first**k)) / np.sqrt(square / (1 - second**k))
+        np.testing.assert_allclose(after.xi, xi, rtol=1e-8)
+
+
+class TestPatience:
+    """A stage is given up when what it descends no longer falls, whatever becomes of V₃."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Roughening(FunctionalDescent):
+        """Tensors ever rougher: V₄ falls below zero and V₃ rises."""
+
+        word: ClassVar[str] = "roughening"
+        patience = 5, 1e-3
+
+        def iterates(self, objective, start):
+            for k in range(1, self.iterations + 1):
+                yield objective.evaluate(start.xi + 0.02 * k * random_xi(objective.problem.F))
+            return False
+
+    @pytest.mark.parametrize(("functional", "most"), [("poisson", 40), ("dirichlet", 12)])
+    def test_is_judged_by_the_functional_that_is_descended(self, functional, most):
+        V, F, fixed, target = star_problem()
+        result = solve(Problem(V, F, fixed, target), strategy=[self.Roughening(functional=functional, iterations=40)])
+        assert not result.injective
+        assert result.history[-1].energy > result.history[0].energy
+        assert (result.stages[0].iterations == 40) == (most == 40)
+        assert result.stages[0].iterations <= most
 
 
 def test_vector_adam_ignores_the_frames():
@@ -449,6 +489,11 @@ class TestStrategy:
             ({"schedule": [(5, -1)]}, "schedule must be pairs"),
             ({"schedule": [(5, 1), (5, 2)]}, "schedule must be pairs"),
             ({"schedule": [(0, np.nan)]}, "schedule must be pairs"),
+            ({"momenta": (0.9, 1.0)}, "momenta must be two numbers"),
+            ({"momenta": (-0.1, 0.9)}, "momenta must be two numbers"),
+            ({"momenta": (np.nan, 0.9)}, "momenta must be two numbers"),
+            ({"momenta": 0.9}, "momenta must be two numbers"),
+            ({"momenta": None}, "momenta must be two numbers"),
         ],
     )
     def test_wrong_words(self, arguments, words):

@@ -63,3 +63,11 @@ def test_what_the_reference_names_is_there(name):
 
 def test_the_reference_has_every_public_name():
     assert set(quasiharmonic.__all__) <= set(REFERENCE)
+
+
+def test_tests_that_the_page_on_the_paper_names_are_there():
+    named = set(re.findall(r"`(test_\w+|Test\w+)`", (FOLDER / "docs" / "paper.md").read_text(encoding="utf-8")))
+    text = "\n".join(path.read_text(encoding="utf-8") for path in (FOLDER / "tests").glob("test_*.py"))
+    there = set(re.findall(r"^ *(?:def|class) (\w+)", text, re.MULTILINE))
+    assert len(named) > 10
+    assert named <= there

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from quasiharmonic import solve
+from quasiharmonic import certify, solve
 from quasiharmonic.descent import LBFGS, Newton, VectorAdam
 from quasiharmonic.field.functionals import FUNCTIONALS, neumann_target
 from quasiharmonic.field.objective import Objective
@@ -77,6 +77,71 @@ class TestValues:
         assert v2.value == pytest.approx(v3.value + v4.value, rel=1e-10)
         np.testing.assert_allclose(v2.gradient, v3.gradient + v4.gradient, rtol=1e-8, atol=1e-10)
         assert v4.value >= -v3.value
+
+    def test_dirichlet_to_neumann_and_back(self, name, V, F):
+        """Eq. 13, 14, 28: the flux of the map is S(A) b; S(A)† is RᵀL†R on data without constants; V₃ its weak form."""
+        problem = posed(V, F, noise=0.05)
+        at = Objective(problem).evaluate(random_xi(F))
+        L, D, pinv = matrices(problem, at)
+        op = operators(V, F, "equilateral")
+        R, S = op.R.toarray(), op.S.toarray()
+        dtn = R.T @ L @ R - R.T @ L @ S @ np.linalg.solve(S.T @ L @ S, S.T @ L @ R)
+        b = R.T @ at.w
+        np.testing.assert_allclose(R.T @ at.operator.flux(at.w), dtn @ b, atol=1e-10)
+        area = at.w.real @ D @ at.w.imag
+        assert at.value == pytest.approx((b.conj() @ dtn @ b).real / 2 - area, rel=1e-10)
+        # The pseudo-inverses differ in the constants alone.
+        k = len(b)
+        no_constant = np.eye(k) - np.full((k, k), 1 / k)
+        ntd = R.T @ pinv @ R
+        np.testing.assert_allclose(
+            no_constant @ ntd @ no_constant, np.linalg.pinv(dtn, hermitian=True), atol=1e-9 * np.abs(ntd).max()
+        )
+        g = R.T @ neumann_target(problem, at.w)
+        v4 = Objective(problem, "poisson").evaluate(at.xi).value
+        assert v4 == pytest.approx((g.conj() @ np.linalg.pinv(dtn, hermitian=True) @ g).real / 2 - area, rel=1e-8)
+
+    def test_sandwich_at_determinants_above_one(self, name, V, F):
+        """Proposition C.3, eq. 42, for tensors of determinants 1 to 4; below 1 it need not hold."""
+        problem = posed(V, F, noise=0.2)
+        op = operators(V, F, "equilateral")
+        rng = np.random.default_rng(2)
+        w = problem.frame.inward(bend(V[:, :2]) + 0.1 * rng.standard_normal((len(V), 2)))
+        areas = problem.domain.mesh("equilateral").derivatives(w).area
+        signed, unsigned = areas.sum(), np.abs(areas).sum()
+        assert unsigned > signed
+
+        def energy(a):
+            return (w.conj() @ op.laplacian(a.T) @ w).real / 2
+
+        scale = 1 + rng.random(len(F))
+        unit = TANH.field(random_xi(F, 0.3)).entries()
+        for a in (unit, scale * unit):
+            assert np.linalg.det(np.array([[a[0], a[1]], [a[1], a[2]]]).T).min() > 1 - 1e-9
+            assert energy(a) >= unsigned >= signed
+        assert energy(scale * unit) > energy(unit)
+        # The least tensors for this map, at which it is tight: those of the map with inverted triangles mirrored.
+        p, q, _ = problem.domain.mesh("equilateral").derivatives(w)
+        mu = np.where(np.abs(q) < np.abs(p), q / p, np.conj(p / q))
+        least = TANH.field(TANH.invert(mu)).entries()
+        assert energy(least) == pytest.approx(unsigned, rel=1e-9)
+        assert energy(0.9 * least) < unsigned
+
+    def test_areas_tell_injective_maps(self, name, V, F):
+        """Proposition C.4: unsigned and signed area are the same, and no triangle degenerates, iff all are positive."""
+        straight = bend(V[:, :2])
+        disturbed = straight + 0.2 * np.random.default_rng(3).standard_normal(straight.shape)
+        collapsed = straight.copy()
+        collapsed[F[0, 0]] = collapsed[F[0, 1]]
+        for uv, same, degenerate in ((straight, True, False), (disturbed, False, False), (collapsed, None, True)):
+            doubled = signed_areas(F, uv)
+            equal = np.abs(doubled).sum() == pytest.approx(doubled.sum(), rel=1e-12)
+            assert (doubled == 0).any() == degenerate
+            if same is not None:
+                assert equal == same
+            certificate = certify(F, uv)
+            assert certificate.injective == (equal and not degenerate)
+            assert bool(certificate.degenerate.size) == degenerate
 
     def test_sandwich(self, name, V, F):
         """Eq. 42: Dirichlet energy ≥ unsigned area ≥ signed area."""

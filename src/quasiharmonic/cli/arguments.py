@@ -10,7 +10,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 # Those of quasiharmonic.energy.polishing, .harmonising, .linsolve and .measures, which are not imported to say them.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 FLATTENED = *ENERGIES, "distances"
-HARMONISED = "arap", "area", "springs", "mips", "symmetric-dirichlet"
+HARMONISED = "arap", "arap-unsigned", "area", "springs", "mips", "symmetric-dirichlet"
 MEASURES = (
     "sigma1",
     "sigma2",

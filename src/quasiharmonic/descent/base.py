@@ -112,7 +112,7 @@ class Descent(SearchStage):
 
     @property
     def patience(self) -> tuple[int, float] | None:
-        """The stage has settled when within so many iterates none was righted and the energy fell by less.
+        """The stage has settled when within so many iterates none was righted and the objective fell by less.
 
         As a fraction of itself. None for methods that know by themselves when to end.
         """

@@ -18,7 +18,7 @@ from quasiharmonic.mesh.reference import blocks
 
 # Less momentum than Adam's usual 0.9 / 0.999 is the largest single gain: the landscape changes as fast as
 # the map unfolds, and old gradients point to where the folds were.
-MOMENTUM = 0.6, 0.9
+MOMENTA = 0.6, 0.9
 # Long steps unfold a map in few iterations, short ones get through where it is tight. Chosen on letters and
 # on random pairs of surface and outline.
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
@@ -35,9 +35,14 @@ class VectorAdam(FunctionalDescent):
     schedule : sequence of (int, float)
         Step lengths at given iterations, linear in between and constant after the last. Empty for those that suit the
         parameterisation.
+    momenta : (float, float)
+        Of the mean gradient and of its mean square, Adam's β₁ and β₂; at least 0 and below 1. The paper names none;
+        Adam's own are 0.9 and 0.999. With those and the paper's steps it is
+        ``VectorAdam(schedule=[(0, 0.1)], momenta=(0.9, 0.999))``.
     """
 
     schedule: Sequence[tuple[int, float]] = ()
+    momenta: tuple[float, float] = MOMENTA
 
     word: ClassVar[str] = "vector-adam"
 
@@ -52,6 +57,12 @@ class VectorAdam(FunctionalDescent):
                 "schedule must be pairs (iteration, step length), iterations ascending and lengths positive, "
                 f"not {self.schedule!r}"
             )
+        try:
+            momenta = np.array(self.momenta, dtype=np.float64)
+        except (TypeError, ValueError):
+            momenta = np.full(2, np.nan)
+        if momenta.shape != (2,) or not np.all((momenta >= 0) & (momenta < 1)):
+            raise ValueError(f"momenta must be two numbers of at least 0 and below 1, not {self.momenta!r}")
 
     @property
     def _steps(self) -> Sequence[tuple[int, float]]:
@@ -59,7 +70,7 @@ class VectorAdam(FunctionalDescent):
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""
-        first, second = MOMENTUM
+        first, second = self.momenta
         times, lengths = zip(*self._steps, strict=True)
         mean = np.zeros_like(start.xi)
         square = np.zeros(start.xi.shape)

@@ -311,7 +311,7 @@ class ARAP(Isotropic):
     """``(σ₁ − 1)² + (σ₂ − 1)²``, as rigid as possible (E₁, §11.1.1).
 
     With the signed ``σ₂``, that is with the nearest *rotation* (Sorkine and Alexa 2007): an inverted
-    triangle is charged for being inverted. On all others this is the paper's E₁.
+    triangle is charged for being inverted. On all others this is the paper's E₁ (`UnsignedARAP`).
     """
 
     def density(self, d: Deformation) -> FloatArray:
@@ -326,6 +326,30 @@ class ARAP(Isotropic):
         """``a^(−3/2), 0, 0``."""
         zero = np.zeros(d.b.shape)
         return inverse(np.sqrt(d.a)) ** 3, zero, zero
+
+
+class UnsignedARAP(Isotropic):
+    """``(σ₁ − 1)² + (σ₂ − 1)²`` with ``σ₂ ≥ 0``: E₁ as §11.1.1 has it.
+
+    With the nearest orthogonal matrix, reflections too: a mirrored triangle costs nothing. On maps without inverted
+    triangles it is `ARAP`.
+    """
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``2 (√c − 1)² + 2e``, c the larger of a and b, e the smaller."""
+        return 2 * (np.sqrt(np.maximum(d.a, d.b)) - 1) ** 2 + 2 * np.minimum(d.a, d.b)
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``2 − 2/√c`` and 2; where a = b there is a ridge, and its side without inversion counts."""
+        upright = d.a >= d.b
+        slope = 2 - 2 * inverse(np.sqrt(np.maximum(d.a, d.b)))
+        return np.where(upright, slope, 2.0), np.where(upright, 2.0, slope)
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``c^(−3/2)`` for the larger one, and zeros."""
+        upright = d.a >= d.b
+        bend = inverse(np.sqrt(np.maximum(d.a, d.b))) ** 3
+        return np.where(upright, bend, 0.0), np.zeros(d.b.shape), np.where(upright, 0.0, bend)
 
 
 class AreaPreserving(Isotropic):

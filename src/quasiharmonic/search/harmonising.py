@@ -22,7 +22,7 @@ from quasiharmonic.arrays import (
     whole_number,
 )
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet
+from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet, UnsignedARAP
 from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.exact.diagnosis import diagnose
@@ -38,6 +38,7 @@ from quasiharmonic.search.harmonised import Harmonised
 #: What can be lowered, by name: each makes its energy from the rest mesh.
 ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
     "arap": lambda V, F: ARAP(),
+    "arap-unsigned": lambda V, F: UnsignedARAP(),
     "area": lambda V, F: AreaPreserving(),
     "springs": MassSpring,
     "mips": lambda V, F: MIPS(),
@@ -84,7 +85,8 @@ def harmonise(
     energy : str, Energy or None
         E, the mean over the surface's area:
 
-        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)², rigid where it can be;
+        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)², rigid where it can be, with σ₂ < 0 for inverted triangles;
+        - ``"arap-unsigned"``: the same with σ₂ ≥ 0, as the paper has it: mirroring costs nothing;
         - ``"area"``: (σ₁σ₂ − 1)², areas and nothing else;
         - ``"springs"``: (l − l⁰)² summed over the mesh's edges;
         - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles and nothing else;

@@ -281,7 +281,7 @@ class Search:
                 return Status.INJECTIVE
             if self._left <= 0:
                 return Status.OUT_OF_ITERATIONS
-            if patience.is_over(step):
+            if patience.is_over(step.flipped, here.value):
                 return Status.SETTLED
         return Status.SETTLED if steps.at_rest else Status.OUT_OF_ITERATIONS
 
@@ -310,12 +310,15 @@ class _Patience:
     def __init__(self, limits: tuple[int, float] | None) -> None:
         self._most: float
         self._most, self._progress = limits or (np.inf, 0.0)
-        self._flipped, self._energy, self._in_vain = np.inf, np.inf, 0
+        self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
 
-    def is_over(self, step: Step) -> bool:
-        """Whether too many steps in a row have righted no triangle and lowered the energy by too little."""
-        if step.flipped < self._flipped or step.energy < (1 - self._progress) * self._energy:
-            self._flipped, self._energy = min(step.flipped, self._flipped), min(step.energy, self._energy)
+    def is_over(self, flipped: int, value: float) -> bool:
+        """Whether too many steps in a row have righted no triangle and lowered the objective by too little."""
+        if flipped < self._flipped or value < self._low_enough:
+            self._flipped, self._value = min(flipped, self._flipped), min(value, self._value)
+            # V₄ may be negative.
+            fraction = self._progress * abs(self._value) if np.isfinite(self._value) else 0.0
+            self._low_enough = self._value - fraction
             self._in_vain = 0
         else:
             self._in_vain += 1
