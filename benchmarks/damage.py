@@ -27,6 +27,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from io import FileIO, TextIOWrapper
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ from quasiharmonic.io import MeshData, read_mesh, write_map
 from quasiharmonic.io.fem import read_fem
 from quasiharmonic.surfaces import disk
 
-SECONDS, GIGABYTES = 60.0, 1.5
+SECONDS, GIGABYTES = 150.0, 1.5
 
 # What takes a kind of file: its name stands for {}, and what is written is called "out".
 CALLS: dict[str, list[str]] = {
@@ -74,6 +75,7 @@ _NUMBERS = (
     b"-inf",
     b"2147483648",
     b"9" * 20,
+    b"9" * 4000,
     b"9" * 5000,
     b"1e-320",
     b"1e300",
@@ -232,9 +234,9 @@ def _command(arguments: list[str], folder: Path) -> None:
     status = 70
     try:
         os.chdir(folder)
-        said = os.open("said", os.O_WRONLY | os.O_CREAT)
-        os.dup2(said, 1)
-        os.dup2(said, 2)
+        sys.stdout = sys.stderr = TextIOWrapper(FileIO("said", "w"), encoding="utf-8", line_buffering=True)
+        os.dup2(sys.stdout.fileno(), 1)
+        os.dup2(sys.stdout.fileno(), 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         try:
             status = qhm(arguments)
@@ -243,7 +245,6 @@ def _command(arguments: list[str], folder: Path) -> None:
         except BaseException:
             traceback.print_exc()
         sys.stdout.flush()
-        sys.stderr.flush()
     finally:
         os._exit(status)
 
@@ -279,13 +280,20 @@ def _fault(call: str, status: int, said: str, left: set[str], folder: Path) -> s
     written = folder / call.split("-o ")[1].split()[0]
     if not written.is_file():
         return "nothing written"
-    if command == "morph":
-        moved = read_fem(written)
-        F, uv = moved.F, moved.points
-    else:
-        mesh = read_mesh(written)
-        F, uv = (mesh.F, mesh.V[:, :2]) if mesh.FT is None or mesh.vt is None else (mesh.FT, mesh.vt)
+    try:
+        F, uv = _map(written, planar=command == "morph")
+    except (ValueError, OSError) as error:
+        return f"written, and cannot be read: {error}"
     return "" if status == 1 or _positive(F, uv) else "certified, and not injective"
+
+
+def _map(written: Path, planar: bool) -> tuple[IntArray, FloatArray]:
+    """Triangles and places of a map in a file."""
+    if planar:
+        moved = read_fem(written)
+        return moved.F, moved.points
+    mesh = read_mesh(written)
+    return (mesh.F, mesh.V[:, :2]) if mesh.FT is None or mesh.vt is None else (mesh.FT, mesh.vt)
 
 
 def _positive(F: IntArray, uv: FloatArray) -> bool:

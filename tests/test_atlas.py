@@ -113,7 +113,12 @@ class TestCommands:
 
     @pytest.mark.parametrize(
         ("text", "words"),
-        [("0 1\n0 400000\n", "line 2"), ("0 x\n", "is not an edge"), ("0 100\n", "no such edge to cut")],
+        [
+            ("0 1\n0 400000\n", "line 2"),
+            ("0 1\n2 " + "9" * 5000, f"'{'9' * 40}...' is far too large at line 2"),
+            ("0 x\n", "is not an edge"),
+            ("0 100\n", "no such edge to cut"),
+        ],
     )
     def test_bad_lists_of_edges(self, source, tmp_path, capsys, text, words):
         (tmp_path / "edges.txt").write_text(text)

@@ -311,6 +311,13 @@ def test_words_that_cannot_be_read(text):
         read_corners(text)
 
 
+@pytest.mark.parametrize("text", ["9" * 4000, "9" * 5000, "3:" + "9" * 4000])
+def test_numbers_far_too_large_are_cut_short_in_the_message(text):
+    with pytest.raises(ValueError, match=r"is none of V, V:K and V:X:Y") as refused:
+        read_corners(text)
+    assert len(str(refused.value)) < 200
+
+
 def test_words_for_one_vertex_twice():
     mesh = surfaces.grid(4, 4)
     for text, message in (

@@ -253,6 +253,7 @@ def test_every_coding(tmp_path, form, coder, order, word):
             "compressed by vtkLZ4DataCompressor",
         ),
         (vtu("ascii").replace(b'type="UInt8"', b'type="String"'), "arrays of String are no numbers"),
+        (vtu("ascii").replace(b'type="UInt8"', b'type="' + b"U" * 5000 + b'"'), "arrays of U{40} are no numbers"),
         (vtu("raw")[:-90], "ends too early|cannot be read"),
         (vtu("inline").replace(b"AAA", b"!!!"), "what should be base64 is not"),
         (vtu("raw").replace(b'offset="0"', b'offset="99999"'), None),

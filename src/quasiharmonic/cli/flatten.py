@@ -182,7 +182,7 @@ def _numbers(path: Path) -> list[float]:
             try:
                 values.append(float(text))
             except ValueError:
-                raise ValueError(f"{path}, line {number}: {text!r} is not a number") from None
+                raise ValueError(f"{path}, line {number}: {text[:40]!r} is not a number") from None
             if not values[-1] > 0:
-                raise ValueError(f"{path}, line {number}: a weight must be positive, not {text}")
+                raise ValueError(f"{path}, line {number}: a weight must be positive, not {text[:40]}")
     return values

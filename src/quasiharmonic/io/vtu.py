@@ -145,7 +145,7 @@ class _VtuFile:
         """The numbers of an array, of which there may be so many."""
         kind = _KINDS.get(array.attributes.get("type", ""))
         if kind is None:
-            raise ValueError(f"arrays of {array.attributes.get('type')} are no numbers")
+            raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are no numbers")
         if array.attributes.get("format") == "ascii":
             text = self._data[array.begin : array.end].split()
             return np.array(text, dtype=np.bytes_).astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)

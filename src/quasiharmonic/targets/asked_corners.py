@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, vertex_array
+from quasiharmonic.io.textual import integer
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.targets.pins import Corners
 
@@ -181,15 +182,15 @@ def _entry(text: str) -> tuple[int | Place, Goal | None]:
     """A vertex or a place, and where it goes if that is said."""
     vertex, *goal = text.removeprefix(_NEAR).split(":")
     try:
-        who = _place(vertex) if text.startswith(_NEAR) else int(vertex)
+        who = _place(vertex) if text.startswith(_NEAR) else integer(vertex.strip().encode())
         if not goal:
             return who, None
         if len(goal) == 1:
-            return who, int(goal[0])
+            return who, integer(goal[0].strip().encode())
         x, y = map(float, goal)
         return who, (x, y)
     except ValueError:
-        raise ValueError(f"{text!r} is none of {FORMS}") from None
+        raise ValueError(f"{text[:40]!r} is none of {FORMS}") from None
 
 
 def _place(text: str) -> Place:
