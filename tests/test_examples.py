@@ -52,7 +52,7 @@ def test_figure_04(example):
 
 
 def test_figure_05(example):
-    numbers = example("figure_05", size=16)
+    numbers = example("figure_05", size=48)
     assert numbers["tanh"]["flips"] == numbers["si-log"]["flips"] == 0
     assert numbers["tanh"]["iterations"] < 60 < numbers["si-log"]["iterations"] < 300
     assert numbers["si-log"]["MIPS"] < 0.7 * numbers["tanh"]["MIPS"]
