@@ -287,11 +287,11 @@ def test_figure_09(example):
 
 
 def test_figure_10(example):
-    numbers = example("figure_10", size=24, rows=1)
-    for row in numbers.values():
-        assert [cell["flips"] for cell in row.values()] == [0, 0, 0, 0]
-        assert row["V₃"]["left by the functional"] == 0
-        assert row["V₄"]["left by the functional"] > 20
+    numbers = example("figure_10", surfaces=1, iterations=100)
+    assert numbers["V₃ tanh"]["solved"] == 6
+    assert numbers["V₃ tanh"]["most iterations"] < 100
+    # The paper has them all.
+    assert numbers["V₄"]["solved"] < 6
 
 
 def test_figure_14(example):
