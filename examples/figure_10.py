@@ -15,10 +15,10 @@ V₄, si-log          1      4
 V₄ by edges, si-log 11     521
 =================== ====== ===============
 
-With tanh V₃ leaves one triangle, of the rabbit onto H. With si-log the bust and the hand are solved for the most part,
-the angel, the gargoyle and the rabbit on no letter: 2 to 46 triangles stay inverted, on most letters the same number,
-whichever the functional. V₄ in linear elements goes below zero; in Crouzeix and Raviart's it does as V₃ does
-(`edge_elements`). The maps drawn are those of V₃ with tanh.
+With tanh V₃ leaves one triangle, of the rabbit onto H, for which `speed` finds a map. With si-log the bust and the
+hand are solved for the most part, the angel, the gargoyle and the rabbit on no letter: 2 to 46 triangles stay
+inverted, on most letters the same number, whichever the functional. V₄ in linear elements goes below zero; in Crouzeix
+and Raviart's it does as V₃ does (`edge_elements`). The maps drawn are those of V₃ with tanh.
 """
 
 from __future__ import annotations
