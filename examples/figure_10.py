@@ -44,7 +44,7 @@ COLUMNS = {
 
 
 def main(output: Path, size: int = 24, surfaces: int = 5, iterations: int = 600) -> dict[str, Any]:
-    figure, axes = panels(surfaces, len(LETTERS), (2.1, 2.6))
+    figure, axes = panels(surfaces, len(LETTERS), (2.6, 3.1))
     numbers: dict[str, Any] = {column: {"solved": 0, "most iterations": 0} for column in COLUMNS}
     for row, surface in zip(axes, SURFACES, strict=False):
         V, F = sculpture(surface, size)
@@ -71,7 +71,7 @@ def main(output: Path, size: int = 24, surfaces: int = 5, iterations: int = 600)
                     total["solved"] += 1
                     total["most iterations"] = max(total["most iterations"], result.iterations)
             failed = [column for column in COLUMNS if cell[column]["flips"]]
-            show(ax, problem, shown.uv, f"{surface}; not by " + ", ".join(failed) if failed else surface, size=6)
+            show(ax, problem, shown.uv, f"{surface}; not by " + ", ".join(failed) if failed else surface, size=7)
             numbers[f"{surface} onto {letter}"] = cell
     save(figure, output, "figure_10")
     return numbers
