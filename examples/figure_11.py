@@ -47,7 +47,8 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
     for ax, (name, uv) in zip([*axes[0][1:], *axes[1]], maps.items(), strict=True):
         ratio, _ = ratios(problem, uv)
         left = flips(problem, uv)
-        title = f"{name}\n" + (f"{left} inverted" if left else f"σ₁/σ₂ up to {ratio.max():.1f}")
+        how = f"{name}, by polishing" if "then" in name else name
+        title = f"{how}\n" + (f"{left} inverted" if left else f"σ₁/σ₂ up to {ratio.max():.1f}")
         drawn = show_ratios(ax, problem, uv, title, 20)
         ax.plot(*uv[problem.domain.pins].T, "o", color="white", mec="black", markersize=5)
         numbers[name.split(":")[0]] = {

@@ -9,6 +9,10 @@ So it does here: the first maps have MIPS 0.7 to 7.4 and isometric distortion 69
 down to 0.08 to 2.3 and the latter no lower than 400. Polishing by symmetric Dirichlet gives up some of the angles,
 MIPS 2.2 to 10, and brings sizes to between 8.7 and 15, with every boundary vertex still in its place; IsoTLC, another
 program, moves the boundary.
+
+The paper's isometric columns cannot be that maximum as it is: 0.853, for David onto A, is less than max(σ₁, 1/σ₂) of
+any triangle, for where σ₁ is below 1 so is σ₂, and 1/σ₂ above it. What was taken off, or divided by, the text does not
+say; those columns compare with ours in kind only.
 """
 
 from __future__ import annotations

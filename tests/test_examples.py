@@ -52,7 +52,7 @@ def test_figure_04(example):
 
 
 def test_figure_05(example):
-    numbers = example("figure_05", size=16)
+    numbers = example("figure_05", size=48)
     assert numbers["tanh"]["flips"] == numbers["si-log"]["flips"] == 0
     assert numbers["tanh"]["iterations"] < 60 < numbers["si-log"]["iterations"] < 300
     assert numbers["si-log"]["MIPS"] < 0.7 * numbers["tanh"]["MIPS"]
@@ -287,11 +287,11 @@ def test_figure_09(example):
 
 
 def test_figure_10(example):
-    numbers = example("figure_10", size=24, rows=1)
-    for row in numbers.values():
-        assert [cell["flips"] for cell in row.values()] == [0, 0, 0, 0]
-        assert row["V₃"]["left by the functional"] == 0
-        assert row["V₄"]["left by the functional"] > 20
+    numbers = example("figure_10", surfaces=1, iterations=100)
+    assert numbers["V₃ tanh"]["solved"] == 6
+    assert numbers["V₃ tanh"]["most iterations"] < 100
+    # The paper has them all.
+    assert numbers["V₄"]["solved"] < 6
 
 
 def test_figure_14(example):
