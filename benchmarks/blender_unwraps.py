@@ -5,9 +5,9 @@
 Needs Blender as a module (``pip install bpy`` with Python 3.11) and this package beside it. Every OBJ file below the
 folders; without any, surfaces that the project makes. Blender unwraps in its three ways, with nothing pinned and with
 the two vertices of the border that are farthest apart pinned as far apart as they are in space, the surface's area
-taken for 1; ours is `flatten`, the same two held or none. Flipped triangles and overlap are judged exactly, on what Blender holds, in single precision; ours after the
-same rounding. Stretch is the mean symmetric Dirichlet energy at the surface's area, 4 for an isometry, "∞" where a
-triangle is flipped. Seconds are of the wall.
+taken for 1; ours is `flatten`, the same two held or none. Flipped triangles and overlap are judged exactly, on what
+Blender holds, in single precision; ours after the same rounding. Stretch is the mean symmetric Dirichlet energy at the
+surface's area, 4 for an isometry, "∞" where a triangle is flipped. Seconds are of the wall.
 """
 
 from __future__ import annotations
