@@ -84,11 +84,11 @@ class QHM_OT_check(UvWorking):
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Select and tell."""
         verdict, lying, bent = result
-        data = context.active_object.data
-        flipped = surface.select_faces(data, self.surface, verdict.flipped)
-        count = surface.select_faces(data, self.surface, np.union1d(verdict.flipped, lying))
-        context.tool_settings.mesh_select_mode = (False, False, True)
-        text = f"{counted('face', 'faces', count)} selected, of which {flipped} flipped. {_told(verdict)}"
+        face = self.surface.polygons.of_triangle
+        flipped = np.unique(face[verdict.flipped])
+        chosen = np.union1d(flipped, face[lying])
+        surface.select_faces(context, self.surface, chosen)
+        text = f"{counted('face', 'faces', len(chosen))} selected, of which {len(flipped)} flipped. {_told(verdict)}"
         if len(bent):
             text += (
                 f" {counted('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."

@@ -115,19 +115,16 @@ def write(data: bpy.types.Mesh, surface: Surface, mapped: SeamedMesh) -> SeamedM
     return SeamedMesh(mapped.V, mapped.F, np.where(mapped.FT >= 0, surface.loops, -1), places.astype(np.float64))
 
 
-def select_faces(data: bpy.types.Mesh, surface: Surface, triangles: IntArray) -> int:
-    """Select the faces that some triangles are parts of, and no others; how many these are."""
-    polygons = surface.polygons
-    chosen = np.zeros(len(polygons), dtype=np.bool_)
-    chosen[polygons.of_triangle[triangles]] = True
-    corners = np.repeat(chosen, polygons.sizes)
-    data.polygons.foreach_set("select", chosen)
-    for items, name in ((data.vertices, "vertex_index"), (data.edges, "edge_index")):
-        touched = np.zeros(len(items), dtype=np.bool_)
-        touched[numbers(data.loops, name, 1, np.int32).ravel()[corners]] = True
-        items.foreach_set("select", touched)
-    data.update()
-    return int(np.count_nonzero(chosen))
+def select_faces(context: bpy.types.Context, surface: Surface, faces: IntArray) -> None:
+    """Select some faces of the active object, in object mode, and no others; what of it is selected is by faces now."""
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="DESELECT")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    chosen = np.zeros(len(surface.polygons), dtype=np.bool_)
+    chosen[faces] = True
+    # Edit mode selects the edges and vertices of these by itself, if faces are what it selects.
+    context.active_object.data.polygons.foreach_set("select", chosen)
+    context.tool_settings.mesh_select_mode = (False, False, True)
 
 
 def numbers(items: Any, name: str, width: int, kind: type) -> Any:

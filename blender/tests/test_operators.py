@@ -288,8 +288,9 @@ def test_in_edit_mode_islands_that_are_not_selected_stay():
     thing = two_squares([1.5, 0])
     scenes.move_vertex(thing, 7, [0.5, 0.35])
     scenes.move_vertex(thing, 32, [2.0, 0.35])
-    for items in (thing.data.polygons, thing.data.edges, thing.data.vertices):
-        items.foreach_set("select", np.zeros(len(items), dtype=bool))
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="DESELECT")
+    bpy.ops.object.mode_set(mode="OBJECT")
     bpy.context.tool_settings.mesh_select_mode = (False, False, True)
     thing.data.polygons[20].select = True
     before = scenes.places(thing)
