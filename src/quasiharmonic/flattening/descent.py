@@ -6,6 +6,7 @@ One vertex is held, or the map could drift. It may turn: the raised diagonal of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ import numpy as np
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import Energy, QuadraticForm
+from quasiharmonic.energy.line_search import backtrack, extend
 from quasiharmonic.energy.newton_descent import Lowered, NewtonDescent
 from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energy.turning import Turning
 from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
 from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.result import Status
@@ -28,6 +31,9 @@ _STRANGE = 0.3
 _LEAST_ENERGY = 1e-4
 # A step may take the narrowest gap down to this share of what it was, or of its reach.
 _NARROWER = 0.3
+# Newton's steps in full converge quadratically. Where so many of them in a row leave this share of the decrement, and
+# this of the energy, triangles turn, which a straight step allows by little.
+_SLOW, _LITTLE, _SLOW_STEPS = 0.3, 0.8, 4
 
 
 class _Moment(NamedTuple):
@@ -104,6 +110,8 @@ class FreeDescent(NewtonDescent):
         self, energy: Lowered, uv: FloatArray, linear_solver: str, fixed: Sequence[int] | IntArray = (0,)
     ) -> None:
         super().__init__(energy, uv, np.asarray(fixed, dtype=np.int64), 0, linear_solver)
+        self._linear_solver = linear_solver
+        self._last, self._slow = (np.inf, np.inf), 0
 
     @property
     def uv(self) -> FloatArray:
@@ -131,6 +139,34 @@ class FreeDescent(NewtonDescent):
         """Make what only guards the map count for less; False if it cannot."""
         return False
 
+    @cached_property
+    def _turning(self) -> Turning | None:
+        return Turning.of(self.energy.F, self.energy.g, self.w.size, self.fixed, self._linear_solver)
+
+    def _search(self, direction: ComplexArray, promise: float) -> bool:
+        """As of `NewtonDescent`; where full steps are many and short, first along a path that turns."""
+        last, higher = self._last
+        slow = not self._cut and promise > _SLOW * last and self.value > _LITTLE * higher
+        self._last, self._slow = (promise, self.value), self._slow + 1 if slow else 0
+        return (self._slow >= _SLOW_STEPS and self._turned(direction, promise)) or super()._search(direction, promise)
+
+    def _turned(self, direction: ComplexArray, promise: float) -> bool:
+        """Take a step in full, or more, along a path that turns; False if the energy does not fall enough there."""
+        if self._turning is None or not promise > 0:
+            return False
+        full = np.zeros_like(self.w)
+        full[self.system.free] = direction
+        path = self._turning.path(self.w, full)
+
+        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
+            return self.tried(path(t), bound)
+
+        taken = backtrack(trial, self.value, promise, tries=1)
+        if taken is None:
+            return False
+        _, self.value, (self.w, self._deformation) = extend(trial, taken)
+        return True
+
 
 class GuardedDescent(FreeDescent):
     """Steps of a map that stays bijective.
@@ -153,7 +189,7 @@ class GuardedDescent(FreeDescent):
         rim: Rim,
         fixed: Sequence[int] | IntArray = (0,),
     ) -> None:
-        self._rim, self._linear_solver = rim, linear_solver
+        self._rim = rim
         self._stages = iter(_STAGES)
         self._weight, self._slack = next(self._stages)
         super().__init__(GuardedEnergy(energy), uv, linear_solver, fixed)
