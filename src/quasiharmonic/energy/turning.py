@@ -23,6 +23,13 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 
 
+def turn(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> FloatArray:
+    """By what angle every triangle of a map (n,) complex128 begins to turn along a direction; (f,) float64."""
+    corners = F.T
+    rate: ComplexArray = np.sum(g.conj() * direction[corners], axis=0) / np.sum(g.conj() * w[corners], axis=0)
+    return rate.imag
+
+
 class Turning:
     """Paths for maps of one mesh.
 
@@ -45,7 +52,7 @@ class Turning:
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
-        self._corners = np.ascontiguousarray(F.T)
+        self._F, self._corners = F, np.ascontiguousarray(F.T)
         self._g = g
         # The gradients' cross product says how large the triangle is, up to a factor that all have in common.
         self._area: FloatArray = 1 / np.abs((g[1].conj() * g[2]).imag)
@@ -69,11 +76,11 @@ class Turning:
             From a length t to the map there, in first order ``w + t · direction``.
         """
         (p, q), (dp, dq) = self._derivatives(w), self._derivatives(direction)
-        turn = (dp / p).imag
-        strain_p, strain_q = dp - 1j * turn * p, dq - 1j * turn * q
+        angle = turn(self._F, self._g, w, direction)
+        strain_p, strain_q = dp - 1j * angle * p, dq - 1j * angle * q
 
         def at(t: float) -> ComplexArray:
-            turned = np.exp(1j * t * turn)
+            turned = np.exp(1j * t * angle)
             beyond_p = turned * (p + t * strain_p) - (p + t * dp)
             beyond_q = turned * (q + t * strain_q) - (q + t * dq)
             load = self._area * (beyond_p * self._g + beyond_q * self._g.conj())

@@ -17,7 +17,7 @@ from quasiharmonic.energy.energies import Energy, QuadraticForm
 from quasiharmonic.energy.line_search import backtrack, extend
 from quasiharmonic.energy.newton_descent import Lowered, NewtonDescent
 from quasiharmonic.energy.newton_system import NewtonSystem
-from quasiharmonic.energy.turning import Turning
+from quasiharmonic.energy.turning import Turning, turn
 from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
 from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.result import Status
@@ -34,6 +34,8 @@ _NARROWER = 0.3
 # Newton's steps in full converge quadratically. Where so many of them in a row leave this share of the decrement, and
 # this of the energy, triangles turn, which a straight step allows by little.
 _SLOW, _LITTLE, _SLOW_STEPS = 0.3, 0.8, 4
+# ... if half of them turn by this angle: where they turn by less a line is as good, and the path costs a solve.
+_TURNED = 0.01
 
 
 class _Moment(NamedTuple):
@@ -152,10 +154,11 @@ class FreeDescent(NewtonDescent):
 
     def _turned(self, direction: ComplexArray, promise: float) -> bool:
         """Take a step in full, or more, along a path that turns; False if the energy does not fall enough there."""
-        if self._turning is None or not promise > 0:
-            return False
         full = np.zeros_like(self.w)
         full[self.system.free] = direction
+        angle = np.median(np.abs(turn(self.energy.F, self.energy.g, self.w, full)))
+        if not (promise > 0 and angle > _TURNED) or self._turning is None:
+            return False
         path = self._turning.path(self.w, full)
 
         def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
