@@ -23,11 +23,11 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 
 
-def turn(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> FloatArray:
-    """By what angle every triangle of a map (n,) complex128 begins to turn along a direction; (f,) float64."""
+def rates(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> ComplexArray:
+    """``dp/p``: how every triangle (f,) of a map (n,) begins to grow along a direction, and ``i`` times its turning."""
     corners = F.T
     rate: ComplexArray = np.sum(g.conj() * direction[corners], axis=0) / np.sum(g.conj() * w[corners], axis=0)
-    return rate.imag
+    return rate
 
 
 class Turning:
@@ -76,7 +76,7 @@ class Turning:
             From a length t to the map there, in first order ``w + t · direction``.
         """
         (p, q), (dp, dq) = self._derivatives(w), self._derivatives(direction)
-        angle = turn(self._F, self._g, w, direction)
+        angle = rates(self._F, self._g, w, direction).imag
         strain_p, strain_q = dp - 1j * angle * p, dq - 1j * angle * q
 
         def at(t: float) -> ComplexArray:

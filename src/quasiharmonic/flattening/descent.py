@@ -17,7 +17,7 @@ from quasiharmonic.energy.energies import Energy, QuadraticForm
 from quasiharmonic.energy.line_search import backtrack, extend
 from quasiharmonic.energy.newton_descent import Lowered, NewtonDescent
 from quasiharmonic.energy.newton_system import NewtonSystem
-from quasiharmonic.energy.turning import Turning, turn
+from quasiharmonic.energy.turning import Turning, rates
 from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
 from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.result import Status
@@ -34,8 +34,8 @@ _NARROWER = 0.3
 # Newton's steps in full converge quadratically. Where so many of them in a row leave this share of the decrement, and
 # this of the energy, triangles turn, which a straight step allows by little.
 _SLOW, _LITTLE, _SLOW_STEPS = 0.3, 0.8, 4
-# ... if half of them turn by this angle: where they turn by less a line is as good, and the path costs a solve.
-_TURNED = 0.01
+# ... if in the middle they turn by so many times what they grow: otherwise a line is as good, and costs no solve.
+_TURNED = 12.0
 
 
 class _Moment(NamedTuple):
@@ -156,8 +156,9 @@ class FreeDescent(NewtonDescent):
         """Take a step in full, or more, along a path that turns; False if the energy does not fall enough there."""
         full = np.zeros_like(self.w)
         full[self.system.free] = direction
-        angle = np.median(np.abs(turn(self.energy.F, self.energy.g, self.w, full)))
-        if not (promise > 0 and angle > _TURNED) or self._turning is None:
+        rate = rates(self.energy.F, self.energy.g, self.w, full)
+        turning = np.median(np.abs(rate.imag)) > _TURNED * np.median(np.abs(rate.real))
+        if not (promise > 0 and turning) or self._turning is None:
             return False
         path = self._turning.path(self.w, full)
 
