@@ -146,6 +146,19 @@ class TestMirroredAndStacked:
             rim = boundary(before.islands[1])
             assert np.array_equal(after.islands[1].uv[rim], before.islands[1].uv[rim])
 
+    def test_a_mirrored_island_is_measured_as_the_other_side_shows_it(self, tmp_path, capsys):
+        seamed(tmp_path / "in.obj")
+        run("measure", tmp_path / "in.obj", "--json", tmp_path / "straight.json")
+        seamed(tmp_path / "in.obj", mirrored=1)
+        run("measure", tmp_path / "in.obj", "--json", tmp_path / "mirrored.json")
+        assert "mirrored island 1 measured as the other side shows" in capsys.readouterr().out
+        one, other = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("straight", "mirrored"))
+        assert other["isometric"] == pytest.approx(one["isometric"])
+        assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
+        said = capsys.readouterr().out
+        assert "inf" not in said
+        assert "strictly positive" not in said
+
     def test_flattened_anew_nothing_is_mirrored(self, tmp_path):
         seamed(tmp_path / "in.obj", mirrored=1)
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
@@ -206,6 +219,42 @@ class TestCut:
         given = ["--seams", tmp_path / "edges.txt"]
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", *given) == 2
         assert f"edge ({a}, {b}) inside a face" in capsys.readouterr().err
+
+
+class TestSeenFromOutside:
+    def test_the_boundary_is_that_which_seams_make(self, source, tmp_path, capsys):
+        assert run("check", source, "--boundary", "--json", tmp_path / "told.json") == 0
+        loops = json.loads((tmp_path / "told.json").read_text())["loops"]
+        assert len(loops) == 3
+        # By the mesh's own numbers, of which those at a seam are on two loops.
+        vertices = np.concatenate([loop["vertices"] for loop in loops])
+        assert vertices.max() < len(io.read_mesh(source).V)
+        assert len(np.unique(vertices)) < len(vertices)
+
+    def test_a_batch_with_seams_has_its_page(self, source, tmp_path):
+        assert run("batch", tmp_path, "-o", tmp_path / "out", "--flatten", "-j", "1") == 0
+        assert run("report", tmp_path / "out") == 0
+
+    def test_isometric_islands_let_go(self, tmp_path):
+        write_cube(tmp_path / "in.obj", 1)
+        text = (tmp_path / "in.obj").read_text().replace("f ", "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf ", 1)
+        lines = text.splitlines()
+        for i, line in enumerate(lines):
+            if line.startswith("f "):
+                lines[i] = "f " + " ".join(f"{v}/{k + 1}" for k, v in enumerate(line.split()[1:]))
+        (tmp_path / "in.obj").write_text("\n".join(lines) + "\n")
+        assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--free") == 0
+
+    def test_a_face_without_places_is_named(self, tmp_path, capsys):
+        V, F = grid(3, 3)
+        io.write_obj(tmp_path / "in.obj", io.MeshData(V, F).with_map(V))
+        text = (tmp_path / "in.obj").read_text()
+        last = text.splitlines()[-1]
+        (tmp_path / "in.obj").write_text(text.replace(last, re.sub(r"/\d*", "", last)))
+        for options in ([], ["--cut"]):
+            assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", *options) == 2
+            assert "face 17 (0-based) without texture coordinates" in capsys.readouterr().err
+        assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--seams", "none") == 0
 
 
 class TestRefused:

@@ -143,6 +143,17 @@ class TestFiles:
             assert np.array_equal(getattr(quick, name), getattr(careful, name))
         assert np.array_equal(quick.polygons.corners, careful.polygons.corners)
 
+    def test_lines_that_say_the_same_stay_as_they_stood(self, tmp_path):
+        text = "v 0 0 0\r\nv 1.00 0 0\r\nv 0 1e0 0\r\nvt 0.50 0 0\r\nvt 1 0 0.25\r\nvt 0 1.000\r\nf 1/1 2/2 3/3\r\n"
+        (tmp_path / "a.obj").write_bytes(text.encode())
+        mesh = io.read_mesh(tmp_path / "a.obj")
+        io.write_obj(tmp_path / "b.obj", mesh)
+        assert (tmp_path / "b.obj").read_bytes() == text.encode()
+        uv = mesh.vt.copy()
+        uv[1] = 2, 3
+        io.write_obj(tmp_path / "b.obj", mesh.with_map(uv))
+        assert (tmp_path / "b.obj").read_bytes() == text.replace("vt 1 0 0.25", "vt 2.0 3.0").encode()
+
     def test_off(self, tmp_path):
         text = "OFF\n5 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n2 0 0\n4 0 1 2 3\n3 1 4 2\n"
         (tmp_path / "a.off").write_text(text)

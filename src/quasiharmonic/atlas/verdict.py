@@ -159,6 +159,15 @@ def certify(mesh: SeamedMesh) -> AtlasVerdict:
     return AtlasVerdict(tuple(judged), _overlapping(mesh.islands, judged))
 
 
+def unmirrored(mesh: SeamedMesh) -> SeamedMesh:
+    """The map with its mirrored islands reflected, to be measured; where they lie does not matter then."""
+    turned = len(mesh.islands) > 1
+    mirror = np.array([-1.0, 1.0])
+    return mesh.with_places(
+        [island.uv * mirror if turned and is_mirrored(island.F, island.uv) else island.uv for island in mesh.islands]
+    )
+
+
 def is_mirrored(F: IntArray, uv: FloatArray) -> bool:
     """Whether every triangle is strictly negative."""
     return bool((orientation_or_nonfinite(*uv[F].swapaxes(0, 1))[0] < 0).all())

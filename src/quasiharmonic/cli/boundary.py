@@ -19,6 +19,8 @@ _LISTED = 100
 
 def run(options: argparse.Namespace) -> int:
     """Read the surface, number its boundary, draw it, report."""
+    from dataclasses import replace
+
     import numpy as np
 
     from quasiharmonic import io
@@ -31,7 +33,12 @@ def run(options: argparse.Namespace) -> int:
         report.check_picture("--plot", options.plot, (options.input,))
     mesh = io.read_mesh(options.input)
     with report.about(options.input):
-        loops = boundary_turning(mesh.V, mesh.F)
+        opened = io.seamed(mesh).opened()
+        # Of a vertex that has several places, each is on the boundary by itself and by the vertex's number.
+        origin = np.arange(len(opened.V))
+        origin[opened.F] = mesh.F
+        turning = boundary_turning(opened.V, opened.F)
+        loops = [replace(loop, vertices=origin[loop.vertices]) for loop in turning]
     told = [_told(loop, mesh.V) for loop in loops]
     facts: dict[str, Any] = {
         "input": str(options.input),

@@ -56,6 +56,11 @@ class Judged:
         return self.bijective and (self.verdict is None or not len(self.verdict.overlapping))
 
     @property
+    def mirrored(self) -> bool:
+        """Whether an island is mirrored."""
+        return self.verdict is not None and bool(self.verdict.mirrored.size)
+
+    @property
     def inverted(self) -> NDArray[np.int64]:
         """Triangles that are not as their island is wound."""
         import numpy as np

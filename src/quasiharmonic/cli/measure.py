@@ -43,14 +43,21 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, measure, export, report."""
     from quasiharmonic import io
+    from quasiharmonic.arrays import named
+    from quasiharmonic.atlas.verdict import certify, unmirrored
     from quasiharmonic.cli import report
     from quasiharmonic.energy.measures import distortion
+    from quasiharmonic.mesh.seams import SeamedMesh
 
     report.check_json(options.json, inputs=(options.input, options.export))
     if options.export is not None:
         report.check_export(options.export, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
     V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
+    mirrored = certify(SeamedMesh(V, F, F, uv)).mirrored
+    if mirrored.size:
+        reflected = unmirrored(SeamedMesh(V, F, F, uv)).uv
+        uv = uv if reflected is None else reflected
     with report.about(options.input):
         found = distortion(V, F, uv, rings=options.rings if options.distances else None)
     if options.export is not None:
@@ -59,6 +66,8 @@ def run(options: argparse.Namespace) -> int:
         io.write_per_triangle(options.export, V, F, uv, values)
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
     lines = [_table(found, len(mesh.F))]
+    if mirrored.size:
+        lines.append(f"mirrored {named('island', 'islands', mirrored)} measured as the other side shows them")
     if found.distances is not None:
         lines.append(found.distances.summary())
     report.emit(facts, options.json, "\n".join(lines))

@@ -94,6 +94,7 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
     What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``.
     """
     from quasiharmonic import io
+    from quasiharmonic.atlas.verdict import unmirrored
     from quasiharmonic.cli import judging, material, progress, report, seams
     from quasiharmonic.energy.measures import distortion
 
@@ -106,7 +107,7 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
     judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, after.mesh)))
     with report.after_writing(options.output):
         # Each with the vertices that its own seams give it, which may lie in different places.
-        opened = before.opened(), after.mesh.opened()
+        opened = unmirrored(before).opened(), unmirrored(after.mesh).opened()
         measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
         facts = {
             **after.to_dict(),
@@ -120,7 +121,7 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
         }
         lines = [report.of_maps(after, judged, options.output)]
         if judged.injective:
-            lines += [_change(*measured), after.status.value]
+            lines += [_change(*measured), *([] if judged.mirrored else [after.status.value])]
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if judged.injective else 1
 

@@ -136,6 +136,9 @@ def _same(path: Path, other: Path) -> bool:
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
 
 
+_COUNTING = "(counting from 0)"
+
+
 @contextmanager
 def about(source: Path | str) -> Iterator[None]:
     """Tell of which file a message about a mesh speaks, and how it counts; messages about files say so themselves."""
@@ -146,7 +149,10 @@ def about(source: Path | str) -> Iterator[None]:
     except MeshFileError:
         raise
     except ValueError as error:
-        raise ValueError(f"{source}: {error} (counting from 0)") from error
+        if str(error).endswith(_COUNTING):
+            # Said already, of something more particular.
+            raise
+        raise ValueError(f"{source}: {error} {_COUNTING}") from error
 
 
 class ReportError(Exception):

@@ -93,6 +93,9 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
 
     with report.about(mesh.source):
         if options.seams == "file":
+            if mesh.FT is not None and getattr(options, "to", "") is not None:
+                # Only where the map says where boundaries go, part of it may do.
+                io.check_mapped(mesh)
             found = Seamed(io.seamed(mesh))
         elif options.seams == "none":
             found = Seamed(SeamedMesh(mesh.V, mesh.F))

@@ -15,7 +15,7 @@ from quasiharmonic.io.gltfwrite import write_gltf
 from quasiharmonic.io.handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
 from quasiharmonic.io.holding import TEXTURED, not_held
 from quasiharmonic.io.materials import companions
-from quasiharmonic.io.meshdata import MeshData, in_plane, map_of, vertex_places
+from quasiharmonic.io.meshdata import MeshData, check_mapped, in_plane, map_of, vertex_places
 from quasiharmonic.io.obj import read_obj, write_obj
 from quasiharmonic.io.off import read_off, write_off
 from quasiharmonic.io.per_triangle import FORMATS as PER_TRIANGLE_FORMATS
@@ -36,6 +36,7 @@ __all__ = [
     "OutputError",
     "ProblemArrays",
     "Texture",
+    "check_mapped",
     "check_output",
     "check_writable",
     "checkerboard",

@@ -47,24 +47,28 @@ class Carried:
 
 
 @dataclass(frozen=True, eq=False)
-class VertexLines:
-    """Lines of a file that are written back as they stood, so that not one digit of a model changes.
+class KeptLines:
+    """Lines of a file that are written back as they stood, so that not one digit changes that need not.
 
     Attributes
     ----------
     text : bytes
-        A line for each vertex.
-    rows : (n, 3 + k) float64
-        What they say. Where a mesh says something else by now, they are not written.
+        The lines.
+    rows : (n, k) float64
+        What they say.
     """
 
     text: bytes
     rows: FloatArray
 
-    def still_said(self, rows: FloatArray) -> bool:
-        """Whether the first of some rows, or all of them, are what the lines say."""
-        first = rows[: len(self.rows)]
-        return first.shape == self.rows.shape and np.array_equal(first, self.rows, equal_nan=True)
+    def unchanged(self, rows: FloatArray) -> NDArray[np.bool_]:
+        """Which of some rows are what the line of the same number says; (m,) bool."""
+        same = np.zeros(len(rows), dtype=np.bool_)
+        if rows.shape[1:] == self.rows.shape[1:]:
+            both = min(len(rows), len(self.rows))
+            one, other = rows[:both], self.rows[:both]
+            same[:both] = ((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1)
+        return same
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +90,10 @@ class MeshData:
         For every corner its row of ``vt``; -1 where the corner has none.
     extra : (n, k) float64 or None
         What stood behind the three coordinates of a vertex (weight, colour); NaN where nothing did.
-    lines : VertexLines or None
-        The lines of the first vertices as they stood.
+    lines, map_lines : KeptLines or None
+        The lines of the first vertices, and of the first texture coordinates, as they stood.
+    newline : bytes
+        What ends the file's lines.
     normals : bytes
         The ``vn`` lines as they stood. They are never looked into, only written back.
     FN : (f, 3) int64 or None
@@ -111,7 +117,9 @@ class MeshData:
     vt: FloatArray | None = None
     FT: IntArray | None = None
     extra: FloatArray | None = None
-    lines: VertexLines | None = None
+    lines: KeptLines | None = None
+    map_lines: KeptLines | None = None
+    newline: bytes = b"\n"
     normals: bytes = b""
     FN: IntArray | None = None
     statements: bytes = b""

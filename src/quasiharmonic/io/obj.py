@@ -6,13 +6,14 @@ import math
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.materials import with_libraries, write_material
-from quasiharmonic.io.meshdata import MeshData, VertexLines, polygon_mesh
+from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
 from quasiharmonic.io.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.textual import integer_table, number_table, read_text
 
@@ -24,6 +25,8 @@ _NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _CAREFUL + rb")\s)", re.MULTIL
 # What a corner of each form refers to: 0 vertices, 1 texture coordinates, 2 normals.
 _FORMS = {b"1": (0,), b"1/1": (0, 1), b"1//1": (0, 2), b"1/1/1": (0, 1, 2)}
 _CHUNK = 100_000
+# How a file ends its lines shows in its first bytes.
+_HEAD = 4096
 
 
 def read_obj(path: str | os.PathLike[str]) -> MeshData:
@@ -56,7 +59,9 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
         without vertices or faces, one that is not text, or none at all.
     """
     data = read_text(path)
-    return read_regular(path, data) or read_obj_lines(path, data)
+    mesh = read_regular(path, data) or read_obj_lines(path, data)
+    with open(path, "rb") as file:
+        return replace(mesh, newline=b"\r\n" if b"\r\n" in file.read(_HEAD) else b"\n")
 
 
 def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
@@ -84,7 +89,8 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
     if mesh.texture is not None:
         mesh = write_material(path, mesh, durable=durable)
     mesh = with_libraries(path, mesh)
-    write_whole(path, lambda file: file.writelines(_pieces(mesh)), durable=durable)
+    pieces = (piece.replace(b"\n", mesh.newline) for piece in _pieces(mesh))
+    write_whole(path, lambda file: file.writelines(pieces), durable=durable)
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
@@ -104,9 +110,10 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
     rows = number_table(positions, b"v", int(counts[_VERTEX]))
     if rows is None or rows.shape[1] < 3:
         return None
-    vt = None
+    vt, places = None, b""
     if counts[_TEXTURE]:
-        vt = number_table(_lines_of(_TEXTURE, data, ends, kinds), b"vt", int(counts[_TEXTURE]))
+        places = _lines_of(_TEXTURE, data, ends, kinds)
+        vt = number_table(places, b"vt", int(counts[_TEXTURE]))
         if vt is None or not 2 <= vt.shape[1] <= 3:
             return None
     parts = _regular_faces(_lines_of(_FACE, data, ends, kinds), counts)
@@ -123,7 +130,8 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
         normal_lines=flat.get(2),
         vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
         extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
-        lines=VertexLines(positions, rows),
+        lines=KeptLines(positions, rows),
+        map_lines=None if vt is None else KeptLines(places, vt[:, :2]),
         normals=_lines_of(_NORMAL, data, ends, kinds),
         statements=statements,
         statement_faces=before[kinds == _STATEMENT],
@@ -188,16 +196,9 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
     head = int(np.count_nonzero(at < 0))
     yield b"".join(line + b"\n" for line in statements[:head])
     rows = mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra])
-    if mesh.lines is not None and mesh.lines.still_said(rows):
-        yield mesh.lines.text
-        rows = rows[len(mesh.lines.rows) :]
-    if np.isnan(rows).any():
-        for row in rows.tolist():
-            yield ("v " + " ".join(repr(x) for x in row if not math.isnan(x)) + "\n").encode()
-    else:
-        yield from _number_lines("v", rows)
+    yield from _lines("v", mesh.lines, rows)
     if mesh.vt is not None:
-        yield from _number_lines("vt", mesh.vt)
+        yield from _lines("vt", mesh.map_lines, mesh.vt)
     yield mesh.normals
     corners = _corner_texts(mesh)
     starts = 3 * np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.starts
@@ -211,7 +212,29 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
         yield line + b"\n" if line else b""
 
 
+def _lines(keyword: str, kept: KeptLines | None, rows: NDArray[np.float64]) -> Iterator[bytes]:
+    """Rows of numbers, as they stood where they still say what they said."""
+    same = np.zeros(len(rows), dtype=np.bool_) if kept is None else kept.unchanged(rows)
+    if kept is None or not same.any():
+        yield from _number_lines(keyword, rows)
+        return
+    texts = kept.text.split(b"\n")
+    # In runs of what stays and what does not.
+    ends = [*(np.flatnonzero(same[1:] != same[:-1]) + 1).tolist(), len(rows)]
+    begin = 0
+    for end in ends:
+        if same[begin]:
+            yield b"\n".join([*texts[begin:end], b""])
+        else:
+            yield from _number_lines(keyword, rows[begin:end])
+        begin = end
+
+
 def _number_lines(keyword: str, rows: NDArray[np.float64]) -> Iterator[bytes]:
+    if np.isnan(rows).any():
+        for row in rows.tolist():
+            yield (keyword + "".join(f" {x!r}" for x in row if not math.isnan(x)) + "\n").encode()
+        return
     form = keyword + " %r" * rows.shape[1] + "\n"
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.meshdata import MeshData, VertexLines, polygon_mesh
+from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
 from quasiharmonic.io.textual import integer, number, shown
 
 # Statements whose geometry would be lost, and elements that point to vertices in ways not kept.
@@ -37,7 +37,7 @@ class _Reader:
         self.data = data
         self.coordinates, self.width = array("d"), array("b")
         self.vt = array("d")
-        self.positions = bytearray()
+        self.positions, self.places = bytearray(), bytearray()
         self.normals = bytearray()
         self.normal_count = 0
         self.corners = array("q")
@@ -76,6 +76,7 @@ class _Reader:
         if len(row) < 2:
             raise _FaultError(f"a texture coordinate with {_count(row, 'number')}", "two are needed")
         self.vt.extend(row[:2])
+        self.places += text + b"\n"
 
     def normal(self, line: int, text: bytes) -> None:
         self.normals += text + b"\n"
@@ -131,7 +132,8 @@ class _Reader:
             normal_lines=normals if (normals >= 0).any() else None,
             vt=np.array(self.vt, dtype=np.float64).reshape(-1, 2) if self.vt else None,
             extra=extra,
-            lines=VertexLines(bytes(self.positions), V if extra is None else np.hstack([V, extra])),
+            lines=KeptLines(bytes(self.positions), V if extra is None else np.hstack([V, extra])),
+            map_lines=KeptLines(bytes(self.places), np.array(self.vt, dtype=np.float64).reshape(-1, 2)),
             normals=bytes(self.normals),
             statements=bytes(self.statements),
             statement_faces=np.array(self.statement_faces, dtype=np.int64),

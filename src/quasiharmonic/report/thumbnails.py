@@ -50,7 +50,8 @@ def thumbnail(record: Record, results: Path | None) -> str:
     V = _framed(mesh.V)
     plot_surface(V, mesh.F, axes[0])
     if mapped:
-        plot_map(V, mesh.F, _framed(io.map_of(mesh)), ax=axes[1])
+        opened, F, uv = io.without_idle(*io.cut_at_seams(mesh))
+        plot_map(_framed(opened), F, _framed(uv), ax=axes[1])
     file = BytesIO()
     figure.savefig(file, format="png")
     return "data:image/png;base64," + b64encode(file.getvalue()).decode()
