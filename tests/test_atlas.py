@@ -349,6 +349,11 @@ class TestFunctions:
         atlas.flatten(SeamedMesh(V, F, FT, uv))
         assert all(np.array_equal(a, b) for a, b in zip((V, F, uv, FT), copies, strict=True))
 
+    def test_pins_decide_the_size(self):
+        V, F, uv, FT, _ = strips(4)
+        with pytest.raises(ValueError, match="vertices that are held decide the map's size"):
+            atlas.flatten(SeamedMesh(V, F, FT, uv), fixed=[0], unit_square=True)
+
     def test_weights_and_pins(self):
         V, F, uv, FT, _ = strips(4)
         mesh = SeamedMesh(V, F, FT, uv)

@@ -376,3 +376,19 @@ def test_a_start_of_any_size_is_brought_to_the_surfaces(size):
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
     assert result.history[-1].energy == pytest.approx(own.history[-1].energy, rel=1e-6)
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1e3, 1e6, 1e8, 1e11])
+@pytest.mark.parametrize("turn", [1, -1])
+def test_what_is_plane_is_its_own_map(stretch, turn):
+    V, F = grid(20, 20)
+    result = flatten(V * [stretch * turn, 1], F if turn > 0 else F[:, ::-1])
+    assert result.status is Status.POLISHED
+    assert result.history[-1].energy < 1e-12
+    assert result.certificate.bijective
+
+
+def test_a_single_triangle():
+    result = flatten([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]])
+    assert result.certificate.bijective
+    assert result.history[-1].energy < 1e-12

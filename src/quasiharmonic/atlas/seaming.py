@@ -12,7 +12,9 @@ from quasiharmonic.mesh.seams import SeamedMesh
 from quasiharmonic.mesh.topology import edge_keys, edges, trace_loops
 
 
-def cut_apart(mesh: SeamedMesh, *, polygons: Polygons | None = None, disks_too: bool = True) -> SeamedMesh:
+def cut_apart(
+    mesh: SeamedMesh, *, polygons: Polygons | None = None, disks_too: bool = True, reach: bool = True
+) -> SeamedMesh:
     """Cut every island of a surface into a disk that lies flat well; see `quasiharmonic.find_cuts`.
 
     Parameters
@@ -23,6 +25,9 @@ def cut_apart(mesh: SeamedMesh, *, polygons: Polygons | None = None, disks_too: 
         The faces that its triangles are parts of, inside which nothing is cut.
     disks_too : bool
         Whether islands that are disks already are cut where that is worth it. Otherwise they are left.
+    reach : bool
+        Whether cuts go on to what sticks out. A cut that only makes a disk is shorter, and seldom leaves an outline no
+        room beside it.
 
     Returns
     -------
@@ -38,7 +43,7 @@ def cut_apart(mesh: SeamedMesh, *, polygons: Polygons | None = None, disks_too: 
         return mesh
     seams = mesh.seams
     inside = np.empty((0, 2), dtype=np.int64) if polygons is None else polygons.diagonals(mesh.F)
-    found = find_cuts(mesh.V, mesh.F, edges=seams, uncut=inside)
+    found = find_cuts(mesh.V, mesh.F, edges=seams, uncut=inside, gain=0.1 if reach else np.inf)
     return mesh if len(found) == len(seams) else mesh.cut(found)
 
 

@@ -155,6 +155,8 @@ def flatten(
     """
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     held = _fixed(mesh, fixed)
+    if held is not None and unit_square:
+        raise ValueError("vertices that are held decide the map's size: leave unit_square out")
     if held is not None and mesh.uv is None:
         raise ValueError("nothing says where the fixed vertices go: the mesh has no places")
 

@@ -50,7 +50,8 @@ def surface_of(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
     """
     surface = io.seamed(mesh)
     if settings["cut"]:
-        return cut_apart(surface, polygons=mesh.polygons, disks_too=settings["flatten"])
+        flat = settings["flatten"]
+        return cut_apart(surface, polygons=mesh.polygons, disks_too=flat, reach=flat or settings["refine"])
     return surface
 
 

@@ -104,7 +104,9 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
             found = Seamed(seaming.cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
         if options.cut:
             before = found.mesh
-            found.mesh = seaming.cut_apart(before, polygons=mesh.polygons, disks_too=disks_too)
+            found.mesh = seaming.cut_apart(
+                before, polygons=mesh.polygons, disks_too=disks_too, reach=disks_too or options.refine
+            )
             found.facts["cut_edges"] = cut = len(found.mesh.seams) - len(before.seams)
             found.notes.append(
                 f"cut along {counted('edge', 'edges', cut)}: seams of the map, the model's vertices and faces stay"

@@ -20,7 +20,8 @@ class Rails:
     """The outline that boundary vertices slide along: what ``slide=`` takes.
 
     Vertices at corners stay, the others glide between them in their order. A vertex not quite on its curve is moved
-    onto it first, and the one nearest to a corner onto the corner.
+    onto it first, and the one nearest to a corner onto the corner, if it is within ``tolerance`` of it. A corner
+    that no vertex is so near to is not kept.
 
     Parameters
     ----------

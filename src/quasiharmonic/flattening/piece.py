@@ -207,8 +207,8 @@ class Flattening:
         """A bijective map, and whether it is near its best already."""
         began = time.perf_counter()
         piece, solver = self._piece, self._settings.linear_solver
-        uv = None
-        if len(piece.F) < COARSE_FROM:
+        uv = self._as_it_lies()
+        if uv is None and len(piece.F) < COARSE_FROM:
             uv = disk_start(piece.V, piece.F, piece.loops, solver)
         if uv is None:
             uv = coarse_start(piece.V, piece.F, piece.loops, solver)
@@ -221,6 +221,15 @@ class Flattening:
         energy = self._measure.value(in_units(uv, 0))
         self._stages.append(Stage("start", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
         return uv, energy < _NEAR
+
+    def _as_it_lies(self) -> FloatArray | None:
+        """The surface itself, if it is plane and covers no point twice: there is no better map."""
+        V, F, loops = self._piece.V, self._piece.F, self._piece.loops
+        if np.ptp(V[:, 2]) > 0:
+            return None
+        # Seen from the side on which its triangles are counterclockwise.
+        uv = V[:, :2] * [np.sign(signed_areas(F, in_units(V[:, :2], 0)).sum()) or 1.0, 1.0]
+        return uv if certify(F, uv, loops=loops).bijective else None
 
     def _blind_to_scale(self, uv: FloatArray) -> bool:
         """Whether a map of twice the size would be as good."""
