@@ -128,7 +128,8 @@ def test_a_word_slides_along_the_curves_of_its_letters():
     outer = max(curves, key=lambda curve: curve.length)
     places = result.uv[fixed]
     assert np.hypot(*(places - target).T).max() > 0.01
-    assert outer.nearest(places)[1].max() <= np.spacing(1.0)
+    # Half a rounding of each coordinate, and as much again of the point on the curve that is measured to.
+    assert outer.nearest(places)[1].max() <= np.hypot(*np.spacing(np.abs(places).max(axis=0)))
     # The first letter is where it is alone.
     first = places[:, 0] < 0.5
     assert first.any()
