@@ -87,7 +87,9 @@ class EdgeGraph:
         before : (n,) int64
             Negative at sources and where there is no way.
         """
-        graph = csr_array((weight, (self.ends[:, 0], self.ends[:, 1])), shape=(self.n, self.n))
+        # SciPy's walks in graphs took indices of 32 bits alone before 1.17.
+        tail, head = self.ends.astype(np.int32).T
+        graph = csr_array((weight, (tail, head)), shape=(self.n, self.n))
         distance, before, _ = dijkstra(
             graph, directed=False, indices=sources, return_predecessors=True, min_only=True, limit=limit
         )

@@ -137,7 +137,7 @@ class _Disk:
         start = sewn[self._left[way[0], int(np.argmax(held[first]))]]
         near = on_border & (loop == loop[start])
         inner = sewn[self._left[~border]]
-        ring = csr_array((graph.cost[~border], (inner[:, 0], inner[:, 1])), shape=(m, m))
+        ring = csr_array((graph.cost[~border], tuple(inner.astype(np.int32).T)), shape=(m, m))
         distance, before, _ = dijkstra(
             ring, directed=False, indices=np.flatnonzero(near), return_predecessors=True, min_only=True, limit=limit
         )

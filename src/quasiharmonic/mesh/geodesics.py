@@ -110,7 +110,8 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
 def edge_graph(F: IntArray, n: int) -> csr_array:
     """Which of ``n`` vertices are joined by an edge; (n, n) with ones."""
     tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
-    ends = np.concatenate([tail, head]), np.concatenate([head, tail])
+    # SciPy's walks in graphs took indices of 32 bits alone before 1.17.
+    ends = tuple(np.concatenate(both).astype(np.int32) for both in ((tail, head), (head, tail)))
     graph = csr_array((np.ones(2 * tail.size), ends), shape=(n, n))
     graph.data[:] = 1
     return graph
@@ -208,7 +209,7 @@ def _shortest(row: IntArray, column: IntArray, length: FloatArray, n: int) -> cs
     key = key[order]
     first = np.flatnonzero(np.diff(key, prepend=-1))
     least, at = np.minimum.reduceat(length[order], first), order[first]
-    return csr_array((least, (row[at], column[at])), shape=(n, n))
+    return csr_array((least, (row[at].astype(np.int32), column[at].astype(np.int32))), shape=(n, n))
 
 
 def _cross(a: ComplexArray, b: ComplexArray) -> FloatArray:
