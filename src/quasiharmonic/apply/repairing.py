@@ -21,11 +21,11 @@ from quasiharmonic.arrays import (
     named,
     whole_number,
 )
-from quasiharmonic.atlas.verdict import is_mirrored
+from quasiharmonic.atlas.verdict import mirrored_islands
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Diagnosis
 from quasiharmonic.hearing import heard
-from quasiharmonic.mesh.seams import Island, SeamedMesh
+from quasiharmonic.mesh.seams import Island, SeamedMesh, which_island
 from quasiharmonic.result import Step
 
 
@@ -68,7 +68,7 @@ class RepairedIsland:
 
     def summary(self) -> str:
         """Say in a sentence what was done."""
-        where = f"island at triangle {self.triangles[0]} ({counted('triangle', 'triangles', len(self.triangles))})"
+        where = which_island(self.triangles)
         overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
         if self.mirrored:
             done = "turned over" if self.moved.size else "mirrored, and left so"
@@ -218,8 +218,8 @@ def repair(
     check_callback(callback)
     mesh = SeamedMesh(V, F, FT, uv)
     done = []
-    for island in mesh.islands:
-        if len(mesh.islands) > 1 and is_mirrored(island.F, island.uv):
+    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
+        if mirrored:
             done.append(_mirrored(island, unmirror))
             continue
         one = IslandRepair(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray, counted
-from quasiharmonic.atlas.verdict import AtlasVerdict, certify, is_mirrored
+from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.atlas.verdict import MIRROR, AtlasVerdict, certify, mirrored_islands
+from quasiharmonic.energy.deformation import signed_areas
 from quasiharmonic.exact.certificate import is_injective
-from quasiharmonic.mesh.seams import Island, SeamedMesh
+from quasiharmonic.mesh.seams import Island, SeamedMesh, which_island
 from quasiharmonic.mesh.surface import manifold_edges
 from quasiharmonic.result import MapResult, Status
 
-_MIRROR = np.array([-1.0, 1.0])
 # An atlas is as far as the island that comes first here; of others, as the first one.
 _FURTHEST_LAST = (Status.INTERRUPTED, Status.IMPOSSIBLE, Status.OUT_OF_ITERATIONS, Status.STILL_FALLING)
 
@@ -76,7 +77,7 @@ class MappedAtlas:
 
     def places(self) -> list[FloatArray]:
         """For each island, where its vertices are, in the order in which its result has them."""
-        done = [one.result.uv * _MIRROR if one.mirrored else one.result.uv for one in self.islands]
+        done = [one.result.uv * MIRROR if one.mirrored else one.result.uv for one in self.islands]
         return [*done, *(island.uv for island in self.mesh.islands[len(done) :])]
 
     def verdict(self) -> AtlasVerdict:
@@ -135,7 +136,7 @@ def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, refle
         with naming(island, len(islands)):
             result = lower(island)
         # A refinement of the island has further vertices, at the end.
-        places[k] = (result.uv * _MIRROR if mirrored else result.uv)[: len(island.vertices)]
+        places[k] = (result.uv * MIRROR if mirrored else result.uv)[: len(island.vertices)]
         done.append(MappedIsland(island.triangles, mirrored, result))
     return MappedAtlas(mesh.with_places(places), tuple(done))
 
@@ -154,26 +155,22 @@ def faced(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]
     islands = mesh.islands
     if not islands:
         raise ValueError("the mesh has no triangles" if not len(mesh.F) else "no triangle has a place")
-    mirrored = [reflect and len(islands) > 1 and is_mirrored(island.F, island.uv) for island in islands]
+    mirrored = mirrored_islands(mesh) if reflect else [False] * len(islands)
     return [
-        (replace(island, uv=island.uv * _MIRROR) if turned else island, turned)
+        (replace(island, uv=island.uv * MIRROR) if turned else island, turned)
         for island, turned in zip(islands, mirrored, strict=True)
     ]
 
 
-class naming:  # noqa: N801 (a context manager, used as a word)
+@contextmanager
+def naming(island: Island, count: int) -> Iterator[None]:
     """Say of which island a ValueError speaks, where there are several."""
-
-    def __init__(self, island: Island, count: int) -> None:
-        self._island, self._count = island, count
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if self._count > 1 and isinstance(error, ValueError):
-            size = counted("triangle", "triangles", len(self._island.triangles))
-            where = f"the island at triangle {self._island.triangles[0]} ({size})"
-            raise ValueError(f"{where}, its elements numbered anew: {error}") from None
+    try:
+        yield
+    except ValueError as error:
+        if count == 1:
+            raise
+        raise ValueError(f"the {which_island(island.triangles)}, its elements numbered anew: {error}") from None
 
 
 def in_place_of(island: Island, uv: FloatArray) -> FloatArray:
@@ -184,12 +181,7 @@ def in_place_of(island: Island, uv: FloatArray) -> FloatArray:
     before, after = (np.ascontiguousarray(w).view(np.complex128).ravel() for w in (island.uv, uv))
     centre, middle = before.mean(), after.mean()
     turn = np.vdot(after - middle, before - centre)
-    area = [abs(_area(island.F, w)) for w in (before, after)]
+    area = [abs(float(signed_areas(island.F, w).sum())) for w in (before, after)]
     scale = np.sqrt(area[0] / area[1]) * (turn / abs(turn) if turn else 1.0)
     placed = ((after - middle) * scale + centre).view(np.float64).reshape(-1, 2)
     return placed if is_injective(island.F, placed) else uv
-
-
-def _area(F: IntArray, w: np.ndarray[Any, np.dtype[np.complex128]]) -> float:
-    a, b, c = w[F].T
-    return 0.5 * float(((b - a).conj() * (c - a)).imag.sum())

@@ -12,7 +12,10 @@ from quasiharmonic.arrays import FloatArray, IntArray, counted, named
 from quasiharmonic.exact import certificate
 from quasiharmonic.exact.certificate import Certificate
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
-from quasiharmonic.mesh.seams import Island, SeamedMesh
+from quasiharmonic.mesh.seams import Island, SeamedMesh, which_island
+
+#: What a map is multiplied by to be reflected at the v axis.
+MIRROR = np.array([-1.0, 1.0])
 
 # Pairs of islands that are named at most; an atlas of stacked ones has as many as pairs there are.
 _MOST_PAIRS = 1000
@@ -52,7 +55,7 @@ class IslandVerdict:
 
     def summary(self) -> str:
         """Say in a sentence what is certified or wrong."""
-        where = f"island at triangle {self.triangles[0]} ({counted('triangle', 'triangles', len(self.triangles))})"
+        where = which_island(self.triangles)
         turned = ", mirrored" if self.mirrored else ""
         if not self.injective:
             return f"{where}{turned}: not injective, {named('triangle', 'triangles', self.flipped)} not positive"
@@ -151,21 +154,22 @@ def certify(mesh: SeamedMesh) -> AtlasVerdict:
     1 island: 1 injective, 1 bijective.
     """
     judged = []
-    for island in mesh.islands:
-        mirrored = len(mesh.islands) > 1 and is_mirrored(island.F, island.uv)
+    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)
         wrong = np.sort(np.concatenate([found.flipped, found.degenerate, found.nonfinite]))
         judged.append(IslandVerdict(island.triangles, mirrored, found, island.triangles[wrong]))
     return AtlasVerdict(tuple(judged), _overlapping(mesh.islands, judged))
 
 
+def mirrored_islands(mesh: SeamedMesh) -> list[bool]:
+    """Which islands are mirrored; of a single one it is never said, as it is nobody's purpose."""
+    return [len(mesh.islands) > 1 and is_mirrored(island.F, island.uv) for island in mesh.islands]
+
+
 def unmirrored(mesh: SeamedMesh) -> SeamedMesh:
     """The map with its mirrored islands reflected, to be measured; where they lie does not matter then."""
-    turned = len(mesh.islands) > 1
-    mirror = np.array([-1.0, 1.0])
-    return mesh.with_places(
-        [island.uv * mirror if turned and is_mirrored(island.F, island.uv) else island.uv for island in mesh.islands]
-    )
+    turned = zip(mesh.islands, mirrored_islands(mesh), strict=True)
+    return mesh.with_places([island.uv * MIRROR if mirrored else island.uv for island, mirrored in turned])
 
 
 def is_mirrored(F: IntArray, uv: FloatArray) -> bool:

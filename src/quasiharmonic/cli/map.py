@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from quasiharmonic.cli.judging import Judged
     from quasiharmonic.cli.targets import Posed
     from quasiharmonic.curves import Rails
-    from quasiharmonic.io import MeshData
-    from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.mesh.seams import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
@@ -82,6 +80,7 @@ def run(options: argparse.Namespace) -> int:
     """Map, write, read back, judge, report."""
     from quasiharmonic import io
     from quasiharmonic.atlas.mapped import each_island
+    from quasiharmonic.atlas.refined import written_over
     from quasiharmonic.cli import judging, material, report, seams, sliding, targets
     from quasiharmonic.result import Status
 
@@ -120,7 +119,9 @@ def run(options: argparse.Namespace) -> int:
     with report.about(mesh_path):
         mapped = each_island(found.mesh, solved, reflect=options.to is None)
     refined = [one.fitted.refined for one in posed]
-    written = refined_islands(mesh, mapped, refined) if any(refined) else mesh.with_places(mapped.mesh)
+    written = mesh.with_places(mapped.mesh)
+    if any(refined):
+        written = written_over(mesh, mapped.mesh.islands, refined, mapped.places())
     if options.pack:
         written = written.with_places(seams.laid_out(options, io.mapped(written)))
     judged = judging.write(options.output, written)
@@ -191,13 +192,6 @@ def smoothed(problem: Problem, result: MapResult, linear_solver: str, slide: boo
     # Nobody asked for convergence, so it is not missed.
     interrupted = smoother.status is Status.INTERRUPTED
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)
-
-
-def refined_islands(mesh: MeshData, mapped: MappedAtlas, refined: list[Refined | None]) -> MeshData:
-    """The file with islands of which edges were split, and their maps."""
-    from quasiharmonic.atlas.refined import written_over
-
-    return written_over(mesh, mapped.mesh.islands, refined, mapped.places())
 
 
 def summed(facts: list[dict[str, int]]) -> dict[str, int]:

@@ -42,9 +42,11 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, measure, export, report."""
+    import numpy as np
+
     from quasiharmonic import io
     from quasiharmonic.arrays import named
-    from quasiharmonic.atlas.verdict import certify, unmirrored
+    from quasiharmonic.atlas.verdict import mirrored_islands, unmirrored
     from quasiharmonic.cli import report
     from quasiharmonic.energy.measures import distortion
     from quasiharmonic.mesh.seams import SeamedMesh
@@ -54,9 +56,10 @@ def run(options: argparse.Namespace) -> int:
         report.check_export(options.export, inputs=(options.input,))
     mesh = io.read_mesh(options.input)
     V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
-    mirrored = certify(SeamedMesh(V, F, F, uv)).mirrored
+    opened = SeamedMesh(V, F, F, uv)
+    mirrored = np.flatnonzero(mirrored_islands(opened))
     if mirrored.size:
-        reflected = unmirrored(SeamedMesh(V, F, F, uv)).uv
+        reflected = unmirrored(opened).uv
         uv = uv if reflected is None else reflected
     with report.about(options.input):
         found = distortion(V, F, uv, rings=options.rings if options.distances else None)

@@ -20,6 +20,7 @@ from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
     check_range,
+    counted,
     index_array,
     map_array,
     named,
@@ -55,6 +56,11 @@ class Island:
     vertices: IntArray
     V: FloatArray
     uv: FloatArray
+
+
+def which_island(triangles: IntArray) -> str:
+    """Name an island in a message by the mesh's triangles (k,), ascending, that it has."""
+    return f"island at triangle {triangles[0]} ({counted('triangle', 'triangles', len(triangles))})"
 
 
 class SeamedMesh:
