@@ -112,6 +112,28 @@ def test_wrong_calls(head, tmp_path, capsys, options, words):
     assert not (tmp_path / "flat.obj").exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "option", "belongs"),
+    [
+        (["flatten"], ["--rings", 4], "--energy distances"),
+        (["flatten"], ["--unit", "cm"], "--pattern"),
+        (["flatten"], ["--margin", "0.1"], "--pack"),
+        (["polish"], ["--margin", "0.1"], "--pack"),
+        (["harmonise"], ["--margin", "0.1"], "--pack"),
+        (["map", "--to", "disk"], ["--margin", "0.1"], "--pack"),
+    ],
+)
+def test_an_option_without_effect_is_refused(head, tmp_path, capsys, command, option, belongs):
+    assert run(*command, head, "-o", tmp_path / "flat.obj", *option) == 2
+    assert f"{option[0]} belongs to {belongs}" in capsys.readouterr().err
+    assert not (tmp_path / "flat.obj").exists()
+
+
+def test_rings_of_what_is_not_measured_are_refused(head, capsys):
+    assert run("measure", head, "--rings", 4) == 2
+    assert "--rings belongs to --distances" in capsys.readouterr().err
+
+
 def test_bad_weights_are_named(head, tmp_path, capsys):
     (tmp_path / "weights.txt").write_text("1\nheavy\n")
     assert run("flatten", head, "-o", tmp_path / "flat.obj", "--weights", tmp_path / "weights.txt") == 2
@@ -122,7 +144,8 @@ def test_distances(head, tmp_path, capsys):
     out, report = tmp_path / "flat.obj", tmp_path / "report.json"
     errors = []
     for energy in ("symmetric-dirichlet", "distances"):
-        assert run("flatten", head, "-o", out, "--energy", energy, "--rings", 4, "--json", report) == 0
+        rings = ["--rings", 4] if energy == "distances" else []
+        assert run("flatten", head, "-o", out, "--energy", energy, *rings, "--json", report) == 0
         facts = json.loads(report.read_text())
         assert ("distances" in facts["distortion"]) == (energy == "distances")
         assert run("measure", out, "--distances", "--rings", 4, "--json", tmp_path / "measured.json") == 0

@@ -550,6 +550,23 @@ def test_what_the_command_line_refuses(tmp_path, capsys):
     assert "add --slide" in capsys.readouterr().err
 
 
+def test_the_command_line_names_vertices_off_the_outline(tmp_path, capsys):
+    V, F = surfaces.disk(6)
+    source = tmp_path / "in.obj"
+    io.write_obj(source, io.MeshData(lift(V), F).with_map(V))
+    out = ["-o", str(tmp_path / "out.obj")]
+    assert main(["polish", str(source), "--slide", "--to", "disk", *out]) == 0
+    assert "off the outline" not in capsys.readouterr().out
+    rim = boundary_loops(F, len(V))[0]
+    V[rim[:3]] *= 1.01
+    io.write_obj(source, io.MeshData(lift(V), F).with_map(V))
+    assert main(["polish", str(source), "--slide", "--to", "disk", *out]) == 0
+    named = ", ".join(map(str, rim[:3]))
+    assert (
+        f"of {len(rim)} boundary vertices 3 are off the outline and stay: vertices {named}" in capsys.readouterr().out
+    )
+
+
 def test_vertices_are_told_their_sides(tmp_path, capsys):
     V, F = surfaces.grid(10, 10)
     # The diagonal before the corner (1, 0) turned, there is room beside it for the next vertex of the right side, which

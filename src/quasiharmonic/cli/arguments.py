@@ -40,10 +40,36 @@ def add_rings(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--rings",
         type=count,
-        default=20,
         metavar="N",
         help="distances: how many edges apart vertices are at most (default: 20)",
     )
+
+
+def settle(options: argparse.Namespace, name: str, default: object, *, asked: bool, belongs: str) -> None:
+    """Put in what an option is that was not given; refuse one that was, where nothing asks for it.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Has None for what was not given. Changed.
+    name : str
+        Of the option, without its dashes.
+    default : object
+        What it is where it was not given.
+    asked : bool
+        Whether it has any effect in this call.
+    belongs : str
+        What it belongs to, as one would write it.
+
+    Raises
+    ------
+    ValueError
+        When it was given without effect.
+    """
+    if getattr(options, name) is None:
+        setattr(options, name, default)
+    elif not asked:
+        raise ValueError(f"--{name} belongs to {belongs}, which was not asked for: add that, or leave --{name} out")
 
 
 def steps(text: str) -> int:

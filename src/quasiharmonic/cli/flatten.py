@@ -57,9 +57,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--pattern", type=Path, metavar="FILE", help="draw the outline true to scale too, as .svg or .dxf"
     )
-    parser.add_argument(
-        "--unit", choices=("mm", "cm", "m", "in"), default="mm", help="of the surface, for --pattern (default: mm)"
-    )
+    parser.add_argument("--unit", choices=("mm", "cm", "m", "in"), help="of the surface, for --pattern (default: mm)")
     parser.add_argument(
         "--allowance", type=float, default=0.0, metavar="WIDTH", help="cut so far outside of the outline, in that unit"
     )
@@ -79,12 +77,15 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, judge, report."""
     from quasiharmonic import atlas, io
-    from quasiharmonic.cli import judging, material, progress, report, seams
+    from quasiharmonic.cli import arguments, judging, material, progress, report, seams
     from quasiharmonic.energy.measures import distortion
     from quasiharmonic.flattening.patterns import write_pattern
 
     began = time.perf_counter()
     seams.check_options(options)
+    seams.check_packing(options)
+    arguments.settle(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
+    arguments.settle(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
     inputs = (
         options.input,
         options.weights,

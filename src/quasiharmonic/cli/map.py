@@ -88,6 +88,7 @@ def run(options: argparse.Namespace) -> int:
     if options.slide and options.no_polish:
         raise ValueError("--slide moves the boundary while distortion is lowered, which --no-polish forbids")
     sliding.check_options(options)
+    seams.check_packing(options)
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     if options.to is not None:
         # The handles of a folder say which vertices its own vt hold.

@@ -47,10 +47,11 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.arrays import named
     from quasiharmonic.atlas.verdict import mirrored_islands, unmirrored
-    from quasiharmonic.cli import report
+    from quasiharmonic.cli import arguments, report
     from quasiharmonic.energy.measures import distortion
     from quasiharmonic.mesh.seams import SeamedMesh
 
+    arguments.settle(options, "rings", 20, asked=options.distances, belongs="--distances")
     report.check_json(options.json, inputs=(options.input, options.export))
     if options.export is not None:
         report.check_export(options.export, inputs=(options.input,))

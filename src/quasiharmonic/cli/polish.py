@@ -69,6 +69,8 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("with --free nothing holds the boundary: leave --slide and --fixed out")
     sliding.check_options(options)
 
+    notes: list[str] = []
+
     def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
         from quasiharmonic import atlas
 
@@ -82,22 +84,29 @@ def run(options: argparse.Namespace) -> int:
             return atlas.polish(mesh, free=True, **given)
         if options.to is not None and len(mesh.islands) > 1:
             raise ValueError(f"--slide --to is for one island on the outline, and there are {len(mesh.islands)}")
-        slide = options.slide if options.to is None else sliding.along(options.to, pieces=options.pieces)
-        return atlas.polish(mesh, fixed=fixed, slide=slide, **given)
+        if options.to is None:
+            return atlas.polish(mesh, fixed=fixed, slide=options.slide, **given)
+        rails = sliding.along(options.to, pieces=options.pieces)
+        notes.extend(sliding.told_off(rails, mesh.islands[0]))
+        return atlas.polish(mesh, fixed=fixed, slide=rails, **given)
 
-    return improve(options, lower, inputs=(options.pieces,))
+    return improve(options, lower, inputs=(options.pieces,), notes=notes)
 
 
-def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = ()) -> int:
+def improve(
+    options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = (), notes: Sequence[str] = ()
+) -> int:
     """Read a map, lower its distortion, write, judge, report; for every command that does so.
 
-    What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``.
+    What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``. What
+    ``notes`` say by the time the map is there is told with it.
     """
     from quasiharmonic import io
     from quasiharmonic.atlas.verdict import unmirrored
     from quasiharmonic.cli import judging, material, progress, report, seams
     from quasiharmonic.energy.measures import distortion
 
+    seams.check_packing(options)
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
     mesh = material.read_mesh(options, options.input)
     before = io.mapped(mesh)
@@ -121,7 +130,7 @@ def improve(options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | N
         }
         lines = [report.of_maps(after, judged, options.output)]
         if judged.injective:
-            lines += [_change(*measured), *([] if judged.mirrored else [after.status.value])]
+            lines += [*notes, _change(*measured), *([] if judged.mirrored else [after.status.value])]
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if judged.injective else 1
 

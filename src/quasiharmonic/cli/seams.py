@@ -57,7 +57,6 @@ def add_packing(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--margin",
         type=float,
-        default=1 / 256,
         metavar="SHARE",
         help="for --pack: least room between islands, as a share of the square's side (default: 1/256)",
     )
@@ -68,6 +67,13 @@ def laid_out(options: argparse.Namespace, mesh: SeamedMesh) -> SeamedMesh:
     from quasiharmonic import atlas
 
     return atlas.pack(mesh, margin=options.margin) if options.pack else mesh
+
+
+def check_packing(options: argparse.Namespace) -> None:
+    """Raise a ValueError for a margin of what is not packed."""
+    from quasiharmonic.cli import arguments
+
+    arguments.settle(options, "margin", 1 / 256, asked=options.pack, belongs="--pack")
 
 
 def check_options(options: argparse.Namespace) -> None:

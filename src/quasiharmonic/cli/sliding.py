@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from quasiharmonic.curves import Rails
+    from quasiharmonic.mesh.seams import Island
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -65,6 +66,19 @@ def along(
         return Rails(curves, held=held, corner_angle=corner_angle)
     sides = [side for curve in curves for side in curve.sides(corner_angle)]
     return Rails(sides, on=read_pieces(pieces, len(sides)), held=held, corner_angle=corner_angle)
+
+
+def told_off(rails: Rails, island: Island) -> list[str]:
+    """A sentence about the boundary vertices of a map that are on none of the curves, if there are such."""
+    from quasiharmonic.arrays import named
+    from quasiharmonic.mesh.topology import boundary_loops
+
+    loops = boundary_loops(island.F, len(island.V))
+    off = island.vertices[rails.off(loops, island.uv)]
+    if not off.size:
+        return []
+    count = sum(loop.size for loop in loops)
+    return [f"of {count} boundary vertices {off.size} are off the outline and stay: {named('vertex', 'vertices', off)}"]
 
 
 def read_pieces(path: Path, sides: int) -> dict[int, int]:

@@ -139,6 +139,12 @@ class Rails:
             chains.append(chain)
         return Track(chains, places)
 
+    def off(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
+        """The boundary vertices that are on no curve, and stay; raises as `lay` does for those told a curve."""
+        boundary = np.concatenate(loops)
+        curve, _ = self._found(boundary, uv)
+        return boundary[curve < 0]
+
     def _corners(self, one: Curve, places: FloatArray) -> dict[int, float]:
         """The rows of the boundary's places (b, 2) that are at corners of a curve, and where these are along it.
 
