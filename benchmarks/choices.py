@@ -1,30 +1,33 @@
 """What each choice costs and brings: functional, parameterisation, method of descent, strategy, energy.
 
-    OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose
+    OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose [--scans FOLDER]
 
-Seven surfaces go onto letters (``examples/sculptures.py``), everything the same but for the one choice. Writes a table
-for each choice, in Markdown, which the page *How to choose* includes. Figures are medians over the seven; times are
-relative to the first row, since machines differ.
+Seven surfaces go onto letters (``examples/sculptures.py``), everything the same but for the one choice; beside them, if
+there is a folder of them, problems of one's own. Writes a table for each choice, in Markdown, which the page *How to
+choose* includes. Figures are medians; times are of the CPU and relative to the first row, since machines differ.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from quasiharmonic import MapResult, Problem, distortion, harmonise, polish, solve
-from quasiharmonic.descent import LBFGS, Alternating, Descent, Newton, VectorAdam
+from quasiharmonic import MapResult, Problem, distortion, harmonise, io, polish, solve
+from quasiharmonic.descent import LBFGS, Alternating, Descent, Newton, Untangling, VectorAdam
+from quasiharmonic.search.strategy import STRATEGIES
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
-from figure_17 import swapped
 from sculptures import seven
 
 Row = list[str]
+#: Rows of cells, the first of which says what they are of.
+Table = list[Row]
 LIMIT = 600
 
 
@@ -33,45 +36,48 @@ def afresh(problem: Problem) -> Problem:
     return Problem(problem.V, problem.F, problem.fixed, problem.target)
 
 
+def clocked(run: Callable[[], MapResult]) -> tuple[MapResult, float]:
+    """What a call returns, and its CPU seconds."""
+    start = time.process_time()
+    return run(), time.process_time() - start
+
+
 def mips(problem: Problem, uv: np.ndarray) -> float:
     """Mean over the surface."""
     return float(distortion(problem.V, problem.F, uv).summary("mips").mean)
 
 
-def searched(problems: list[Problem], *stages: Descent, **options: Any) -> list[MapResult]:
+def searched(problems: list[Problem], strategy: str | list[Descent]) -> list[tuple[MapResult, float]]:
     """Each problem from scratch."""
-    return [solve(afresh(problem), strategy=list(stages), max_iterations=LIMIT, **options) for problem in problems]
+    most = 2000 if isinstance(strategy, str) else LIMIT
+    return [clocked(lambda p=p: solve(afresh(p), strategy=strategy, max_iterations=most)) for p in problems]
 
 
-def outcome(problems: list[Problem], results: list[MapResult], unit: float) -> Row:
-    """How many were solved; of all, medians of iterations and time; of those solved, of MIPS."""
-    good = [k for k, result in enumerate(results) if result.injective]
-    angles = [mips(problems[k], results[k].uv) for k in good]
-    return [
-        f"{len(good)} of {len(results)}",
-        f"{np.median([result.iterations for result in results]):.0f}",
-        f"{np.median([result.seconds for result in results]) / unit:.1f}",
-        f"{np.median(angles):.2g}" if angles else "",
-    ]
+def compared(problems: list[Problem], choices: dict[str, str | list[Descent]]) -> Table:
+    """A row for each choice: how many were solved; of all, medians of iterations and time; of those solved, of MIPS."""
+    rows, unit = [HEAD], 0.0
+    for name, strategy in choices.items():
+        runs = searched(problems, strategy)
+        seconds = float(np.median([seconds for _, seconds in runs]))
+        unit = unit or seconds
+        pairs = zip(problems, runs, strict=True)
+        angles = [mips(problem, result.uv) for problem, (result, _) in pairs if result.injective]
+        rows.append(
+            [
+                name,
+                f"{len(angles)} of {len(problems)}",
+                f"{np.median([result.iterations for result, _ in runs]):.0f}",
+                f"{seconds / unit:.1f}",
+                f"{np.median(angles):.2g}" if angles else "",
+            ]
+        )
+    return rows
 
 
-def table(head: Row, rows: list[Row]) -> str:
-    """In Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+HEAD = ["", "solved", "iterations", "time", "MIPS of those solved"]
 
 
-def compared(problems: list[Problem], choices: dict[str, Descent]) -> list[Row]:
-    """A row for each choice."""
-    runs = {name: searched(problems, stage) for name, stage in choices.items()}
-    unit = float(np.median([result.seconds for result in next(iter(runs.values()))]))
-    return [[name, *outcome(problems, results, unit)] for name, results in runs.items()]
-
-
-HEAD = ["solved", "iterations", "time", "MIPS of those solved"]
-
-
-def functionals(problems: list[Problem]) -> str:
+def functionals(problems: list[Problem]) -> Table:
     """The four functionals, si-log on the rest mesh's triangles."""
     names = {
         "V₃ `dirichlet`": "dirichlet",
@@ -79,51 +85,57 @@ def functionals(problems: list[Problem]) -> str:
         "V₁ `neumann`": "neumann",
         "V₄ `poisson`": "poisson",
     }
-    choices = {
-        name: VectorAdam(functional=word, parameterisation="si-log", reference="corrected", iterations=LIMIT)
+    choices: dict[str, str | list[Descent]] = {
+        name: [VectorAdam(functional=word, parameterisation="si-log", reference="corrected", iterations=LIMIT)]
         for name, word in names.items()
     }
-    return table(["functional", *HEAD], compared(problems, choices))
+    return compared(problems, choices)
 
 
-def parameterisations(problems: list[Problem]) -> str:
+def parameterisations(problems: list[Problem]) -> Table:
     """Both parameterisations, each on two kinds of triangles."""
-    choices = {
-        f"`{word}`, {reference}": VectorAdam(parameterisation=word, reference=reference, iterations=LIMIT)
+    choices: dict[str, str | list[Descent]] = {
+        f"`{word}`, {reference}": [VectorAdam(parameterisation=word, reference=reference, iterations=LIMIT)]
         for word in ("tanh", "si-log")
         for reference in ("equilateral", "corrected")
     }
-    return table(["parameterisation, reference", *HEAD], compared(problems, choices))
+    return compared(problems, choices)
 
 
-def pins(_: list[Problem]) -> str:
-    """Two points of a square that change places, 40 × 40 cells."""
-    problem = swapped(40)
-    rows = []
-    for word in ("tanh", "si-log"):
-        result = solve(problem, strategy=[VectorAdam(parameterisation=word, iterations=LIMIT)], max_iterations=LIMIT)
-        rows.append([f"`{word}`", str(len(result.certificate.flipped)), str(result.iterations)])
-    return table(["two points swapped", "inverted at last", "iterations"], rows)
+def exchanged(problem: Problem) -> Problem:
+    """Two points inside change places: the one farthest from the boundary, and one halfway to there."""
+    uv = solve(afresh(problem)).uv
+    inside = np.setdiff1d(np.arange(problem.n), problem.fixed)
+    room, _ = KDTree(uv[problem.fixed]).query(uv[inside])
+    first = inside[np.argmax(room)]
+    away = np.linalg.norm(uv[inside] - uv[first], axis=1)
+    second = inside[np.argmin(np.abs(away - 0.5 * room.max()))]
+    target = np.vstack([problem.target, uv[second], uv[first]])
+    return Problem(problem.V, problem.F, np.append(problem.fixed, [first, second]), target)
 
 
-def methods(problems: list[Problem]) -> str:
-    """The methods of descent, tanh on equilateral triangles, each from ξ = 0."""
-    methods = VectorAdam, LBFGS, Newton, Alternating
-    choices = {f"`{method.word}`": method(iterations=LIMIT) for method in methods}
-    return table(["method", *HEAD], compared(problems, choices))
+def pins(problems: list[Problem]) -> Table:
+    """Two points inside of each change places."""
+    choices: dict[str, str | list[Descent]] = {
+        f"`{word}`": [VectorAdam(parameterisation=word, iterations=LIMIT)] for word in ("tanh", "si-log")
+    }
+    choices["strategy `speed`"] = "speed"
+    return compared([exchanged(problem) for problem in problems], choices)
 
 
-def strategies(problems: list[Problem]) -> str:
-    """Both strategies, as they are."""
-    rows, unit = [], 0.0
-    for name in ("speed", "quality"):
-        results = [solve(afresh(problem), strategy=name) for problem in problems]
-        seconds = float(np.median([result.seconds for result in results]))
-        unit = unit or seconds
-        angles = np.median([mips(p, r.uv) for p, r in zip(problems, results, strict=True)])
-        solved = sum(result.injective for result in results)
-        rows.append([f"`{name}`", f"{solved} of {len(results)}", f"{seconds / unit:.1f}", f"{angles:.2g}"])
-    return table(["strategy", "solved", "time", "MIPS of the map"], rows)
+def methods(problems: list[Problem]) -> Table:
+    """The methods of descent, tanh on equilateral triangles where nothing is said, each from ξ = 0."""
+    choices: dict[str, str | list[Descent]] = {
+        f"`{method.word}`": [method(iterations=LIMIT)] for method in (VectorAdam, LBFGS, Newton, Alternating)
+    }
+    choices["`l-bfgs`, si-log"] = [LBFGS(parameterisation="si-log", reference="corrected", iterations=LIMIT)]
+    choices["`untangling`"] = [Untangling(iterations=LIMIT)]
+    return compared(problems, choices)
+
+
+def strategies(problems: list[Problem]) -> Table:
+    """All strategies, as they are."""
+    return compared(problems, {f"`{name}`": name for name in STRATEGIES})
 
 
 def lowered(problem: Problem, uv: np.ndarray) -> Iterator[tuple[str, Callable[[], MapResult]]]:
@@ -135,26 +147,26 @@ def lowered(problem: Problem, uv: np.ndarray) -> Iterator[tuple[str, Callable[[]
         yield f'`harmonise`, "{energy}"', lambda e=energy: harmonise(*given, fixed=problem.fixed, energy=e)
 
 
-def energies(problems: list[Problem]) -> str:
+def energies(problems: list[Problem]) -> Table:
     """What becomes of the first map."""
     columns: dict[str, list[tuple[float, ...]]] = {}
     for problem in problems:
-        first = solve(afresh(problem))
-        for name, run in [("first map", lambda found=first: found), *lowered(problem, first.uv)]:
-            result = run()
+        first, took = clocked(lambda p=problem: solve(afresh(p)))
+        for name, run in [("first map", None), *lowered(problem, first.uv)]:
+            result, seconds = clocked(run) if run else (first, took)
             if not result.injective:
                 raise RuntimeError(f"{name} lost the map")
             found = distortion(problem.V, problem.F, result.uv)
             sizes = np.exp(quantile(np.abs(np.log(found.area_ratio)), found.share))
             isometric = found.summary("isometric")
-            row = result.seconds, found.summary("mips").mean, isometric.median, isometric.maximum, sizes
+            row = seconds, found.summary("mips").mean, isometric.median, isometric.maximum, sizes
             columns.setdefault(name, []).append(row)
     unit = float(np.median([row[0] for row in columns["first map"]]))
-    rows = []
+    rows = [["", "time", "MIPS", "isometric, median", "isometric, worst", "areas off by"]]
     for name, values in columns.items():
         seconds, *others = np.median(np.array(values), axis=0)
         rows.append([name, f"{seconds / unit:.0f}", *(f"{value:.2g}" for value in others)])
-    return table(["", "time", "MIPS", "isometric, median", "isometric, worst", "areas off by"], rows)
+    return rows
 
 
 def quantile(values: np.ndarray, share: np.ndarray) -> float:
@@ -166,19 +178,31 @@ def quantile(values: np.ndarray, share: np.ndarray) -> float:
 TABLES = functionals, parameterisations, pins, methods, strategies, energies
 
 
+def beside(own: Table, scans: Table | None) -> str:
+    """In Markdown, the figures of scans beside those of our own surfaces."""
+    if scans is not None:
+        first = [own[0][0], *own[0][1:], *(f"scans: {scans[0][1]}", *scans[0][2:])]
+        own = [first, *([*left, *right[1:]] for left, right in zip(own[1:], scans[1:], strict=True))]
+    lines = [own[0], ["---"] * len(own[0]), *own[1:]]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="where tables go (else to the screen)")
     parser.add_argument("--size", type=int, default=40, help="height of the surfaces' grid (40)")
+    parser.add_argument("--scans", type=Path, metavar="FOLDER", help="problem folders, at any depth")
     parser.add_argument("only", nargs="*", metavar="TABLE", help=f"of {', '.join(t.__name__ for t in TABLES)} (all)")
     options = parser.parse_args()
     problems = list(seven(options.size).values())
+    folders = sorted(path.parent for path in options.scans.rglob("input.obj")) if options.scans else []
+    scans = [Problem(*io.read_problem(folder)) for folder in folders]
     solve(problems[0])  # whatever has to be imported is
     for measure in TABLES:
         if options.only and measure.__name__ not in options.only:
             continue
-        text = measure(problems)
+        text = beside(measure(problems), measure(scans) if scans else None)
         print(f"{measure.__name__}\n{text}", flush=True)
         if options.output:
             options.output.mkdir(parents=True, exist_ok=True)

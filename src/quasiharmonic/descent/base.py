@@ -52,6 +52,9 @@ class Runner(Protocol):
     def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
         """Search on a coarse mesh, beginning with what the stage ``begins_with``, and carry the map to the mesh."""
 
+    def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
+        """Descend on the mesh itself; where that finds no map, later stages go on from where this one began."""
+
 
 class SearchStage(ABC):
     """What a strategy is a list of."""

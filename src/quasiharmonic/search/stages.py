@@ -62,6 +62,32 @@ class CoarseToFine(SearchStage):
         return search.attempt_on_coarse(self, before)
 
 
+@dataclass(frozen=True)
+class InPassing(SearchStage):
+    """A stage whose iterations are discarded where it finds no map (§9.2): what follows goes on from before it.
+
+    Attributes
+    ----------
+    tried : Descent
+    """
+
+    tried: Descent
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return self.tried.name
+
+    @property
+    def begins_with(self) -> Descent:
+        """``tried``."""
+        return self.tried
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.attempt_in_passing(self.tried, before)
+
+
 #: Whatever a strategy is made of.
 Stages: TypeAlias = Sequence[SearchStage]
 
@@ -165,6 +191,14 @@ class Search:
         status = self._descend_by_any(stage, before)
         if status is not Status.INJECTIVE:
             self._examine()
+        return status
+
+    def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
+        """Run a stage on the mesh itself, and forget the lowest V₃ that it came to if it finds no map."""
+        deepest = self.deepest
+        status = self.attempt(stage, before)
+        if status is not Status.INJECTIVE:
+            self.deepest = deepest
         return status
 
     def _descend_by_any(self, stage: Descent, before: Status) -> Status:

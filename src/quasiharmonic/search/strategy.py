@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from quasiharmonic.descent import Descent, Newton, Patches, RandomRestarts, Untangling, VectorAdam
+from quasiharmonic.descent import Alternating, Descent, Newton, Patches, RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.descent.base import SearchStage
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.stages import CoarseToFine, Stages
+from quasiharmonic.search.stages import CoarseToFine, InPassing, Stages
 
 # Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
 # than ten iterations on the mesh.
 _LARGE = 6000
+# Turns of alternation and Newton's method in the paper's pipeline.
+_TURNS = 10
 
 
 def speed(problem: Problem) -> Stages:
@@ -69,7 +71,32 @@ def quality(problem: Problem) -> Stages:
     ]
 
 
-STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "quality": quality}
+def paper(_: Problem) -> Stages:
+    """The pipeline of the paper's evaluation (§9.2, §10.1), and nothing else.
+
+    si-log for at most 1000 iterations; then tanh from the start again; then for the last few triangles the
+    alternation and Newton's method in turn, the alternation's iterations discarded where it fails. All on the mesh
+    itself, and on the surface's own triangles, angles below π/6 corrected (§F.1). How many iterations tanh and each
+    turn have the paper does not say; these make up 2000. Its steps are VectorAdam's own here.
+
+    Returns
+    -------
+    list of Descent or InPassing
+    """
+    last: list[SearchStage] = []
+    for _ in range(_TURNS):
+        last += [
+            InPassing(Alternating(reference="corrected", iterations=20, resume=True)),
+            Newton(reference="corrected", iterations=20, resume=True),
+        ]
+    return [
+        VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
+        VectorAdam(reference="corrected", iterations=600),
+        *last,
+    ]
+
+
+STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "quality": quality, "paper": paper}
 
 
 def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
