@@ -101,7 +101,7 @@ def compare(folders: list[Path]) -> None:
             mips.append(f"| {name} | {len(problem.F)} |" + " – |" * len(columns))
             stretch.append(f"| {name} | {forced(problem):.3g} |" + " – |" * len(columns))
             continue
-        found = {columns[0]: first, columns[1]: first_map(problem, "quality")}
+        found = {columns[0]: first, columns[1]: first_map(problem, "paper")}
         for method, lower in METHODS.items():
             began = time.perf_counter()
             uv = lower(problem, first[0])

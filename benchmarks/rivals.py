@@ -22,6 +22,7 @@ import numpy as np
 import problems
 from quasiharmonic import Problem, distortion, polish, solve
 from quasiharmonic.arrays import FloatArray
+from quasiharmonic.search.strategy import STRATEGIES
 
 RECORDS = Path(__file__).parent / "records"
 #: The programs in the order of the tables; those that ran every problem of the first 68.
@@ -160,7 +161,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anew", action="store_true", help="run our side again on the same problems")
     parser.add_argument("-n", type=int, default=68, metavar="N", help="the first N problems (68)")
-    parser.add_argument("--strategy", default="speed", choices=["speed", "quality"], help="of ours, anew (speed)")
+    parser.add_argument("--strategy", default="speed", choices=STRATEGIES, help="of ours, anew (speed)")
     parser.add_argument("-o", "--output", type=Path, metavar="CSV", help="rows of what was run anew")
     options = parser.parse_args()
     rows = dict(list(on_common_problems(recorded()).items())[: options.n])

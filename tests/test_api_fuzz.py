@@ -238,7 +238,7 @@ def test_problem_and_diagnosis(arguments):
 
 
 @seldom
-@given(problems(wrong=12), st.integers(1, 3), st.sampled_from(["speed", "quality"]))
+@given(problems(wrong=12), st.integers(1, 3), st.sampled_from(["speed", "paper"]))
 def test_injective_map(arguments, iterations, strategy):
     *arrays_, more = arguments
     result = outcome(injective_map, *arrays_, **more, strategy=strategy, max_iterations=iterations)

@@ -206,7 +206,7 @@ class TestRun:
         assert again == {out / "results" / name / "map.obj" for name in ("a", "b/c", "b/d/e")}
         assert not list(out.rglob("*.tmp"))
         assert batch.run(stars, out, jobs=1).resumed == 4
-        assert batch.run(stars, out, batch.Settings(strategy="quality"), jobs=1).resumed == 0
+        assert batch.run(stars, out, batch.Settings(strategy="paper"), jobs=1).resumed == 0
 
     def test_what_another_state_of_the_code_has_done_is_done_anew(self, stars, tmp_path, monkeypatch):
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0

@@ -92,9 +92,9 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
     assert [record["name"] for record in campaign.read(output)] == todo
     assert list(campaign.campaign(todo, output)) == []
     # In another way they are not done, and a failure says which way that was.
-    (other,) = campaign.campaign(todo[:1], output, limit=60, max_iterations=1, strategy="quality")
+    (other,) = campaign.campaign(todo[:1], output, limit=60, max_iterations=1, strategy="paper")
     again = campaign.summary([other | {"outcome": "exception", "message": "lost"}])
-    assert f"--case {todo[0]} --strategy quality --max-iterations 1 " in again
+    assert f"--case {todo[0]} --strategy paper --max-iterations 1 " in again
     output.write_text("".join(output.read_text().splitlines(keepends=True)[:-1]))
 
     campaign.main(["--summary", str(output)])

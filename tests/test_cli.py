@@ -94,7 +94,7 @@ class TestMap:
         assert run("map", problem, "-o", tmp_path / "o.obj", *arguments) == 0
         assert (tmp_path / "p.png").exists()
 
-    @pytest.mark.parametrize("strategy", ["speed", "quality"])
+    @pytest.mark.parametrize("strategy", ["speed", "paper"])
     @pytest.mark.parametrize("reference", ["equilateral", "rest", "corrected"])
     def test_options_reach_the_solver(self, star, tmp_path, strategy, reference):
         arguments = "--strategy", strategy, "--reference", reference, "--linear-solver", "superlu"
@@ -102,7 +102,7 @@ class TestMap:
         assert run("map", star, "-o", tmp_path / "o.obj", *arguments, "--json", report) == 0
         facts = json.loads(report.read_text())
         assert facts["linear_solver"] == "superlu"
-        assert ("si-log" in facts["stages"][0]["name"]) == (strategy == "quality")
+        assert ("si-log" in facts["stages"][0]["name"]) == (strategy == "paper")
 
 
 def bad_meshes():
@@ -355,8 +355,9 @@ class TestPolish:
         from quasiharmonic import linsolve
         from quasiharmonic.cli import arguments
         from quasiharmonic.energy.polishing import ENERGIES
-        from quasiharmonic.search import harmonising
+        from quasiharmonic.search import harmonising, strategy
 
+        assert tuple(strategy.STRATEGIES) == arguments.STRATEGIES
         assert set(arguments.ENERGIES) == set(ENERGIES)
         assert set(arguments.HARMONISED) == set(harmonising.ENERGIES)
         assert set(arguments.LINEAR_SOLVERS) - {"auto"} == set(linsolve.BACKENDS)

@@ -47,9 +47,7 @@ def test_tables(folder, capsys):
 
 def test_a_strategy_that_fails_has_no_other_ones_numbers(folder, capsys, monkeypatch):
     found = benchmark.first_map
-    monkeypatch.setattr(
-        benchmark, "first_map", lambda p, strategy: None if strategy == "quality" else found(p, strategy)
-    )
+    monkeypatch.setattr(benchmark, "first_map", lambda p, strategy: None if strategy == "paper" else found(p, strategy))
     benchmark.compare([folder / "star"])
     both = rows(capsys.readouterr().out)
     assert len(both) == 2

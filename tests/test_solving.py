@@ -462,7 +462,7 @@ def test_second_solve_of_a_moved_problem_agrees_with_a_fresh_one():
     np.testing.assert_array_equal(again.uv, fresh.uv)
 
 
-@pytest.mark.parametrize("strategy", ["speed", "quality"])
+@pytest.mark.parametrize("strategy", ["speed", "paper"])
 def test_the_tensors_give_the_map_back(strategy):
     problem = Problem(*star_problem())
     result = solve(problem, strategy=strategy)

@@ -145,12 +145,12 @@ def morph(
 
     fixed, target = _placed(points, F, moved, positions)
     used = np.unique(F)
-    problem = Problem(points[used], np.searchsorted(used, F), np.searchsorted(used, fixed), target)
+    # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
+    own = np.searchsorted(used, F), np.searchsorted(used, fixed)
+    problem = Problem(points[used], *own, target, reference="corrected")
     rails = _rails(slide, problem, used, np.asarray(moved))
     result = solve(
         problem,
-        # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
-        strategy="quality",
         polish=energy,
         max_iterations=max_iterations,
         linear_solver=linear_solver,

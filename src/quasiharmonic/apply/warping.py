@@ -108,8 +108,9 @@ def warp_by_landmarks(
     own = len(points) - len(before) + np.arange(len(before))
     border = np.setdiff1d(boundary_edges(F, len(points)), own)
     target = np.concatenate([points[border] + _carried(points[border], before[edge], after[edge], size), after])
-    # Landmarks can pass each other: si-log on the picture's own triangles spreads what that costs.
-    result = injective_map(points, F, np.concatenate([border, own]), target, strategy="quality", polish=energy)
+    # Landmarks can pass each other: on the picture's own triangles what that costs is spread from the start.
+    fixed = np.concatenate([border, own])
+    result = injective_map(points, F, fixed, target, reference="corrected", polish=energy)
     if result.certificate.crossings.size:
         raise ValueError("moved: the border that goes along with the landmarks on it crosses itself")
     if not result.injective:

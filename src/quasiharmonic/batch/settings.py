@@ -38,7 +38,7 @@ class Settings:
         `quasiharmonic.targets.asked_corners.read_corners` reads.
     refine : bool
         Whether edges that leave the target no room are split, which adds vertices at the end.
-    strategy : {"speed", "quality"}
+    strategy : {"speed", "paper"}
     polish : str or None
         Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
     slide : bool

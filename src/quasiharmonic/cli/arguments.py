@@ -7,7 +7,8 @@ from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-# Those of quasiharmonic.energy.polishing, .harmonising, .linsolve and .measures, which are not imported to say them.
+# Those of quasiharmonic.energy.polishing, .harmonising, .measures, .strategy and .linsolve, which are not imported to
+# say them.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 FLATTENED = *ENERGIES, "distances"
 HARMONISED = "arap", "arap-unsigned", "area", "springs", "mips", "symmetric-dirichlet"
@@ -22,6 +23,7 @@ MEASURES = (
     "area_ratio",
     "shear",
 )
+STRATEGIES = "speed", "paper"
 LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -33,6 +35,16 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 def add_linear_solver(parser: argparse._ActionsContainer) -> None:
     """``--linear-solver``."""
     parser.add_argument("--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the best present)")
+
+
+def add_strategy(parser: argparse._ActionsContainer) -> None:
+    """``--strategy``."""
+    parser.add_argument(
+        "--strategy",
+        choices=STRATEGIES,
+        default="speed",
+        help="what finds a map soonest, or the paper's own pipeline, si-log first (default: speed)",
+    )
 
 
 def add_rings(parser: argparse._ActionsContainer) -> None:

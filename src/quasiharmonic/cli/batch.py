@@ -95,9 +95,7 @@ def add_parser(commands: Commands) -> None:
         choices=arguments.FLATTENED,
         help="what --flatten lowers (default: symmetric-dirichlet)",
     )
-    solver.add_argument(
-        "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
-    )
+    arguments.add_strategy(solver)
     solver.add_argument(
         "--polish", choices=arguments.ENERGIES, metavar="ENERGY", help="then lower distortion: %(choices)s"
     )

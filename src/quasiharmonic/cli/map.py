@@ -67,9 +67,7 @@ def add_parser(commands: Commands) -> None:
     distortion.add_argument("--no-polish", action="store_true", help="leave the first injective map as it is found")
     sliding.add_options(parser)
     solver = parser.add_argument_group("how it is solved")
-    solver.add_argument(
-        "--strategy", choices=("speed", "quality"), default="speed", help="soonest, or slower and kinder to angles"
-    )
+    arguments.add_strategy(solver)
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
     arguments.add_linear_solver(solver)

@@ -62,8 +62,8 @@ def injective_map(
         Where they go.
     reference : {"equilateral", "rest", "corrected"}, optional
         Shape of the triangles in which gradients are taken (§9.3), whatever the strategy would choose.
-    strategy : {"speed", "quality"} or sequence of Descent
-        ``"speed"`` finds a map soonest; ``"quality"`` takes longer and keeps angles; or stages of one's own.
+    strategy : {"speed", "paper"} or sequence of Descent
+        ``"speed"`` finds a map soonest; ``"paper"`` is the paper's own pipeline, si-log first; or stages of one's own.
     polish : str or Energy, optional
         Once injective, lower this distortion energy; see `quasiharmonic.polish` for the names.
     start : (n, 2) array, optional
