@@ -65,16 +65,14 @@ def paper(_: Problem) -> Stages:
     -------
     list of Descent or InPassing
     """
-    last: list[SearchStage] = []
-    for _ in range(_TURNS):
-        last += [
-            InPassing(Alternating(reference="corrected", iterations=20, resume=True)),
-            Newton(reference="corrected", iterations=20, resume=True),
-        ]
+    turn: list[SearchStage] = [
+        InPassing(Alternating(reference="corrected", iterations=20, resume=True)),
+        Newton(reference="corrected", iterations=20, resume=True),
+    ]
     return [
         VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
         VectorAdam(reference="corrected", iterations=600),
-        *last,
+        *_TURNS * turn,
     ]
 
 
