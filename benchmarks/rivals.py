@@ -1,10 +1,11 @@
 """Beside TLC and Foldover-free, from records of theirs: what each solves, how soon, and how distorted.
 
     python benchmarks/rivals.py                       # the records alone
-    python benchmarks/rivals.py --anew [-n 20] [-o ANEW.csv]
+    python benchmarks/rivals.py --anew speed untangling [-n 20] [-o ANEW.csv]
 
-With ``--anew`` our side is run again on the same problems, in their order, and judged as they were. Seconds then are of
-this machine and version and compare with the records' in kind only. ``records/README.md`` says where these come from.
+With ``--anew`` our side is run again on the same problems, in their order, and judged as they were: by strategies, or by
+`Untangling` alone, which descends Foldover-free's regularised energy our own way. Seconds then are of this machine and
+version; they are compared with each other, and with the records' in kind only. ``records/README.md`` says where these come from.
 """
 
 from __future__ import annotations
@@ -22,11 +23,14 @@ import numpy as np
 import problems
 from quasiharmonic import Problem, distortion, polish, solve
 from quasiharmonic.arrays import FloatArray
+from quasiharmonic.descent import Untangling
 from quasiharmonic.search.strategy import STRATEGIES
 
 RECORDS = Path(__file__).parent / "records"
 #: The programs in the order of the tables; those that ran every problem of the first 68.
 PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until first injective"
+#: What can be run anew.
+WAYS = *STRATEGIES, "untangling"
 #: Less than a tick of the clock they were measured with; in ratios it counts as that.
 TICK = 0.004
 
@@ -96,8 +100,9 @@ def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
     return {name: row for name, row in by_problem.items() if needed <= row.keys()}
 
 
-def anew(rows: dict[str, dict[str, Run]], strategy: str) -> Iterator[Run]:
-    """Our side on the problems of some records, now."""
+def anew(rows: dict[str, dict[str, Run]], way: str) -> Iterator[Run]:
+    """Our side on the problems of some records, now: by a strategy, or untangling alone."""
+    strategy = [Untangling(iterations=2000)] if way == "untangling" else way
     for name in rows:
         made, _, triangles = name.partition(" triangles=")
         case = problems.make(*problems.parse(made), triangles=int(triangles))
@@ -111,19 +116,24 @@ def anew(rows: dict[str, dict[str, Run]], strategy: str) -> Iterator[Run]:
             better = polish(case.V, case.F, result.uv, fixed=case.fixed, energy="mips")
             found, after = (distortion(case.V, case.F, uv) for uv in (result.uv, better.uv))
             row = [found.summary("mips").mean, after.summary("mips").mean, found.summary("isometric").maximum]
-        yield Run(name, f"now {strategy}", len(case.F), seconds, result.injective, case.feasible, before, *row)
+        yield Run(name, f"now {way}", len(case.F), seconds, result.injective, case.feasible, before, *row)
 
 
 def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What each program solved, its ratio of seconds to the first program's, and its distortion where all solved."""
+    """What each program solved, its ratio of seconds to the first program's, and its distortion where all solved.
+
+    What was run anew is compared with the first of those in place of the records' first: they share a machine.
+    """
     first = programs[0]
+    first_now = next((name for name in programs if name.startswith("now ")), first)
     lasting = [row for row in rows.values() if row[first].start_flipped]
     shared = [row for row in lasting if all(name in row and row[name].injective for name in programs)]
     table: dict[str, dict[str, Any]] = {}
     for name in programs:
         ran = [row[name] for row in rows.values() if name in row]
-        pairs = [row for row in lasting if name in row and row[name].injective and row[first].injective]
-        ratio = np.array([max(row[name].seconds, TICK) / max(row[first].seconds, TICK) for row in pairs])
+        unit = first_now if name.startswith("now ") else first
+        pairs = [row for row in lasting if name in row and row[name].injective and row[unit].injective]
+        ratio = np.array([max(row[name].seconds, TICK) / max(row[unit].seconds, TICK) for row in pairs])
         table[name] = {
             "feasible solved": sum(run.injective for run in ran if run.feasible),
             "feasible": sum(row[first].feasible for row in rows.values()),
@@ -159,23 +169,23 @@ def print_table(table: dict[str, dict[str, Any]]) -> None:
 def main() -> None:
     """Print the tables; with ``--anew`` solve first."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--anew", action="store_true", help="run our side again on the same problems")
+    parser.add_argument("--anew", nargs="+", default=[], choices=WAYS, help="run our side again on the same problems")
     parser.add_argument("-n", type=int, default=68, metavar="N", help="the first N problems (68)")
-    parser.add_argument("--strategy", default="speed", choices=STRATEGIES, help="of ours, anew (speed)")
     parser.add_argument("-o", "--output", type=Path, metavar="CSV", help="rows of what was run anew")
     options = parser.parse_args()
     rows = dict(list(on_common_problems(recorded()).items())[: options.n])
     programs = list(PROGRAMS)
-    if options.anew:
-        runs = []
-        for run in anew(rows, options.strategy):
+    runs = []
+    for way in options.anew:
+        for run in anew(rows, way):
             runs.append(run)
             rows[run.problem][run.program] = run
-            print(f"{run.problem}: {run.seconds:.3g} s, {'injective' if run.injective else 'no map'}", file=sys.stderr)
-        programs.append(f"now {options.strategy}")
-        if options.output:
-            with options.output.open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file).writerows([Run._fields, *runs])
+            story = f"{run.seconds:.3g} s, {'injective' if run.injective else 'no map'}"
+            print(f"{run.program}, {run.problem}: {story}", file=sys.stderr)
+        programs.append(f"now {way}")
+    if runs and options.output:
+        with options.output.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([Run._fields, *runs])
     print_table(summary(rows, programs))
 
 

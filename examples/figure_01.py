@@ -5,8 +5,11 @@ The paper's first picture maps Lucy onto the letter G: tanh and Adam find an inj
 and 3.1 s of MATLAB; SBP (Garanzha et al. 2021), in C++ on all cores, takes 300 times as long.
 
 Here it is an angel of our own, 25,074 triangles of which Tutte's embedding inverts 2,278. tanh takes 16 iterations,
-and with everything included three to six times as long as Tutte's embedding alone, less than a second on one core. SBP
-is another program and not run here; ``qhm report --against`` draws a comparison from anybody's records.
+and with everything included three to six times as long as Tutte's embedding alone, less than a second on one core.
+
+SBP is another program and not run here. In its stand stands its regularised energy, descended our own way, by Newton's
+method on the positions (`Untangling`): 51 iterations and nine times the time of tanh on the mesh itself, and a map with
+a tenth of the distortion, MIPS 2.4 against 25. ``qhm report --against`` draws a comparison from anybody's records.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from typing import Any
 
 from common import mips, panels, run, save, show
 from quasiharmonic import Problem, injective_map, quasi_harmonic_map, solve
-from quasiharmonic.descent import VectorAdam
+from quasiharmonic.descent import Untangling, VectorAdam
 from quasiharmonic.plot import plot_surface
 from sculptures import seven
 
@@ -30,17 +33,19 @@ def main(output: Path, size: int = 96) -> dict[str, Any]:
     for name, found_by in {
         "Tutte": lambda: quasi_harmonic_map(Problem(*given)),
         "tanh": lambda: solve(Problem(*given), strategy=[VectorAdam()]),
+        "untangling": lambda: solve(Problem(*given), strategy=[Untangling()]),
         "injective_map": lambda: injective_map(*given),
     }.items():
         start = perf_counter()
         maps[name] = found_by()
         seconds[name] = perf_counter() - start
-    tutte, result = maps["Tutte"], maps["tanh"]
-    figure, axes = panels(1, 3, (5.0, 5.6))
+    tutte, result, untangled = maps["Tutte"], maps["tanh"], maps["untangling"]
+    figure, axes = panels(1, 4, (4.2, 4.8))
     plot_surface(problem.V, problem.F, axes[0][0])
     axes[0][0].set_title(f"{len(problem.F):,} triangles", size=10)
     show(axes[0][1], problem, tutte, "Tutte's embedding")
     show(axes[0][2], problem, result.uv, f"tanh, {result.iterations} iterations")
+    show(axes[0][3], problem, untangled.uv, f"SBP's energy, our way, {untangled.iterations} iterations")
     save(figure, output, "figure_01")
     return {
         "triangles": len(problem.F),
@@ -50,6 +55,11 @@ def main(output: Path, size: int = 96) -> dict[str, Any]:
         "iterations": result.iterations,
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "MIPS": round(mips(problem, result.uv), 2),
+        "untangling": {
+            "inverted": len(untangled.certificate.flipped),
+            "iterations": untangled.iterations,
+            "MIPS": round(mips(problem, untangled.uv), 2),
+        },
     }
 
 
