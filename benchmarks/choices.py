@@ -1,6 +1,6 @@
 """What each choice costs and brings: functional, parameterisation, method of descent, strategy, energy.
 
-    OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose [--scans FOLDER]
+    OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose [--scans FOLDER …]
 
 Seven surfaces go onto letters (``examples/sculptures.py``), everything the same but for the one choice; beside them, if
 there is a folder of them, problems of one's own. Writes a table for each choice, in Markdown, which the page *How to
@@ -192,11 +192,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="where tables go (else to the screen)")
     parser.add_argument("--size", type=int, default=40, help="height of the surfaces' grid (40)")
-    parser.add_argument("--scans", type=Path, metavar="FOLDER", help="problem folders, at any depth")
-    parser.add_argument("only", nargs="*", metavar="TABLE", help=f"of {', '.join(t.__name__ for t in TABLES)} (all)")
+    parser.add_argument(
+        "--scans", type=Path, nargs="+", default=[], metavar="FOLDER", help="with problem folders, at any depth"
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="TABLE", help=f"of {', '.join(t.__name__ for t in TABLES)} (all)"
+    )
     options = parser.parse_args()
     problems = list(seven(options.size).values())
-    folders = sorted(path.parent for path in options.scans.rglob("input.obj")) if options.scans else []
+    folders = [path.parent for folder in options.scans for path in sorted(folder.rglob("input.obj"))]
     scans = [Problem(*io.read_problem(folder)) for folder in folders]
     solve(problems[0])  # whatever has to be imported is
     for measure in TABLES:

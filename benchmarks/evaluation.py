@@ -3,10 +3,10 @@
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/evaluation.py -n 2100 -o evaluation.csv
     python benchmarks/evaluation.py --summary benchmarks/records/evaluation.csv.gz
 
-100 to 20,000 triangles, spread evenly in their logarithm: the families of `problems` of which a solution is known, three
-that are laid along outlines, and surfaces of ``examples/sculptures.py`` onto letters. On each run the paper's strategy,
-tanh alone on the same triangles where si-log found the map, and ``speed``. A row a problem, written as soon as it is done;
-the same command goes on where it was stopped.
+100 to 20,000 triangles, spread evenly in their logarithm: the families of `problems` of which a solution is known,
+three that are laid along outlines, and surfaces of ``examples/sculptures.py`` onto letters. On each run the paper's
+strategy, tanh alone on the same triangles where si-log found the map, and ``speed``. A row a problem, written as soon
+as it is done; the same command goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import csv
 import gzip
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,8 @@ LIMIT = 20.0
 #: Of the generator's difficulties the lower part, as in ``dataset.py``.
 HARDEST = 0.7
 SURFACES, LETTERS, HEIGHTS = ("angel", "gargoyle", "rabbit", "bust", "hand"), "GSRAPH", (20, 26, 33, 41, 50, 61)
+#: Edges of the bands of size and of effort in the tables.
+SIZES, EFFORTS = (100, 300, 1000, 3000, 20_000), (0, 3, 30, 100, 300, 1000)
 RUNS = "paper", "tanh", "speed"
 COLUMNS = (
     "problem",
@@ -146,6 +149,81 @@ def read(path: Path) -> list[Row]:
 def number(rows: Iterable[Row], column: str) -> FloatArray:
     """A column; NaN where there is nothing."""
     return np.array([float(row[column] or "nan") for row in rows])
+
+
+def by_si_log(rows: Iterable[Row]) -> list[Row]:
+    """The problems on which si-log and tanh are compared: both found a map, which Tutte's embedding is not."""
+    return [
+        row for row in rows if row["paper_stage"] == "1" and row["tanh_mips"] and int(row["start_flipped"] or 0) > 0
+    ]
+
+
+def in_bands(rows: Iterable[Row], column: str, edges: Sequence[float]) -> dict[str, list[Row]]:
+    """Rows whose number in a column lies between two edges, by what is said of that."""
+    bands: dict[str, list[Row]] = {f"{low:,} to {high:,}": [] for low, high in pairwise(edges)}
+    for row in rows:
+        k = int(np.searchsorted(edges, float(row[column]), side="right")) - 1
+        list(bands.values())[min(max(k, 0), len(bands) - 1)].append(row)
+    return bands
+
+
+def by_family(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Rows of each family."""
+    families: dict[str, list[Row]] = {family: [] for family in FAMILIES}
+    for row in rows:
+        families[family_of(row["problem"])].append(row)
+    return families
+
+
+def strategies(rows: Sequence[Row]) -> str:
+    """What the paper's strategy and ``speed`` solve, how soon, and how distorted it is."""
+    lines = ["| strategy | solved | CPU s: 50, 95, 100 % | MIPS: 25, 50, 75 % |", "|---|---|---|---|"]
+    both = [row for row in rows if row["paper_mips"] and row["speed_mips"]]
+    for run in ("paper", "speed"):
+        solved = int((number(rows, f"{run}_stage") > 0).sum())
+        seconds, mips = (
+            ", ".join(f"{q:.2g}" for q in np.percentile(values, shares))
+            for values, shares in (
+                (number(rows, f"{run}_seconds"), (50, 95, 100)),
+                (number(both, f"{run}_mips"), (25, 50, 75)),
+            )
+        )
+        lines.append(f"| `{run}` | {solved} of {len(rows)} | {seconds} | {mips} |")
+    return "\n".join(lines)
+
+
+def compared(groups: dict[str, list[Row]], what: str) -> str:
+    """si-log's map beside tanh's from the same triangles: a row a group."""
+    head = f"| {what} | si-log got through | compared | MIPS, si-log / tanh: 10, 50, 90 % | lower | half the surface |"
+    lines = [head, "|---|---|---|---|---|---|"]
+    for name, rows in groups.items():
+        pairs = by_si_log(rows)
+        if not pairs:
+            continue
+        mean, median = (number(pairs, f"paper_{word}") / number(pairs, f"tanh_{word}") for word in ("mips", "median"))
+        first = np.mean([row["paper_stage"] == "1" for row in rows])
+        spread = ", ".join(f"{q:.2f}" for q in np.percentile(mean, (10, 50, 90)))
+        cells = (
+            f"{first:.0%} of {len(rows)}",
+            len(pairs),
+            spread,
+            f"{np.mean(mean < 1):.0%}",
+            f"{np.median(median):.2f}",
+        )
+        lines.append(f"| {name} | {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """All tables."""
+    return "\n\n".join(
+        [
+            strategies(rows),
+            compared({"all": list(rows)} | in_bands(rows, "triangles", SIZES), "triangles"),
+            compared(by_family(rows), "family"),
+            compared(in_bands(rows, "paper_iterations", EFFORTS), "si-log's iterations"),
+        ]
+    )
 
 
 def main() -> None:

@@ -1,86 +1,86 @@
-"""Figures 14 and 16: distortion and time over a data set
-=========================================================
+"""Figures 14 and 16: distortion and time over a data set, by size and by family
+=============================================================================
 
-The paper shows the distribution of MIPS over the maps of a benchmark (Du et al. 2020), lower than TLC's, and the time
-for each of its meshes beside that of SBP: 0.01 to 5 s for most, where SBP takes 1 to 100 s.
-
-Here are the first 80 problems of a set that is generated (``benchmarks/dataset.py``), or with ``--data FOLDER`` those
-of the benchmark itself. All are solved: by the paper's strategy, ``quality``, with si-log first and tanh where that
-does not get through, in 0.03 s (median; 7 s at most), and by ``speed``, with tanh first, in 0.01 s (0.3 s). Half of the
-meshes have fewer than 200 triangles and a boundary made to be hard; on them si-log does not keep angles better, as it
-does on smooth surfaces (Figures 5 and 8): median MIPS is 15 against 12. Polished for least MIPS it is 4.7.
-
-TLC and SBP are other programs; ``qhm report --against`` draws both figures against records of theirs.
+@@TEXT@@
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from common import BENCHMARKS, COLORS, panels, save
-from quasiharmonic import batch
-from quasiharmonic.report.numbers import load
+from common import BENCHMARKS, COLORS, panels, run, save
 
 sys.path.append(str(BENCHMARKS))
-from dataset import drawn, plan, write
+from evaluation import RECORDS, SIZES, Row, by_family, by_si_log, in_bands, number, read
 
-RUNS = {
-    "quality": (batch.Settings(strategy="quality"), COLORS["si-log"]),
-    "speed": (batch.Settings(strategy="speed"), COLORS["tanh"]),
-    "speed, then least MIPS": (batch.Settings(strategy="speed", polish="mips"), (0.35, 0.55, 0.25)),
-}
+SHOWN = {"paper": COLORS["si-log"], "speed": COLORS["tanh"]}
+QUANTILES = 10, 50, 90
 
 
-def generate(folder: Path, count: int) -> None:
-    """The first problems of the generated data set."""
-    for kind, family, seed, difficulty, triangles in plan(count):
-        write(folder / kind / f"{seed:05d}_{family}", drawn(family, seed, difficulty, triangles))
+def ratio(rows: list[Row]) -> np.ndarray:
+    """MIPS of si-log's map over that of tanh's."""
+    return number(rows, "paper_mips") / number(rows, "tanh_mips")
 
 
-def main(output: Path, size: int = 80, data: Path | None = None) -> dict[str, Any]:
-    runs = {}
-    with TemporaryDirectory() as scratch:
-        if data is None:
-            data = Path(scratch, "data")
-            generate(data, size)
-        for name, (settings, _) in RUNS.items():
-            folder = Path(scratch, name)
-            batch.run(data, folder, settings, jobs=1)
-            runs[name] = load(folder)
-    figure, (axes,) = panels(1, 2, (5.6, 4.4))
-    numbers: dict[str, Any] = {}
-    for k, ax in enumerate(axes):
-        ax.set_position((0.07 + 0.5 * k, 0.13, 0.41, 0.75))
-        ax.grid(alpha=0.3)
-    for name, run in runs.items():
-        good, color = run.certified, RUNS[name][1]
-        mips, seconds, triangles = (run.column(column)[good] for column in ("mips", "seconds", "triangles"))
-        bins = np.geomspace(1e-2, 1e5, 29)
-        axes[0].hist(mips, bins=bins, histtype="step", lw=2, color=color, label=name)
-        axes[1].plot(triangles, seconds, "o", ms=4, alpha=0.7, color=color)
+def draw_families(ax: Axes, rows: list[Row]) -> dict[str, list[float]]:
+    """A bar from the tenth to the ninetieth percentile a family, with the median in it."""
+    found = {}
+    for family, some in by_family(by_si_log(rows)).items():
+        if some:
+            low, middle, high = np.percentile(ratio(some), QUANTILES)
+            found[family] = [round(float(q), 2) for q in (low, middle, high)]
+            ax.plot([low, high], [family] * 2, lw=5, color="0.75", solid_capstyle="butt")
+            ax.plot(middle, family, "o", color=COLORS["si-log"])
+    ax.invert_yaxis()
+    return found
+
+
+def main(output: Path) -> dict[str, Any]:
+    rows = read(RECORDS)
+    figure, axes = panels(2, 2, (5.8, 4.6))
+    for i, line in enumerate(axes):
+        for j, ax in enumerate(line):
+            ax.set_position((0.08 + 0.5 * j, 0.57 - 0.5 * i, 0.4, 0.37))
+            ax.grid(alpha=0.3)
+    (left, right), (sizes, families) = axes
+    both = [row for row in rows if row["paper_mips"] and row["speed_mips"]]
+    numbers: dict[str, Any] = {"problems": len(rows), "solved by both": len(both)}
+    for name, color in SHOWN.items():
+        mips, seconds = number(both, f"{name}_mips"), number(rows, f"{name}_seconds")
+        left.hist(mips, bins=np.geomspace(1e-2, 1e5, 43), histtype="step", lw=2, color=color, label=name)
+        right.plot(number(rows, "triangles"), seconds, ".", ms=3, alpha=0.5, color=color)
         numbers[name] = {
-            "problems": len(run.rows),
-            "certified": int(good.sum()),
+            "solved": int((number(rows, f"{name}_stage") > 0).sum()),
             "MIPS": {f"{q} %": float(f"{np.percentile(mips, q):.3g}") for q in (25, 50, 75, 95)},
             "seconds": {f"{q} %": float(f"{np.percentile(seconds, q):.2g}") for q in (50, 95, 100)},
         }
-    axes[0].set(xscale="log", xlabel="MIPS energy", ylabel="maps", title="Figure 14")
-    axes[1].set(xscale="log", yscale="log", xlabel="triangles", ylabel="seconds, file to file", title="Figure 16")
-    axes[0].legend()
+    pairs = by_si_log(rows)
+    sizes.plot(number(pairs, "triangles"), ratio(pairs), ".", ms=3, alpha=0.4, color="0.5")
+    numbers["si-log"] = {"first": sum(row["paper_stage"] == "1" for row in rows), "compared": len(pairs)}
+    numbers["lower"] = round(float((ratio(pairs) < 1).mean()), 2)
+    numbers["by size"] = {}
+    for (name, some), low, high in zip(in_bands(pairs, "triangles", SIZES).items(), SIZES, SIZES[1:], strict=False):
+        quantiles = np.percentile(ratio(some), QUANTILES)
+        for q, style in zip(quantiles, (":", "-", ":"), strict=True):
+            sizes.plot([low, high], [q, q], style, lw=2, color=COLORS["si-log"])
+        numbers["by size"][name] = [round(float(q), 2) for q in quantiles]
+    numbers["by family"] = draw_families(families, rows)
+    left.set(xscale="log", xlabel="MIPS energy", ylabel="maps", title="Figure 14")
+    right.set(xscale="log", yscale="log", xlabel="triangles", ylabel="CPU seconds", title="Figure 16")
+    title = "MIPS of si-log's map over tanh's"
+    sizes.set(xscale="log", yscale="log", xlabel="triangles", title=title, ylim=(0.1, 30))
+    families.set(xscale="log", title=f"{title}: 10, 50, 90 %", xlim=(0.1, 30))
+    for ax, line in ((sizes, "axhline"), (families, "axvline")):
+        getattr(ax, line)(1, color="black", lw=1)
+    left.legend()
     save(figure, output, "figure_14")
     return numbers
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("figures"), metavar="DIR", help="folder (figures)")
-    parser.add_argument("--size", type=int, default=80, help="problems to generate (80)")
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="a data set of one's own, such as the benchmark")
-    print(json.dumps(main(**vars(parser.parse_args())), indent=2, ensure_ascii=False))
+    run(main)
