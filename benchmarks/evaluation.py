@@ -46,6 +46,8 @@ HARDEST = 0.7
 SURFACES, LETTERS, HEIGHTS = ("angel", "gargoyle", "rabbit", "bust", "hand"), "GSRAPH", (20, 26, 33, 41, 50, 61)
 #: Edges of the bands of size and of effort in the tables.
 SIZES, EFFORTS = (100, 300, 1000, 3000, 20_000), (0, 3, 30, 100, 300, 1000)
+#: Edges of the shares of triangles that Tutte's embedding inverts.
+INVERTED = 0, 0.01, 0.03, 0.1, 1
 RUNS = "paper", "tanh", "speed"
 COLUMNS = (
     "problem",
@@ -226,15 +228,45 @@ def summary(rows: Sequence[Row]) -> str:
     )
 
 
+def spread(problem: Problem, parameterisation: str) -> FloatArray:
+    """MIPS of one descent's first map: what 50, 90 and 99 % of the surface stay below, and the mean."""
+    stage = VectorAdam(parameterisation=parameterisation, reference="corrected", iterations=1000)
+    found = distortion(problem.V, problem.F, limited(problem, [stage])[0].uv)
+    order = np.argsort(found.mips)
+    mips, share = found.mips[order], found.share[order]
+    return np.array([*mips[np.searchsorted(np.cumsum(share), (0.5, 0.9, 0.99))], mips @ share])
+
+
+def explained(rows: Iterable[Row], count: int) -> str:
+    """si-log's distortion beside tanh's by quantiles, on some of the problems that both solve, solved again."""
+    pairs = [row for row in by_si_log(rows) if int(row["triangles"]) <= 3000]
+    inverted = number(pairs, "start_flipped") / number(pairs, "triangles")
+    words = "half the surface", "90 % of it", "99 % of it", "mean"
+    lines = [f"| inverted at the start | problems | {' | '.join(f'{word}: 50 %, lower' for word in words)} |"]
+    lines.append("|---" * (2 + len(words)) + "|")
+    for low, high in pairwise(INVERTED):
+        some = [row for row, share in zip(pairs, inverted, strict=True) if low <= share < high]
+        some = some[:: max(1, len(some) // count)][:count]
+        made = [problem_named(row["problem"])[0] for row in some]
+        ratios = np.array([spread(problem, "si-log") / spread(problem, "tanh") for problem in made])
+        cells = [f"{np.median(ratio):.2f}, {np.mean(ratio < 1):.0%}" for ratio in ratios.T]
+        lines.append(f"| {low:.0%} to {high:.0%} | {len(some)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Run what is missing, or summarise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=2100, help="problems (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("evaluation.csv"), help="table (%(default)s)")
     parser.add_argument("--summary", type=Path, metavar="TABLE", help="summarise a table and end")
+    parser.add_argument(
+        "--why", type=int, metavar="N", help="of that table, quantiles of some N problems of a kind solved again"
+    )
     options = parser.parse_args()
     if options.summary:
-        print(summary(read(options.summary)))
+        rows = read(options.summary)
+        print(explained(rows, options.why) if options.why else summary(rows))
         return
     done = {row["problem"] for row in read(options.output)}
     new = not options.output.exists()

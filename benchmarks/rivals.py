@@ -1,11 +1,12 @@
 """Beside TLC and Foldover-free, from records of theirs: what each solves, how soon, and how distorted.
 
-    python benchmarks/rivals.py                       # the records alone
+    python benchmarks/rivals.py                       # from the records
     python benchmarks/rivals.py --anew speed untangling [-n 20] [-o ANEW.csv]
 
-With ``--anew`` our side is run again on the same problems, in their order, and judged as they were: by strategies, or by
-`Untangling` alone, which descends Foldover-free's regularised energy our own way. Seconds then are of this machine and
-version; they are compared with each other, and with the records' in kind only. ``records/README.md`` says where these come from.
+With ``--anew`` our side is run again on the same problems, in their order, and judged as they were: by strategies, or
+by `Untangling` alone, which descends Foldover-free's regularised energy our own way. Seconds then are of this machine
+and version; they are compared with each other, and with the records' in kind only. ``records/README.md`` says where
+those come from.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ from quasiharmonic.search.strategy import STRATEGIES
 RECORDS = Path(__file__).parent / "records"
 #: The programs in the order of the tables; those that ran every problem of the first 68.
 PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until first injective"
-#: What can be run anew.
+#: What can be run anew, and the runs of these that are kept.
 WAYS = *STRATEGIES, "untangling"
+ANEW = tuple(f"anew {way}" for way in WAYS)
 #: Less than a tick of the clock they were measured with; in ratios it counts as that.
 TICK = 0.004
 
@@ -83,6 +85,24 @@ def recorded() -> list[Run]:
         ]
 
 
+def kept(path: Path = RECORDS / "anew.csv") -> list[Run]:
+    """Runs of ours that were made anew and written with ``-o``."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [
+            Run(
+                row["problem"],
+                row["program"],
+                int(row["triangles"]),
+                float(row["seconds"]),
+                row["injective"] == "True",
+                row["feasible"] == "True",
+                int(row["start_flipped"]),
+                *(float(row[name]) for name in ("mips", "polished", "stretch")),
+            )
+            for row in csv.DictReader(file)
+        ]
+
+
 def letters() -> list[dict[str, str]]:
     """What TLC-PN and Foldover-free took on seven scans onto letters, and came to."""
     with (RECORDS / "letters.csv").open(encoding="utf-8", newline="") as file:
@@ -93,7 +113,7 @@ def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
     """Of each problem that all programs ran, the run of each."""
     by_problem: dict[str, dict[str, Run]] = {}
     for run in runs:
-        if run.program in PROGRAMS:
+        if run.program in PROGRAMS + ANEW:
             by_problem.setdefault(run.problem, {})[run.program] = run
     # A run of SBP that never came to an injective map has no moment at which it did.
     needed = set(PROGRAMS[:-1])
@@ -116,22 +136,25 @@ def anew(rows: dict[str, dict[str, Run]], way: str) -> Iterator[Run]:
             better = polish(case.V, case.F, result.uv, fixed=case.fixed, energy="mips")
             found, after = (distortion(case.V, case.F, uv) for uv in (result.uv, better.uv))
             row = [found.summary("mips").mean, after.summary("mips").mean, found.summary("isometric").maximum]
-        yield Run(name, f"now {way}", len(case.F), seconds, result.injective, case.feasible, before, *row)
+        yield Run(name, f"anew {way}", len(case.F), seconds, result.injective, case.feasible, before, *row)
 
 
 def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[str, dict[str, Any]]:
     """What each program solved, its ratio of seconds to the first program's, and its distortion where all solved.
 
+    ``least`` counts the polished maps that are within 1 % of the least distorted one.
+
     What was run anew is compared with the first of those in place of the records' first: they share a machine.
     """
     first = programs[0]
-    first_now = next((name for name in programs if name.startswith("now ")), first)
+    first_now = next((name for name in programs if name.startswith("anew ")), first)
     lasting = [row for row in rows.values() if row[first].start_flipped]
     shared = [row for row in lasting if all(name in row and row[name].injective for name in programs)]
+    lowest = [np.nanmin([row[name].polished for name in programs]) for row in shared]
     table: dict[str, dict[str, Any]] = {}
     for name in programs:
         ran = [row[name] for row in rows.values() if name in row]
-        unit = first_now if name.startswith("now ") else first
+        unit = first_now if name.startswith("anew ") else first
         pairs = [row for row in lasting if name in row and row[name].injective and row[unit].injective]
         ratio = np.array([max(row[name].seconds, TICK) / max(row[unit].seconds, TICK) for row in pairs])
         table[name] = {
@@ -144,6 +167,8 @@ def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[st
             "of": int(ratio.size),
             "MIPS": median([row[name].mips for row in shared]),
             "polished": median([row[name].polished for row in shared]),
+            "least": int(sum(row[name].polished <= 1.01 * least for row, least in zip(shared, lowest, strict=True))),
+            "of all": len(shared),
         }
     return table
 
@@ -157,13 +182,14 @@ def median(values: Sequence[float]) -> float:
 def print_table(table: dict[str, dict[str, Any]]) -> None:
     """In Markdown."""
     first = next(iter(table))
-    print(f"| program | feasible | unknown | seconds / {first}: 10, 50, 90 % | quicker | MIPS | polished |")
-    print("|---|---|---|---|---|---|---|")
+    print(f"| program | feasible | unknown | seconds / {first}: 10, 50, 90 % | quicker | MIPS | polished | least |")
+    print("|---|---|---|---|---|---|---|---|")
     for name, row in table.items():
         ratio = ", ".join(f"{q:g}" for q in row["ratio"])
         solved = f"{row['feasible solved']}/{row['feasible']} | {row['unknown solved']}/{row['unknown']}"
         quicker = f"{row['quicker']}/{row['of']}"
-        print(f"| {name} | {solved} | {ratio} | {quicker} | {row['MIPS']:g} | {row['polished']:g} |")
+        least = f"{row['least']}/{row['of all']}"
+        print(f"| {name} | {solved} | {ratio} | {quicker} | {row['MIPS']:g} | {row['polished']:g} | {least} |")
 
 
 def main() -> None:
@@ -173,8 +199,8 @@ def main() -> None:
     parser.add_argument("-n", type=int, default=68, metavar="N", help="the first N problems (68)")
     parser.add_argument("-o", "--output", type=Path, metavar="CSV", help="rows of what was run anew")
     options = parser.parse_args()
-    rows = dict(list(on_common_problems(recorded()).items())[: options.n])
-    programs = list(PROGRAMS)
+    rows = dict(list(on_common_problems([*recorded(), *([] if options.anew else kept())]).items())[: options.n])
+    programs = [*PROGRAMS, *(() if options.anew else ANEW)]
     runs = []
     for way in options.anew:
         for run in anew(rows, way):
@@ -182,7 +208,7 @@ def main() -> None:
             rows[run.problem][run.program] = run
             story = f"{run.seconds:.3g} s, {'injective' if run.injective else 'no map'}"
             print(f"{run.program}, {run.problem}: {story}", file=sys.stderr)
-        programs.append(f"now {way}")
+        programs.append(f"anew {way}")
     if runs and options.output:
         with options.output.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file).writerows([Run._fields, *runs])

@@ -8,8 +8,9 @@ not run here. SBP's regularised energy is, descended our own way by Newton's met
 
 Here it is an angel, 8,510 triangles of which Tutte's embedding inverts 747. tanh takes 16 iterations and
 ends at MIPS 22.0, si-log 106 and 6.8: the same trade. Both undo most inversions in the first ten iterations, and the
-last few triangles take most of the time. `Untangling` takes 40 Newton steps, each of the time of several of tanh's: at
-the first nearly all triangles are inverted, at the 31st all at once come right, and MIPS is 2.8. V₃ need not fall at every step: VectorAdam's is not a line search.
+last few triangles take most of the time. `Untangling` takes 40 Newton steps, each as long as several of tanh's: after
+the first nearly all triangles are inverted, at the 31st nearly all at once come right, and MIPS is 2.8. V₃ need not
+fall at every step: VectorAdam's is not a line search.
 """
 
 from __future__ import annotations

@@ -39,6 +39,23 @@ def test_what_the_pages_say():
     assert table["SBP"]["MIPS"] < table["ours speed"]["MIPS"] < table["TLC-QN"]["MIPS"] < table["TLC-PN"]["MIPS"]
 
 
+def test_what_the_pages_say_of_runs_made_anew():
+    programs = (*rivals.PROGRAMS, *rivals.ANEW)
+    table = rivals.summary(rivals.on_common_problems([*rivals.recorded(), *rivals.kept()]), programs)
+    solved = {name: (table[name]["feasible solved"], table[name]["unknown solved"]) for name in rivals.ANEW}
+    assert solved == {"anew speed": (44, 21), "anew paper": (41, 20), "anew untangling": (43, 21)}
+    assert [table[name]["ratio"][1] for name in rivals.ANEW] == [1, 8.2, 2.2]
+    assert table["anew untangling"]["MIPS"] < table["anew speed"]["MIPS"]
+
+
+def test_runs_of_one_search_on_one_problem_agree_whenever_they_were_made():
+    rows = rivals.on_common_problems([*rivals.recorded(), *rivals.kept()])
+    for row in rows.values():
+        then, now = row["ours speed"], row["anew speed"]
+        assert (now.triangles, now.feasible, now.start_flipped) == (then.triangles, then.feasible, then.start_flipped)
+        assert now.injective == then.injective
+
+
 def test_letters():
     rows = rivals.letters()
     assert len(rows) == 7
@@ -54,4 +71,4 @@ def test_our_side_anew():
     assert run.triangles == row["ours speed"].triangles
     assert run.polished == pytest.approx(row["ours speed"].polished, rel=0.05)
     table = rivals.summary({name: row | {run.program: run}}, (*rivals.PROGRAMS, run.program))
-    assert table["now speed"]["feasible solved"] + table["now speed"]["unknown solved"] == 1
+    assert table["anew speed"]["feasible solved"] + table["anew speed"]["unknown solved"] == 1
