@@ -269,11 +269,14 @@ def main() -> None:
         print(explained(rows, options.why) if options.why else summary(rows))
         return
     done = {row["problem"] for row in read(options.output)}
-    new = not options.output.exists()
+    before = options.output.read_bytes() if options.output.exists() else b""
     with options.output.open("a", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, COLUMNS)
-        if new:
+        if not before:
             table.writeheader()
+        elif not before.endswith(b"\n"):
+            # A line that a kill has cut short stays alone, and is not read.
+            file.write("\n")
         for name in names(options.count):
             if name not in done:
                 table.writerow(measured(name))
