@@ -141,7 +141,7 @@ def strategies(problems: list[Problem]) -> Table:
 def lowered(problem: Problem, uv: np.ndarray) -> Iterator[tuple[str, Callable[[], MapResult]]]:
     """Every way to lower distortion that has a name, not yet run."""
     given = problem.V, problem.F, uv
-    for energy in ("symmetric-dirichlet", "arap", "blend", "mips"):
+    for energy in ("symmetric-dirichlet", "arap-barrier", "blend", "mips"):
         yield f'`polish`, "{energy}"', lambda e=energy: polish(*given, fixed=problem.fixed, energy=e)
     for energy in ("symmetric-dirichlet", "arap", "springs", "area"):
         yield f'`harmonise`, "{energy}"', lambda e=energy: harmonise(*given, fixed=problem.fixed, energy=e)
