@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +39,9 @@ ITERATIONS = 600
 Outcome = tuple[int, int]
 
 
-def trials(seeds: int = 2) -> Iterator[tuple[str, Problem]]:
+def trials(seeds: int = 2, surfaces: Sequence[str] = ("angel", "rabbit", "hand")) -> Iterator[tuple[str, Problem]]:
     """Surfaces onto letters, turned rings, points swapped, and generated problems that have a map."""
-    for surface in ("angel", "rabbit", "hand"):
+    for surface in surfaces:
         V, F = sculpture(surface, 24)
         for letter in "GSH":
             outline = targets.filled(targets.letter(letter))
@@ -145,12 +145,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="*", choices=[*TRIED, []], default=list(TRIED))
     parser.add_argument("--seeds", type=int, default=2, help="generated problems of each family (2)")
+    parser.add_argument("--surfaces", nargs="*", default=["angel", "rabbit", "hand"], help="that go onto letters")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
     table: dict[str, dict[str, Any]] = {}
     for what in options.what:
         rows = table[what] = {}
-        for name, problem in trials(options.seeds):
+        for name, problem in trials(options.seeds, options.surfaces):
             rows[name] = {"triangles": len(problem.F), **TRIED[what](problem)}
             print(what, name, json.dumps(rows[name], ensure_ascii=False), flush=True)
         for column in dict.fromkeys(key for row in rows.values() for key in row):

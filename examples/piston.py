@@ -1,10 +1,10 @@
 """A cheese with holes pushed through an hourglass: collision avoidance while time goes on
 ========================================================================================
 
-A piston comes down and pushes a cheese with five holes into the neck of an hourglass. At every step piston, cheese (blue)
-and air (yellow) are one mesh that is certified bijective, so nothing overlaps, ever, not even inside the holes, whose
-walls come to lie against each other. The air is triangulated anew at every step, and carries a thousandth of the weight.
-Nothing detects a contact or answers it; `figure_20` has the paper's figure, which is pressed into its place in one go.
+A piston comes down and pushes a cheese with five holes into the neck of an hourglass. At every step piston, cheese
+(blue) and air (yellow) are one mesh that is certified bijective, so nothing overlaps, ever, not even inside the holes,
+whose walls come to lie against each other. The air is triangulated anew at every step, and carries a thousandth of the
+weight. Nothing detects a contact or answers it; in `figure_20` a figure is pressed into its place in one go.
 
 Beside the picture of six moments, an animation is written: ``piston.gif``.
 """

@@ -298,11 +298,20 @@ def test_figure_09(example):
 
 
 def test_figure_10(example):
-    numbers = example("figure_10", surfaces=1, iterations=100)
-    assert numbers["V₃ tanh"]["solved"] == 6
-    assert numbers["V₃ tanh"]["most iterations"] < 100
-    # The paper has them all.
-    assert numbers["V₄"]["solved"] < 6
+    numbers = example("figure_10", size=24, surfaces=1)
+    assert numbers["drawn"]["solved"] == numbers["drawn"]["of"] == 6
+    assert numbers["drawn"]["most iterations"] < 100
+    # Those of the paper's three functionals that do not do it by themselves.
+    recorded = numbers["recorded"]["gallery"]
+    assert recorded["V₁ si-log"]["solved"] < recorded["V₃ si-log"]["solved"] <= recorded["V₃ si-log"]["of"] == 30
+
+
+def test_figure_22(example):
+    numbers = example("figure_22", size=20)
+    assert numbers["least angle"] < 1e-5
+    assert numbers["angles below 1°"] > 500
+    assert numbers["the disk"]["flips"] == numbers["G"]["flips"] == 0
+    assert all(count is not None for way, count in numbers["G"]["alone"].items() if way.startswith("tanh"))
 
 
 def test_figure_14(example):

@@ -74,7 +74,7 @@ def test_positive_weights(problem, symmetric):
 
 
 def test_which_weights_a_map_has(problem):
-    """Any injective map has mean values; Tutte's own has one weight an edge, a triangulation that is not regular none."""
+    """Any injective map has mean values; Tutte's own has one weight an edge too, one that is not regular has not."""
     assert positive_weights.mean_values(problem, solve(problem).uv) < 1e-12
     V, F = disk(5)
     (loop,) = boundary_loops(F, len(V))
