@@ -344,7 +344,13 @@ def sculpture(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
     F : (f, 3) int64
         Counterclockwise seen from outside.
     """
-    field, low, high = SCULPTURES[name]
+    return standing(*SCULPTURES[name], size)
+
+
+def standing(
+    field: Field, low: tuple[float, float, float], high: tuple[float, float, float], size: int
+) -> tuple[FloatArray, IntArray]:
+    """The surface of any field, as `sculpture` has it, between two corners of a box that is cut off at its floor."""
     step, floor = (high[1] - low[1]) / size, low[1]
     V, F = cut_off(*surface_net(field, np.subtract(low, (0, 2 * step, 0)), high, step), floor)
     rim = np.concatenate(boundary_loops(F, len(V)))

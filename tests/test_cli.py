@@ -385,6 +385,10 @@ class TestHarmonise:
         assert [s["name"] for s in facts["stages"][:2]] == [f"harmonise, springs, η = {eta}" for eta in (0.5, 0.25)]
         assert all(s["iterations"] <= 6 for s in facts["stages"][:2])
         assert facts["linear_solver"] == "superlu"
+        # The map is not of the size of its surface.
+        assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", "--unscaled", *arguments) == 0
+        unscaled = json.loads(report.read_text())
+        assert unscaled["stages"][0]["energy"] != facts["stages"][0]["energy"]
 
     def test_refuses_what_it_cannot_begin_with(self, star, tmp_path, capsys):
         assert run("harmonise", star, "-o", tmp_path / "o.obj", "--energy", "mips") == 2

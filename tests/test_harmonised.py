@@ -241,6 +241,31 @@ class TestHarmonise:
         assert shares[1] < 0.9 * shares[0]
         assert shares[2] < 0.9 * shares[0]
 
+    def test_the_surfaces_own_scale(self):
+        """What has weight is at rest whatever room the whole has; scaled with the whole it is not."""
+        V, F = disk(10)
+        loose = np.linalg.norm(V[F].mean(axis=1), axis=1) > 0.5
+        uv, fixed = 2 * V, boundary_of(F)
+        inner = DeformationEnergy(V, F[~loose], ENERGIES["arap"](V, F))
+        found = {}
+        for scaled in (True, False):
+            result = harmonise(V, F, uv, fixed=fixed, weights=~loose, scaled=scaled, max_iterations=100)
+            assert result.injective
+            found[scaled] = inner.value(result.uv @ (1, 1j))
+        # σ₁ = σ₂ = 2 where it is scaled, a similarity, which is what the map already was.
+        assert found[True] == pytest.approx(2, rel=1e-6)
+        assert found[False] < 0.02
+
+    def test_the_scale_of_an_unscaled_energy(self):
+        """E of the map as it stands, in whichever unit."""
+        V, F, uv, fixed = bowl()
+        for unit, energy in ((1, "arap"), (2.0**40, "springs"), (0.3, "symmetric-dirichlet")):
+            known = DeformationEnergy(V * unit, F, ENERGIES[energy](V, F)).value(uv @ (1, 1j) * unit * 1.7)
+            result = harmonise(
+                V * unit, F, uv * unit * 1.7, fixed=fixed, energy=energy, conformal=0, scaled=False, max_iterations=2
+            )
+            assert result.history[0].energy == pytest.approx(known, rel=1e-9)
+
     def test_an_energy_of_ones_own(self):
         class Shear(Energy):
             """|q|² per unit of area: smooth, no barrier, and without second derivatives."""

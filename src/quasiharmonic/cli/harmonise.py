@@ -44,6 +44,11 @@ def add_parser(commands: Commands) -> None:
         help="weight of the energy against injectivity, one for each round (default: four rounds, as suits the energy)",
     )
     parser.add_argument(
+        "--unscaled",
+        action="store_true",
+        help="compare lengths and areas as they are, not after scaling the map to the surface's area",
+    )
+    parser.add_argument(
         "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
     )
     seams.add_packing(parser)
@@ -65,6 +70,7 @@ def run(options: argparse.Namespace) -> int:
             fixed=fixed,
             energy=options.energy,
             eta=options.eta,
+            scaled=not options.unscaled,
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,

@@ -29,6 +29,10 @@ class Frame:
         """Positions (n, 2) as complex numbers in the frame; (n,) complex128."""
         return np.ldexp(uv - self.centre, -self._exponent).view(np.complex128).ravel()
 
+    def lengths(self, x: FloatArray) -> FloatArray:
+        """Lengths, or positions that stay about their own origin, in the frame's unit; an array of the same shape."""
+        return np.ldexp(x, -self._exponent)
+
     def outward(self, w: ComplexArray) -> FloatArray:
         """Complex numbers of the frame (n,) as positions; (n, 2) float64."""
         return np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent) + self.centre

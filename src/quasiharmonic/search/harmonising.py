@@ -60,6 +60,7 @@ def harmonise(
     eta: float | Sequence[float] | None = None,
     conformal: float = 1e-3,
     weights: ArrayLike | None = None,
+    scaled: bool = True,
     max_iterations: int = 40,
     tolerance: float = 1e-3,
     reference: Reference = "rest",
@@ -92,8 +93,7 @@ def harmonise(
         - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles and nothing else;
         - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻² − 4, lengths.
 
-        Or any `Energy`. Lengths and areas are compared after scaling the map to the surface's area. None leaves R₁
-        alone, which is MIPS in the end and no barrier on the way.
+        Or any `Energy`. None leaves R₁ alone, which is MIPS in the end and no barrier on the way.
     eta : float or sequence of float, optional
         η in ``V₃/|Ω| + η (E + κ R₁)``, one for each round. By default four rounds, that end at 1 for barriers and at
         0.001 for other energies. (The paper has one, of 1e-4, for all.)
@@ -102,6 +102,9 @@ def harmonise(
     weights : (f,) array, optional
         How much each triangle's distortion counts in E; not negative, 1 by default. R₁ counts all alike: it keeps the
         others from collapsing.
+    scaled : bool
+        Compare lengths and areas after scaling the map to the surface's area. With False they are taken as they are:
+        what part of the mesh has weight can be at rest then whatever room the whole is given.
     max_iterations : int
         Linear solves of each round at most.
     tolerance : float
@@ -154,6 +157,7 @@ def harmonise(
         eta=eta,
         conformal=conformal,
         weights=weights,
+        scaled=scaled,
         max_iterations=max_iterations,
         tolerance=tolerance,
         reference=reference,
@@ -172,6 +176,7 @@ def harmonise_map(
     eta: float | Sequence[float] | None = None,
     conformal: float = 1e-3,
     weights: ArrayLike | None = None,
+    scaled: bool = True,
     max_iterations: int = 40,
     tolerance: float = 1e-3,
     reference: Reference = "rest",
@@ -208,7 +213,11 @@ def harmonise_map(
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
         if not area > 0:
             raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
-        deformation = None if chosen is None else DeformationEnergy(own.V, own.F, chosen, area=area, weights=weights)
+        deformation = None
+        if chosen is not None:
+            # In the frame's unit map and surface compare as they do in the caller's.
+            V, asked = (own.V, area) if scaled else (own.frame.lengths(own.V), None)
+            deformation = DeformationEnergy(V, own.F, chosen, area=asked, weights=weights)
         objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
         regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
 

@@ -1,0 +1,67 @@
+"""VectorAdam in the Poincaré disk: tensors of determinant 1 are the points of the hyperbolic plane (§8.2's wish).
+
+A step goes from μ along a geodesic, whatever the length of |ξ|, and the mean of gradients is carried along by parallel
+transport. Lengths are in units in which they are those of ξ with tanh at the origin: ``|dμ|/(1 − |μ|²)``, half of the
+usual. In these units the gradient differs from tanh's in its part across ξ alone, by ``2ρ/sinh 2ρ`` with ρ = |ξ|: what
+ξ takes for a long way around the disk is a longer one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.descent import VectorAdam
+from quasiharmonic.descent.base import Iterates
+from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.field.tensor import TANH
+
+
+def exponential(mu: ComplexArray, step: ComplexArray) -> ComplexArray:
+    """Where a geodesic leads: from μ in the direction and by the length of ``step``; Möbius addition."""
+    length = np.abs(step)
+    there = np.tanh(length) * np.divide(step, length, out=np.zeros_like(step), where=length > 0)
+    return (mu + there) / (1 + np.conj(mu) * there)
+
+
+def transport(start: ComplexArray, end: ComplexArray) -> ComplexArray:
+    """What parallel transport along the geodesic between two points multiplies vectors by: phases."""
+    turn = 1 - end * np.conj(start)
+    return turn / np.conj(turn)
+
+
+def riemannian(gradient: ComplexArray, xi: ComplexArray) -> ComplexArray:
+    """The gradient in an orthonormal frame at μ, its axes those of μ, from the gradient in ξ with tanh."""
+    rho = np.abs(xi)
+    axis = np.divide(xi, rho, out=np.ones_like(xi), where=rho > 0)
+    local = np.conj(axis) * gradient
+    across: FloatArray = np.divide(2 * rho, np.sinh(2 * rho), out=np.ones_like(rho), where=rho > 0)
+    return axis * (local.real + 1j * across * local.imag)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HyperbolicAdam(VectorAdam):
+    """VectorAdam with steps along geodesics; tanh alone."""
+
+    word: ClassVar[str] = "hyperbolic-adam"
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`."""
+        first, second = self.momenta
+        times, lengths = zip(*self._steps, strict=True)
+        mean, square = np.zeros_like(start.xi), np.zeros(start.xi.shape)
+        here = start
+        for k in range(1, self.iterations + 1):
+            gradient = riemannian(here.gradient, here.xi)
+            mean = first * mean + (1 - first) * gradient
+            square = second * square + (1 - second) * np.abs(gradient) ** 2
+            length = float(np.interp(k - 1, times, lengths)) * np.sqrt(1 - second**k) / (1 - first**k)
+            step = np.divide(-length * mean, np.sqrt(square), out=np.zeros_like(mean), where=square > 0)
+            there = objective.step(here, TANH.invert(exponential(here.field.mu, step)) - here.xi)
+            mean *= transport(here.field.mu, there.field.mu)
+            here = there
+            yield here
+        return False
