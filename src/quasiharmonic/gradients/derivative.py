@@ -1,18 +1,20 @@
 """The derivative of a map: what its users hold in hands, whatever the map.
 
-A map w of a surface with rest positions z, tensors μ and held vertices at t solves equations ``R(w, t, z, μ) = 0`` at the
-vertices that may move: the forces there vanish. So with K the derivative of R by the unknowns
+A map w of a surface with rest positions z, tensors μ and held vertices at t solves equations ``R(w, t, z, μ) = 0`` at
+the vertices that may move: the forces there vanish. So with K the derivative of R by the unknowns
 
     dw = −K⁻¹ (∂R/∂t dt + ∂R/∂z dz + ∂R/∂μ dμ),
 
-and for a function of the map with gradient c one solve ``K ℓ = c`` gives all of its gradients, ``−(∂R/∂t)ᵀ ℓ`` and so on.
+and for a function of the map with gradient c one solve ``K ℓ = c`` gives all of its gradients,
+``−(∂R/∂t)ᵀ ℓ`` and so on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -59,9 +61,8 @@ class Doubt(Enum):
     CLIPPED = "Tensors are as far from isotropic as doubles allow, and do not follow μ any further."
 
 
-@dataclass(frozen=True)
 class Gradients:
-    """The gradients of one number that depends on a map.
+    """The gradients of one number that depends on a map, each computed when it is first asked for.
 
     Attributes
     ----------
@@ -73,9 +74,28 @@ class Gradients:
         By the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``, of a map that has them.
     """
 
-    target: FloatArray
-    rest: FloatArray
-    mu: ComplexArray | None = None
+    def __init__(
+        self,
+        target: Callable[[], FloatArray],
+        rest: Callable[[], FloatArray],
+        mu: Callable[[], ComplexArray | None],
+    ) -> None:
+        self._target, self._rest, self._mu = target, rest, mu
+
+    @cached_property
+    def target(self) -> FloatArray:
+        """By the held vertices' places."""
+        return self._target()
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """By the rest positions."""
+        return self._rest()
+
+    @cached_property
+    def mu(self) -> ComplexArray | None:
+        """By the Beltrami coefficients."""
+        return self._mu()
 
 
 class Inverse(Protocol):
@@ -127,7 +147,7 @@ class Derivative:
         fixed: IntArray,
         forces: Forces,
         inverse: Inverse,
-        strain: Strain | None,
+        strain: Callable[[], Strain] | None,
         rest_shape: tuple[int, ...],
         doubts: Iterable[Doubt] = (),
         unit: float = 1.0,
@@ -140,9 +160,13 @@ class Derivative:
         self.uv.flags.writeable = False
         self.doubts = tuple(doubts)
         self._fixed, self._forces, self._inverse = fixed, forces, inverse
-        self._strain, self._rest_shape, self._unit = strain, rest_shape, unit
+        self._make_strain, self._rest_shape, self._unit = strain, rest_shape, unit
         self._follows = np.ones(fixed.size, dtype=bool) if on_curves is None else ~np.isin(fixed, on_curves)
         self._scale, self._gauge, self._tensors = scale, gauge, tensors
+
+    @cached_property
+    def _strain(self) -> Strain | None:
+        return None if self._make_strain is None else self._make_strain()
 
     @property
     def reliable(self) -> bool:
@@ -190,7 +214,7 @@ class Derivative:
                 raise ValueError("mu: only a quasi-harmonic map is a map of tensors")
             load += self._tensors.by_mu(forces, self._checked_mu(mu))
         more = 0.0 if self._scale is None else self._scale.change(held, moved)
-        if self._gauge is None or not self._gauge.keeps_area:
+        if self._scaled:
             load += more * forces.by_scale
         dw = held - self._inverse.solve(load)
         if self._gauge is not None:
@@ -214,26 +238,42 @@ class Derivative:
         ValueError
             When the cotangent has another shape or is not finite.
         """
-        forces = self._forces
         pull = self._unit * as_complex(map_array("cotangent", cotangent, len(self.uv)))
         on_pin, on_scale = 0j, 0.0
         if self._gauge is not None:
             pull, on_pin, on_scale = self._gauge.pulled(pull)
         response = self._inverse.solve(pull)
-        by_places = pull - forces.by_places(response)
-        rest = np.zeros(self._rest_shape)
-        if self._strain is not None:
-            rest -= self._strain.pull(*forces.strain_of(response))
+        if self._scaled:
+            on_scale -= work(self._forces.by_scale, response)
+        return Gradients(
+            partial(self._by_target, pull, response, on_pin, on_scale),
+            partial(self._by_rest, response, on_scale),
+            partial(self._by_mu, response),
+        )
+
+    @property
+    def _scaled(self) -> bool:
+        """Whether the forces depend on the scale between map and surface."""
+        return self._scale is not None and self._gauge is None
+
+    def _by_target(self, pull: ComplexArray, response: ComplexArray, on_pin: complex, on_scale: float) -> FloatArray:
+        by_places = pull - self._forces.by_places(response)
         if self._scale is not None:
-            if self._gauge is None or not self._gauge.keeps_area:
-                on_scale -= work(forces.by_scale, response)
-            rest += on_scale * self._scale.by_rest
             by_places += on_scale * self._scale.by_places
         if self._gauge is not None and self._gauge.pin is not None:
             by_places[self._gauge.pin] += on_pin
-        target = np.where(self._follows, by_places[self._fixed], 0) / self._unit
-        mu = None if self._tensors is None else -self._tensors.of(forces, response)
-        return Gradients(as_rows(target), rest, mu)
+        return as_rows(np.where(self._follows, by_places[self._fixed], 0) / self._unit)
+
+    def _by_rest(self, response: ComplexArray, on_scale: float) -> FloatArray:
+        out = np.zeros(self._rest_shape)
+        if self._strain is not None:
+            out -= self._strain.pull(*self._forces.strain_of(response))
+        if self._scale is not None:
+            out += on_scale * self._scale.by_rest
+        return out
+
+    def _by_mu(self, response: ComplexArray) -> ComplexArray | None:
+        return None if self._tensors is None else -self._tensors.of(self._forces, response)
 
     def _rest_positions(self, rest: ArrayLike) -> FloatArray:
         moved = real_array("rest", rest)

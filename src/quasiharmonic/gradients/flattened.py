@@ -99,7 +99,7 @@ def flatten_derivative(
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum,
-        strain=strain,
+        strain=lambda: strain,
         rest_shape=domain.V.shape,
         doubts=[*doubts, *minimum.doubts],
         unit=2.0**exponent,

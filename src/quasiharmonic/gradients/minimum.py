@@ -25,6 +25,8 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 
 # Steps at most, and how often one is halved.
 _STEPS, _HALVINGS = 100, 40
+# Where second derivatives have a negative direction, how much of what is negative on triangles is left out, in turn.
+_CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
 # A step that strains no triangle by more than this is none; one as short as the second, and not half as long as the one
 # before, is rounding; and a map whose last step strains more than the third is not at rest.
 _NOTHING, _SHORT, _AT_REST = 1e-12, 1e-6, 1e-6
@@ -61,6 +63,7 @@ class Minimum:
         self._energy, self._freedom, self.w = energy, freedom, w
         self._lock = Lock()
         self._lu: Any = None
+        self._clamped = 0.0
         self.doubts: list[Doubt] = []
         with np.errstate(all="ignore"):
             left = self._settle(_STEPS if settle else 0)
@@ -103,13 +106,16 @@ class Minimum:
     def _direction(self, gradient: ComplexArray) -> tuple[ComplexArray, bool]:
         """Newton's step, and whether by the second derivatives as they are."""
         system = self._freedom.system
-        for negative in (1.0, 0.0):
-            system.assemble(self._energy.curvature_of(self._deformation, negative=negative))
-            if negative == 1.0 and system.diagonal.min(initial=0.0) < 0:
+        for clamped in (0.0, *_CLAMPED):
+            if 0 < clamped < self._clamped:
                 continue
-            found = system.descent(gradient, (0.0,) if negative == 1.0 else (1e-12, 1e-6))
+            system.assemble(self._energy.curvature_of(self._deformation, negative=1.0 - clamped))
+            if system.diagonal.min(initial=0.0) < 0:
+                continue
+            found = system.descent(gradient, (0.0,) if clamped < 1 else (1e-12, 1e-6))
             if found is not None:
-                return found[0], negative == 1.0
+                self._clamped = clamped / 4
+                return found[0], clamped == 0
         return system.solve_diagonal(-gradient), False
 
     def _strain(self, step: ComplexArray) -> float:

@@ -101,7 +101,7 @@ def polish_derivative(
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum,
-        strain=strain,
+        strain=lambda: strain,
         rest_shape=domain.V.shape,
         doubts=minimum.doubts,
         unit=2.0**exponent,

@@ -8,6 +8,8 @@ took. Written as forces, it is at rest with the energy ``Σ m φ(p, q)``,
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -86,11 +88,10 @@ def quasi_harmonic_derivative(
         operator = iterate.operator
     mesh, field = objective.mesh, iterate.field
     half: ComplexArray = 0.5 * mesh.gamma
-    strain: Strain | None = None
+    strain: Callable[[], Strain] | None = None
     if mesh.kind != "equilateral":
-        problem.domain.check_areas()
         rest = problem.V, problem.F
-        strain = RestStrain(*rest) if mesh.kind == "rest" else CorrectedStrain(*rest, half)
+        strain = partial(RestStrain, *rest) if mesh.kind == "rest" else partial(CorrectedStrain, *rest, half)
     uv = problem.positions(iterate.w)
     dw = mesh.derivatives(as_complex(uv - problem.frame.centre))
     double = 2.0 / field.defect
