@@ -46,9 +46,9 @@ def flatten_derivative(
     Returns
     -------
     Derivative
-        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``. With no vertex held it is
-        that which lies nearest to ``uv`` (`quasiharmonic.gradients.gauge`), wherever `flatten` would lay it: use it for what
-        does not depend on where the map lies. With one held the map may turn about it, and the same is so.
+        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``. With no vertex held it is that
+        which lies nearest to ``uv`` (`quasiharmonic.gradients.gauge`), wherever `flatten` would lay it: use it for
+        what does not depend on where the map lies. With one held the map may turn about it, and the same is so.
 
     Raises
     ------

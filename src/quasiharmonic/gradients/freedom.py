@@ -1,6 +1,6 @@
 """Where the vertices of a map may go: anywhere, nowhere, along a line that fixes the gauge, or along curves.
 
-Unknowns are those of `SlidingSystem`: both coordinates of a free vertex, and of one that slides the way along its tangent.
+Unknowns are those of `SlidingSystem`: both coordinates of a free vertex, the way along its tangent of one that slides.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class Gauge:
         return out
 
     def pulled(self, pull: ComplexArray) -> tuple[ComplexArray, complex, float]:
-        """The transpose of `fixed`: the gradient (n,) by the displacement, by that of the pin besides, and by ``more``."""
+        """The transpose of `fixed`: the gradient (n,) by the displacement, what the pin has, that by ``more``."""
         out = self.projected(pull)
         if not self.keeps_area:
             return out, complex((pull - out).sum()), 0.0

@@ -1,8 +1,8 @@
 """A map brought to rest to rounding, and the second derivative there, factored once.
 
-A polish ends where Newton's model promises less than a ten-thousandth, and its matrices are made positive. Here steps are
-Newton's own, with second derivatives as they are, and the last of them is no longer than rounding makes it; where they
-are not positive definite, as may be on the way, a step is taken with those that the polish would take.
+A polish ends where Newton's model promises less than a ten-thousandth, and its matrices are made positive. Here steps
+are Newton's own, with second derivatives as they are, and the last of them is no longer than rounding makes it. Where
+they are not positive definite, as may be on the way, so much of what is negative on triangles is left out as it takes.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Minimum:
             return freedom.spread(self._lu.solve(on_unknowns.view(np.float64)).view(np.complex128))
 
     def _settle(self, steps: int) -> float:
-        """Take steps until there is none to take; the strain of the one that would be next. Leaves the system factored."""
+        """Take steps until there is none to take, and leave the system factored; the strain of the step not taken."""
         last = np.inf
         for left in range(steps, -1, -1):
             still_at_it()

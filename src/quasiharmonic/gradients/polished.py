@@ -55,9 +55,9 @@ def polish_derivative(
     Notes
     -----
     By implicit differentiation, with the second derivative as it is. An energy of one's own may depend on the rest
-    positions through p and q alone. Where the boundary slides, its curves do not change, nor does the scale of the map;
-    the barrier that keeps edges near curves that are not straight (`quasiharmonic.curves.straying`) has the bounds and the
-    weight that it would have in a polish begun at ``uv``, and is taken as keeping them.
+    positions through p and q alone. Where the boundary slides, its curves do not change, nor does the scale of the
+    map; the barrier that keeps edges near curves that are not straight (`quasiharmonic.curves.straying`) has the bounds
+    and the weight that it would have in a polish begun at ``uv``, and is taken as keeping them.
 
     Examples
     --------

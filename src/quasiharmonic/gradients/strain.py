@@ -41,8 +41,8 @@ class RestStrain(Strain):
     F : (f, 3) int64
         Triangles, none without area.
     signed : bool
-        Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Those in space never are, and those of a planar
-        surface that is seen from its own side (`mesh.shapes`) are not.
+        Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Those in space never are, nor are those of
+        a planar surface that is seen from its own side (`mesh.shapes`).
 
     Attributes
     ----------
@@ -60,28 +60,28 @@ class RestStrain(Strain):
         self.m: FloatArray = 0.5 * z1 * z2.imag
         self.sides: ComplexArray = np.stack([z1 + 0j, z2 - z1, -z2])
         self.half: ComplexArray = 0.25j * self.sides[(1, 2, 0), :] / self.m
-        e1, e2 = (V[F[:, k]] - V[F[:, 0]] for k in (1, 2))
-        self._along = e1 / z1[:, None]
-        self._across = (e2 - z2.real[:, None] * self._along) / z2.imag[:, None]
+        # In the triangle's plane, as (d, f): along the first side and across it.
+        coordinates = np.ascontiguousarray(V.T)
+        start, one, two = (coordinates[:, at] for at in self._corners)
+        self._along = (one - start) / z1
+        self._across = (two - start - z2.real * self._along) / z2.imag
 
     def of(self, dV: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         a, b = np.zeros((2, self.m.size), dtype=np.complex128)
+        coordinates = np.ascontiguousarray(dV.T)
         for at, g in zip(self._corners, self.half, strict=True):
-            moved = dV[at]
-            dz = np.sum(moved * self._along, axis=1) + 1j * np.sum(moved * self._across, axis=1)
+            moved = coordinates[:, at]
+            dz = np.sum(moved * self._along, axis=0) + 1j * np.sum(moved * self._across, axis=0)
             a += g.conj() * dz
             b += g * dz
         return a - 1j * (a + b).imag, b
 
     def pull(self, by_a: ComplexArray, by_b: ComplexArray) -> FloatArray:
-        by_b = by_b - 1j * by_a.imag
-        out = np.zeros(self._shape)
-        for at, g in zip(self._corners, self.half, strict=True):
-            force = by_a.real * g + by_b * g.conj()
-            by_corner = force.real[:, None] * self._along + force.imag[:, None] * self._across
-            for axis in range(self._shape[1]):
-                out[:, axis] += np.bincount(at, by_corner[:, axis], minlength=self._shape[0])
-        return out
+        force: ComplexArray = by_a.real * self.half + (by_b - 1j * by_a.imag) * self.half.conj()
+        at, n = self._corners.ravel(), self._shape[0]
+        columns = zip(self._along, self._across, strict=True)
+        by_axis = (force.real * along + force.imag * across for along, across in columns)
+        return np.stack([np.bincount(at, column.ravel(), minlength=n) for column in by_axis], axis=1)
 
 
 class CorrectedStrain(Strain):
