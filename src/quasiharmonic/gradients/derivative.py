@@ -262,7 +262,7 @@ class Derivative:
             by_places += on_scale * self._scale.by_places
         if self._gauge is not None and self._gauge.pin is not None:
             by_places[self._gauge.pin] += on_pin
-        by_held: ComplexArray = np.where(self._follows, by_places[self._fixed], 0) / self._unit
+        by_held: ComplexArray = np.where(self._follows, by_places[self._fixed], 0j) / self._unit
         return as_rows(by_held)
 
     def _by_rest(self, response: ComplexArray, on_scale: float) -> FloatArray:

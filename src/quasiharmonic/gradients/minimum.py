@@ -89,7 +89,7 @@ class Minimum:
             gradient = self._at()
             step, self._exact = self._direction(gradient)
             size = self._strain(step)
-            if self._exact and (size <= _NOTHING or (size <= _SHORT and size > 0.5 * last)):
+            if size <= _NOTHING or (self._exact and size <= _SHORT and size > 0.5 * last):
                 return size
             if not left or not self._moved(step):
                 return size
