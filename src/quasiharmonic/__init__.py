@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from quasiharmonic.flattening.distance_descent import keep_distances
     from quasiharmonic.flattening.flattened import flatten
     from quasiharmonic.flattening.patterns import write_pattern
+    from quasiharmonic.gradients.derivative import Derivative
+    from quasiharmonic.gradients.flattened import flatten_derivative
+    from quasiharmonic.gradients.polished import polish_derivative
+    from quasiharmonic.gradients.tensors import quasi_harmonic_derivative
     from quasiharmonic.mesh.refinement import Refined, refine
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
@@ -43,6 +47,7 @@ __version__ = "0.1.0"
 _HOME = {
     "AirMesh": "apply.airmesh",
     "Certificate": "exact.certificate",
+    "Derivative": "gradients.derivative",
     "Descent": "descent",
     "Diagnosis": "exact.diagnosis",
     "Distortion": "energy.measures",
@@ -71,6 +76,7 @@ _HOME = {
     "distortion": "energy.measures",
     "find_cuts": "cuts.finding",
     "flatten": "flattening.flattened",
+    "flatten_derivative": "gradients.flattened",
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
     "injective_map": "search.solving",
@@ -78,6 +84,8 @@ _HOME = {
     "keep_distances": "flattening.distance_descent",
     "morph": "apply.morphing",
     "polish": "energy.polishing",
+    "polish_derivative": "gradients.polished",
+    "quasi_harmonic_derivative": "gradients.tensors",
     "quasi_harmonic_map": "search.solving",
     "refine": "mesh.refinement",
     "refine_problem": "apply.refining",
@@ -91,6 +99,7 @@ _HOME = {
 __all__ = [
     "AirMesh",
     "Certificate",
+    "Derivative",
     "Descent",
     "Diagnosis",
     "Distortion",
@@ -119,6 +128,7 @@ __all__ = [
     "distortion",
     "find_cuts",
     "flatten",
+    "flatten_derivative",
     "flipped_triangles",
     "harmonise",
     "injective_map",
@@ -126,6 +136,8 @@ __all__ = [
     "keep_distances",
     "morph",
     "polish",
+    "polish_derivative",
+    "quasi_harmonic_derivative",
     "quasi_harmonic_map",
     "refine",
     "refine_problem",

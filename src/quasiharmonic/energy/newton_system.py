@@ -121,6 +121,11 @@ class NewtonSystem:
             self._values[slot] += part
         self._diagonal = self._values[self._first]
 
+    @property
+    def diagonal(self) -> FloatArray:
+        """The assembled matrix's, (2 (n - k),) float64."""
+        return self._diagonal
+
     def matrix(self) -> csr_array:
         """The assembled matrix, both of its triangles; for study and tests."""
         size = self._first.size

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, named
 
 # Stands in for a divisor of zero, where the dividend vanishes too, so that the quotient is not NaN.
 _TINY = 1e-300
@@ -177,6 +178,23 @@ class TensorField:
         out: ComplexArray = self.ratio * grad
         out += radial * self.xi
         return out
+
+
+def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
+    """What a caller hands over as Beltrami coefficients of ``f`` tensors, checked; zeros where nothing is.
+
+    Raises
+    ------
+    ValueError
+        When it has another shape, holds no numbers, or is not below 1 in modulus; names the first triangles.
+    """
+    coefficients = np.zeros(f) if mu is None else np.asarray(mu)
+    if coefficients.shape != (f,) or coefficients.dtype.kind not in "iufc":
+        raise ValueError(f"mu must hold {f} numbers, one a triangle, not an array of {coefficients.shape}")
+    bad = np.flatnonzero(~(np.abs(coefficients) < 1))
+    if bad.size:
+        raise ValueError(f"mu is not below 1 in modulus at {named('triangle', 'triangles', bad)}")
+    return coefficients.astype(np.complex128)
 
 
 def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:

@@ -12,17 +12,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, check_callback, check_choice, map_array, named, whole_number
+from quasiharmonic.arrays import ComplexArray, FloatArray, check_callback, check_choice, map_array, whole_number
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
 from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.tensor import TANH
+from quasiharmonic.field.tensor import TANH, beltrami_coefficients
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
@@ -228,15 +227,10 @@ def quasi_harmonic_map(
         When rounding leaves no positive definite Laplacian.
     """
     check_choice("reference", reference, get_args(Reference))
-    coefficients = np.zeros(len(problem.F)) if mu is None else np.asarray(mu)
-    if coefficients.shape != (len(problem.F),) or coefficients.dtype.kind not in "iufc":
-        raise ValueError(f"mu must hold {len(problem.F)} numbers, one a triangle, not an array of {coefficients.shape}")
-    bad = np.flatnonzero(~(np.abs(coefficients) < 1))
-    if bad.size:
-        raise ValueError(f"mu is not below 1 in modulus at {named('triangle', 'triangles', bad)}")
+    coefficients = beltrami_coefficients(mu, len(problem.F))
     with problem.exclusive() as own:
         objective = Objective(own, reference=reference, linear_solver=linear_solver)
-        return own.positions(objective.evaluate(TANH.invert(coefficients.astype(np.complex128))).w)
+        return own.positions(objective.evaluate(TANH.invert(coefficients)).w)
 
 
 def _first_map(problem: Problem, start: ArrayLike) -> ComplexArray:

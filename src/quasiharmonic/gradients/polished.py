@@ -1,0 +1,146 @@
+"""The derivative of maps that have been polished: boundary held, or sliding along curves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, map_array, named
+from quasiharmonic.curves.rails import Rails, Track
+from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
+from quasiharmonic.energy.energies import Energy
+from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.energy.polishing import energy_named
+from quasiharmonic.energy.sliding import lay_boundary
+from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.gradients.derivative import Derivative, Scale, as_rows
+from quasiharmonic.gradients.freedom import Freedom, OnCurves
+from quasiharmonic.gradients.gauge import log_size
+from quasiharmonic.gradients.minimum import Minimum
+from quasiharmonic.gradients.strain import RestStrain
+from quasiharmonic.problem import Domain
+
+
+def polish_derivative(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    fixed: ArrayLike,
+    energy: str | Energy = "symmetric-dirichlet",
+    weights: ArrayLike | None = None,
+    linear_solver: str = "auto",
+    slide: bool | Rails = False,
+) -> Derivative:
+    """Bring a polished map to rest to rounding, and differentiate it by held places and rest positions.
+
+    Parameters
+    ----------
+    V, F, fixed, energy, weights, linear_solver, slide
+        As `quasiharmonic.polish` had them.
+    uv : (n, 2) array
+        The polished map.
+
+    Returns
+    -------
+    Derivative
+        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``.
+
+    Raises
+    ------
+    ValueError
+        As `quasiharmonic.polish`, and as there when ``uv`` is not injective: of a map that was not found there is no
+        derivative.
+
+    Notes
+    -----
+    By implicit differentiation, with the second derivative as it is. An energy of one's own may depend on the rest
+    positions through p and q alone. Where the boundary slides, its curves do not change, nor does the scale of the
+    map; the barrier that keeps edges near curves that are not straight (`quasiharmonic.curves.straying`) has the bounds
+    and the weight that it would have in a polish begun at ``uv``, and is taken as keeping them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import polish
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(6)
+    >>> rim = np.arange(len(V) - 36, len(V))
+    >>> derivative = polish_derivative(V, F, polish(V, F, V, fixed=rim).uv, fixed=rim)
+    >>> gradients = derivative.vjp(derivative.uv)  # of half the sum of the squares of all places
+    >>> gradients.target.shape, gradients.rest.shape, derivative.reliable
+    ((36, 2), (127, 2), True)
+    """
+    domain = Domain(V, F, fixed)
+    domain.check_boundary_fixed()
+    chosen = energy_named(energy)
+    start = injective_array(uv, domain)
+    track = lay_boundary(slide, domain, start) if slide is not False else None
+    if track is not None:
+        start = track.uv
+    exponent = int(np.frexp(np.abs(start).max())[1])
+    w = in_units(start, exponent)
+    measure = DeformationEnergy(
+        domain.V,
+        domain.F,
+        chosen,
+        area=float(signed_areas(domain.F, w).sum()),
+        weights=None if weights is None else positive_weights(weights, len(domain.F)),
+    )
+    strain = surface_strain(domain)
+    by_rest = log_surface(strain)
+    if track is None:
+        freedom = Freedom(measure, domain.n, domain.fixed, linear_solver)
+        scale = Scale(-log_size(w, domain.loops), by_rest)
+    else:
+        freedom = OnCurves(measure, track, domain.fixed, domain.loops, exponent, linear_solver)
+        scale = Scale(np.zeros_like(w), by_rest)
+    minimum = Minimum(measure, w, freedom)
+    return Derivative(
+        placed(minimum.w, exponent, np.setdiff1d(domain.fixed, freedom.sliding), start),
+        fixed=domain.fixed,
+        forces=minimum.forces,
+        inverse=minimum,
+        strain=lambda: strain,
+        rest_shape=domain.V.shape,
+        doubts=minimum.doubts,
+        unit=2.0**exponent,
+        on_curves=None if track is None else on_track(track),
+        scale=scale,
+    )
+
+
+def injective_array(uv: ArrayLike, domain: Domain) -> FloatArray:
+    """A map as float64, checked."""
+    array = map_array("uv", uv, domain.n)
+    flipped = flipped_triangles(domain.F, array)
+    if flipped.size:
+        raise ValueError(
+            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; there is no "
+            "derivative of a map that was not found"
+        )
+    return array
+
+
+def surface_strain(domain: Domain) -> RestStrain:
+    """How triangles change with the rest positions, seen from the side on which they are counterclockwise."""
+    domain.check_areas()
+    return RestStrain(domain.V, domain.F, signed=False)
+
+
+def log_surface(strain: RestStrain) -> FloatArray:
+    """The derivative (n, d) of half the logarithm of a surface's area by the rest positions."""
+    share = (strain.m / strain.m.sum()).astype(np.complex128)
+    return strain.pull(share, np.zeros_like(share))
+
+
+def on_track(track: Track) -> IntArray:
+    """Vertices that are where their curves say: those that slide, and those at corners."""
+    return np.concatenate([chain.vertices for chain in track.chains])
+
+
+def placed(w: ComplexArray, exponent: int, held: IntArray, given: FloatArray) -> FloatArray:
+    """A map out of its units, what is held where it was given to the last bit."""
+    uv: FloatArray = np.ldexp(as_rows(w), exponent)
+    uv[held] = given[held]
+    return uv

@@ -1,0 +1,105 @@
+"""Maps as functions of JAX: its own check of gradients, jit, vmap, batches, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from shared.differentiated import flattened_ring, held_ring, tensors
+
+jax = pytest.importorskip("jax")
+layers = pytest.importorskip("quasiharmonic.jax")
+
+
+@pytest.fixture(autouse=True)
+def double():
+    """In double precision, as the maps are."""
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+def check(function, *arguments):
+    from jax.test_util import check_grads
+
+    check_grads(function, arguments, order=1, modes=["rev"], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("reference", ["equilateral", "rest", "corrected"])
+@pytest.mark.parametrize("wrapped", [lambda f: f, jax.jit], ids=["as it is", "jit"])
+def test_quasi_harmonic_maps(wrapped, reference):
+    problem = held_ring(curved=True)
+
+    def maps(mu, target, rest):
+        return layers.quasi_harmonic_map(problem, mu, target=target, rest=rest, reference=reference)
+
+    check(wrapped(maps), tensors(len(problem.F)), np.stack([problem.target, 1.1 * problem.target]), problem.V)
+
+
+def test_injective_maps():
+    problem = held_ring(curved=True)
+    maps = jax.jit(lambda target, rest: layers.injective_map(problem, target=target, rest=rest))
+    check(maps, problem.target, problem.V)
+
+
+@pytest.mark.parametrize("pins", [(), (3, 20, 31)], ids=["free", "three pins"])
+def test_flat_maps(pins):
+    V, F, fixed, places, _ = flattened_ring(pins)
+    if len(pins):
+        check(lambda rest, target: layers.flatten(rest, F, fixed=fixed, target=target), V, places)
+        return
+
+    def shape(rest):
+        # What does not depend on where the map lies.
+        uv = layers.flatten(rest, F)
+        return jax.numpy.sum((uv[..., F, :] - uv[..., np.roll(F, 1, axis=1), :]) ** 2, axis=-1)
+
+    check(shape, np.stack([V, 1.2 * V]))
+
+
+def test_vmap_is_a_batch():
+    problem = held_ring()
+    targets = np.stack([problem.target, 1.1 * problem.target, 0.9 * problem.target])
+    mu = tensors(len(problem.F))
+
+    def loss(mu, target):
+        return (layers.quasi_harmonic_map(problem, mu, target=target) ** 3).sum()
+
+    by_vmap = jax.jit(jax.vmap(jax.grad(loss, argnums=(0, 1)), in_axes=(None, 0)))(mu, targets)
+    together = jax.grad(loss, argnums=(0, 1))(mu, targets)
+    assert np.allclose(by_vmap[0].sum(axis=0), together[0])
+    assert np.allclose(by_vmap[1], together[1])
+    one = jax.grad(loss, argnums=1)(mu, targets[1])
+    assert np.allclose(one, together[1][1])
+
+
+def test_more_maps_than_derivatives_are_kept():
+    problem = held_ring()
+    targets = np.stack([(1 + 0.01 * k) * problem.target for k in range(20)])
+    gradient = jax.grad(lambda target: (layers.injective_map(problem, target=target) ** 2).sum())(targets)
+    first = jax.grad(lambda target: (layers.injective_map(problem, target=target) ** 2).sum())(targets[0])
+    assert np.allclose(gradient[0], first, rtol=1e-8)
+
+
+def test_what_is_refused():
+    problem = held_ring()
+    with pytest.raises(TypeError, match="target must be an array, not list"):
+        layers.injective_map(problem, target=[1.0])
+    with pytest.raises(TypeError, match=r"target must be of float64, not float32: target.astype\('float64'\)"):
+        layers.injective_map(problem, target=problem.target.astype(np.float32))
+    with pytest.raises(TypeError, match="mu must be of complex128"):
+        layers.quasi_harmonic_map(problem, np.zeros(len(problem.F)))
+    with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or that with a batch in front, not \(3"):
+        layers.injective_map(problem, target=problem.target[:3])
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(lambda target: layers.injective_map(problem, target=target), (problem.target,), (problem.target,))
+    jax.config.update("jax_enable_x64", False)
+    with pytest.raises(TypeError, match=r"jax.config.update\('jax_enable_x64', True\)"):
+        layers.injective_map(problem, target=problem.target)
+
+
+def test_a_map_that_is_not_found_says_which():
+    problem = held_ring()
+    mirrored = np.stack([problem.target, problem.target * [1, -1]])
+    with pytest.raises(Exception, match="no injective map was found") as caught:
+        layers.injective_map(problem, target=mirrored).block_until_ready()
+    assert "MapNotFound" in str(caught.value) + type(caught.value).__name__

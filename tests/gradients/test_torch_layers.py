@@ -1,0 +1,147 @@
+"""Maps as functions of PyTorch: gradcheck, batches, compilation, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from shared.differentiated import flattened_ring, held_ring, tensors
+
+from quasiharmonic import injective_map, polish_derivative
+from quasiharmonic.gradients import Doubt
+
+torch = pytest.importorskip("torch")
+layers = pytest.importorskip("quasiharmonic.torch")
+
+# PyTorch's own, about its own.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+
+
+def leaf(values):
+    return torch.tensor(values, requires_grad=True)
+
+
+def check(function, *arguments):
+    assert torch.autograd.gradcheck(
+        function, tuple(map(leaf, arguments)), fast_mode=True, check_forward_ad=True, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("reference", ["equilateral", "rest", "corrected"])
+def test_quasi_harmonic_maps(reference):
+    problem = held_ring(curved=True)
+    check(
+        lambda mu, target, rest: layers.quasi_harmonic_map(problem, mu, target=target, rest=rest, reference=reference),
+        tensors(len(problem.F)),
+        np.stack([problem.target, 1.1 * problem.target]),
+        problem.V,
+    )
+
+
+def test_injective_maps():
+    problem = held_ring(curved=True)
+    check(lambda target, rest: layers.injective_map(problem, target=target, rest=rest), problem.target, problem.V)
+
+
+@pytest.mark.parametrize("pins", [(), (3, 20, 31)], ids=["free", "three pins"])
+def test_flat_maps(pins):
+    V, F, fixed, places, _ = flattened_ring(pins)
+    if len(pins):
+        check(lambda rest, target: layers.flatten(rest, F, fixed=fixed, target=target), V, places)
+        return
+
+    def shape(rest):
+        # What does not depend on where the map lies.
+        uv = layers.flatten(rest, F)
+        return torch.linalg.vector_norm(uv[..., F, :] - uv[..., np.roll(F, 1, axis=1), :], dim=-1)
+
+    check(shape, np.stack([V, 1.2 * V]))
+
+
+def test_batches_go_together():
+    problem = held_ring()
+    targets = leaf(np.stack([[problem.target, 1.1 * problem.target], [1.2 * problem.target, 0.9 * problem.target]]))
+    mu = leaf(np.stack([tensors(len(problem.F)), tensors(len(problem.F)).conj()]))
+    maps = layers.quasi_harmonic_map(problem, mu, target=targets)
+    assert maps.shape == (2, 2, problem.n, 2)
+    (maps**3).sum().backward()
+    mine = leaf(targets.detach()[1, 0].numpy()), leaf(mu.detach()[0].numpy())
+    one = layers.quasi_harmonic_map(problem, mine[1], target=mine[0])
+    (one**3).sum().backward()
+    assert torch.equal(one, maps[1, 0])
+    assert torch.allclose(targets.grad[1, 0], mine[0].grad)
+    # Gradients by what all of a batch have in common are sums.
+    other = leaf(mu.detach()[0].numpy())
+    (layers.quasi_harmonic_map(problem, other, target=targets.detach()[:, 0]) ** 3).sum().backward()
+    assert torch.allclose(mu.grad[0], other.grad)
+
+
+def test_the_map_is_the_library_s_brought_to_rest():
+    problem = held_ring()
+    maps = layers.injective_map(problem, target=leaf(problem.target))
+    found = injective_map(problem.V, problem.F, problem.fixed, problem.target, polish="symmetric-dirichlet")
+    derivative = polish_derivative(problem.V, problem.F, found.uv, fixed=problem.fixed)
+    assert np.array_equal(maps.detach().numpy(), derivative.uv)
+
+
+def test_compiled_programs_break_around_it():
+    problem = held_ring()
+    target = torch.tensor(problem.target)
+
+    def loss(scale):
+        return (layers.quasi_harmonic_map(problem, target=scale * target) ** 2).sum()
+
+    scale = leaf(1.5)
+    torch.compile(loss, backend="eager")(scale).backward()
+    other = leaf(1.5)
+    loss(other).backward()
+    assert torch.equal(scale.grad, other.grad)
+    with pytest.raises(Exception, match="maps are made by NumPy and SciPy"):
+        torch.compile(loss, backend="eager", fullgraph=True)(scale)
+
+
+def test_a_second_derivative_is_refused():
+    problem = held_ring()
+    target = leaf(problem.target)
+    maps = layers.quasi_harmonic_map(problem, target=target)
+    (first,) = torch.autograd.grad((maps**2).sum(), target, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
+def test_what_is_refused():
+    problem = held_ring()
+    target = leaf(problem.target)
+    with pytest.raises(TypeError, match=r"target must be a tensor, not ndarray"):
+        layers.quasi_harmonic_map(problem, target=problem.target)
+    with pytest.raises(TypeError, match=r"target must be of torch.float64, not torch.float32: target.to\("):
+        layers.injective_map(problem, target=target.float())
+    with pytest.raises(TypeError, match=r"mu must be of torch.complex128, not torch.float64"):
+        layers.quasi_harmonic_map(problem, torch.zeros(len(problem.F), dtype=torch.float64))
+    with pytest.raises(ValueError, match="target is on meta, and maps are made on the CPU"):
+        layers.injective_map(problem, target=target.to("meta"))
+    with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or that with a batch in front, not \(3"):
+        layers.injective_map(problem, target=target[:3])
+    with pytest.raises(ValueError, match="fixed and target belong together"):
+        layers.flatten(leaf(problem.V), problem.F, target=target)
+    with pytest.raises(NotImplementedError, match="leave torch.func.vmap out"):
+        torch.func.vmap(lambda target: layers.quasi_harmonic_map(problem, target=target))(target[None])
+    with pytest.raises(NotImplementedError, match="not by torch.func"):
+        torch.func.grad(lambda target: layers.quasi_harmonic_map(problem, target=target).sum())(target)
+
+
+def test_a_map_that_is_not_found_says_which():
+    problem = held_ring()
+    mirrored = np.stack([problem.target, problem.target * [1, -1]])
+    with pytest.raises(layers.MapNotFound, match="no injective map was found") as caught:
+        layers.injective_map(problem, target=leaf(mirrored))
+    assert caught.value.__notes__ == ["This is item 1 of the batch."]
+    assert not caught.value.result.injective
+
+
+def test_a_doubtful_gradient_warns():
+    problem = held_ring()
+    mu = tensors(len(problem.F))
+    mu[0] = 1 - 1e-10
+    maps = layers.quasi_harmonic_map(problem, leaf(mu))
+    with pytest.warns(layers.DoubtfulDerivative, match=Doubt.CLIPPED.value[:20]):
+        maps.sum().backward()
