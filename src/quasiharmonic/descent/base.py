@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias, get_args
+from typing import Any, ClassVar, Protocol, TypeAlias, get_args
 
 import numpy as np
 
@@ -51,6 +51,9 @@ class Runner(Protocol):
 
     def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
         """Search on a coarse mesh, beginning with what the stage ``begins_with``, and carry the map to the mesh."""
+
+    def take_over(self, begun: Any) -> Status:
+        """Go on from what was found elsewhere by the stage that the search would begin with."""
 
 
 class SearchStage(ABC):

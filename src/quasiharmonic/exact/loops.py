@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.exact.predicates import SegmentRelation, box_pairs, orientation, segment_relation
+from quasiharmonic.exact.predicates import SegmentRelation, box_pairs, box_pairs_within, orientation, segment_relation
 
 SignArray = NDArray[np.int8]
 
@@ -96,22 +96,53 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
     Contacts
         Pairs without a common end that meet, and pairs with one that overlap.
     """
-    tail, head = ends.T
-    p, q = positions[tail], positions[head]
+    p, q = positions[ends[:, 0]], positions[ends[:, 1]]
     found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
     number = 0
     for i, j in box_pairs(np.minimum(p, q), np.maximum(p, q)):
-        relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
-        near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
-        i, j, relation = i[near], j[near], relation[near]
-        joined = (tail[i] == tail[j]) | (tail[i] == head[j]) | (head[i] == tail[j]) | (head[i] == head[j])
-        bad = ~joined | (relation == SegmentRelation.OVERLAPPING)
-        found.append(np.stack([i[bad], j[bad]], axis=1))
-        relations.append(relation[bad])
+        pairs, relation = _unfit(p, q, ends, i, j)
+        found.append(pairs)
+        relations.append(relation)
         number += len(found[-1])
         if number > most:
             break
     return Contacts(np.concatenate(found)[:most], np.concatenate(relations)[:most], number <= most)
+
+
+def _unfit(p: FloatArray, q: FloatArray, ends: IntArray, i: IntArray, j: IntArray) -> tuple[IntArray, SignArray]:
+    """Of pairs of segments ``p``–``q`` those that have more in common than an end (c, 2), and what."""
+    relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
+    near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
+    i, j, relation = i[near], j[near], relation[near]
+    tail, head = ends.T
+    joined = (tail[i] == tail[j]) | (tail[i] == head[j]) | (head[i] == tail[j]) | (head[i] == head[j])
+    bad = ~joined | (relation == SegmentRelation.OVERLAPPING)
+    return np.stack([i[bad], j[bad]], axis=1), relation[bad]
+
+
+def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
+    """Which of many loops are simple, whatever they have in common with the others.
+
+    Parameters
+    ----------
+    loops : list of (l,) int64
+        Vertices, at least three each.
+    uv : (n, 2) float64
+        Places, finite where the loops use them.
+
+    Returns
+    -------
+    (k,) bool
+    """
+    curves = _Curves.of(loops, uv)
+    simple = np.ones(len(loops), dtype=bool)
+    # An edge without length shares all it is with the edges before and after it.
+    simple[curves.owner[(curves.p == curves.q).all(axis=1)]] = False
+    low, high = np.minimum(curves.p, curves.q), np.maximum(curves.p, curves.q)
+    for i, j in box_pairs_within(low, high, curves.start):
+        pairs, _ = _unfit(curves.p, curves.q, curves.ends, i, j)
+        simple[curves.owner[pairs[:, 0]]] = False
+    return simple
 
 
 def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
