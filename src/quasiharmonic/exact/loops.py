@@ -96,28 +96,22 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
     Contacts
         Pairs without a common end that meet, and pairs with one that overlap.
     """
-    p, q = positions[ends[:, 0]], positions[ends[:, 1]]
+    tail, head = ends.T
+    p, q = positions[tail], positions[head]
     found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
     number = 0
     for i, j in box_pairs(np.minimum(p, q), np.maximum(p, q)):
-        pairs, relation = _unfit(p, q, ends, i, j)
-        found.append(pairs)
-        relations.append(relation)
+        relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
+        near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
+        i, j, relation = i[near], j[near], relation[near]
+        joined = (tail[i] == tail[j]) | (tail[i] == head[j]) | (head[i] == tail[j]) | (head[i] == head[j])
+        bad = ~joined | (relation == SegmentRelation.OVERLAPPING)
+        found.append(np.stack([i[bad], j[bad]], axis=1))
+        relations.append(relation[bad])
         number += len(found[-1])
         if number > most:
             break
     return Contacts(np.concatenate(found)[:most], np.concatenate(relations)[:most], number <= most)
-
-
-def _unfit(p: FloatArray, q: FloatArray, ends: IntArray, i: IntArray, j: IntArray) -> tuple[IntArray, SignArray]:
-    """Of pairs of segments ``p``–``q`` those that have more in common than an end (c, 2), and what."""
-    relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
-    near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
-    i, j, relation = i[near], j[near], relation[near]
-    tail, head = ends.T
-    joined = (tail[i] == tail[j]) | (tail[i] == head[j]) | (head[i] == tail[j]) | (head[i] == head[j])
-    bad = ~joined | (relation == SegmentRelation.OVERLAPPING)
-    return np.stack([i[bad], j[bad]], axis=1), relation[bad]
 
 
 def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
@@ -136,12 +130,21 @@ def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
     """
     curves = _Curves.of(loops, uv)
     simple = np.ones(len(loops), dtype=bool)
-    # An edge without length shares all it is with the edges before and after it.
-    simple[curves.owner[(curves.p == curves.q).all(axis=1)]] = False
-    low, high = np.minimum(curves.p, curves.q), np.maximum(curves.p, curves.q)
-    for i, j in box_pairs_within(low, high, curves.start):
-        pairs, _ = _unfit(curves.p, curves.q, curves.ends, i, j)
-        simple[curves.owner[pairs[:, 0]]] = False
+    p, q, following = curves.p, curves.q, curves.following
+    # An edge without length shares all it is with the edges before and after it; others overlap with the next where
+    # the curve turns back.
+    beyond = q[following]
+    back = ((p < q) == (beyond < q)).all(axis=1) & ((p > q) == (beyond > q)).all(axis=1)
+    back[back] = orientation(p[back], q[back], beyond[back]) == 0
+    simple[curves.owner[back | (p == q).all(axis=1)]] = False
+    for i, j in box_pairs_within(np.minimum(p, q), np.maximum(p, q), curves.start):
+        apart = (following[i] != j) & (following[j] != i)
+        i, j = i[apart], j[apart]
+        if i.size:
+            met = segment_relation(p[i], q[i], p[j], q[j]) != SegmentRelation.DISJOINT
+            simple[curves.owner[i[met]]] = False
+        if not simple.any():
+            break
     return simple
 
 
@@ -222,6 +225,8 @@ class _Curves:
     """(k, 2) Places of the first vertices."""
     q: FloatArray
     """(k, 2) Places of the second vertices."""
+    following: IntArray
+    """(k,) The next edge of the same loop."""
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
@@ -231,7 +236,9 @@ class _Curves:
         following = np.arange(1, len(tail) + 1)
         following[start[1:] - 1] = start[:-1]
         head = tail[following]
-        return cls(start, np.repeat(np.arange(len(loops)), length), np.stack([tail, head], 1), uv[tail], uv[head])
+        return cls(
+            start, np.repeat(np.arange(len(loops)), length), np.stack([tail, head], 1), uv[tail], uv[head], following
+        )
 
 
 def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
@@ -256,9 +263,7 @@ def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[R
 
 def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
     """Pairs of edges (m, 2) that share more than the vertex they have in common, if any; sorted."""
-    following = np.arange(1, len(curves.ends) + 1)
-    following[curves.start[1:] - 1] = curves.start[:-1]
-    consecutive = np.stack([np.arange(len(following)), following], axis=1)
+    consecutive = np.stack([np.arange(len(curves.ends)), curves.following], axis=1)
     # An edge without length shares all it is with the edges before and after it.
     point = (curves.p == curves.q).all(axis=1)
     swallowed = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)

@@ -44,6 +44,8 @@ _UNDERFLOW_BOUND = 2.0**-1060
 _SMALLEST_SCALED = 2.0**-440
 # Triples that stage 2 takes at a time, so that its sixteen components stay in the cache.
 _EXACT_CHUNK = 8192
+# Levels of a tree of boxes that are not gone through one by one.
+_SKIPPED = 5
 # Pairs of boxes that `box_pairs` handles at a time.
 PAIR_CHUNK = 1 << 17
 
@@ -388,9 +390,16 @@ def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArra
 
     Where there are several roots, what is below one meets nothing of what is below the others.
     """
+    # The first few levels have so few boxes that all pairs of theirs are looked at sooner than level after level.
+    depth, roots = len(one) - 1, np.arange(len(one[-1][0]))
+    skipped = min(depth, _SKIPPED)
+    number = np.arange(1 << skipped)
+    i, j = (part.ravel() for part in np.broadcast_arrays(number[:, None], number))
+    if one is other:
+        i, j = i[i <= j], j[i <= j]
+    i, j = ((np.add.outer(roots << skipped, part)).ravel() for part in (i, j))
     # The deepest portion first, so that what waits stays small however many pairs there are.
-    roots = np.arange(len(one[-1][0]))
-    waiting = [(len(one) - 1, roots, roots)]
+    waiting = [(depth - skipped, i, j)]
     while waiting:
         level, i, j = waiting.pop()
         (lo, hi), (other_lo, other_hi) = one[level], other[level]

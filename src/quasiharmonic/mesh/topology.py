@@ -143,12 +143,12 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
         When the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
         not a consistently oriented surface.
     """
-    tails, times = np.unique(boundary[:, 0], return_counts=True)
-    if np.any(times > 1):
-        shared = tails[times > 1]
-        raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', shared)}")
-    unpaired = np.setxor1d(tails, boundary[:, 1])
-    if unpaired.size:
+    tails, heads = np.sort(boundary, axis=0).T
+    shared = tails[1:][tails[1:] == tails[:-1]]
+    if shared.size:
+        raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', np.unique(shared))}")
+    if not np.array_equal(tails, heads):
+        unpaired = np.setxor1d(tails, heads)
         raise ValueError(f"the boundary does not close at {named('vertex', 'vertices', unpaired)}")
     following = dict(zip(boundary[:, 0].tolist(), boundary[:, 1].tolist(), strict=True))
     loops = []
