@@ -1,8 +1,8 @@
 """Exact verdicts on many small maps at once, for less than each would cost alone.
 
 Most maps that are judged are good ones of a surface with one boundary loop. That these are bijective is said by two
-exact tests, of triangles and of pairs of boundary edges, that many maps can share: if all triangles are positive and the
-only loop is simple, there is nothing else to ask (`certify`). What is any different is handed to that, map by map.
+exact tests, of triangles and of pairs of boundary edges, that many maps can share: if all triangles are positive and
+the only loop is simple, there is nothing else to ask (`certify`). What is any different is handed to that, map by map.
 """
 
 from __future__ import annotations
