@@ -124,7 +124,8 @@ class Plate:
 
     def elastic(self, shape: Array) -> Array:
         """The mesh moved by linear elasticity (Poisson's ratio 0.3) from where it began."""
-        from skfem import Basis, ElementTriP1, ElementVector, condense, solve as solve_linear
+        from skfem import Basis, ElementTriP1, ElementVector, condense
+        from skfem import solve as solve_linear
         from skfem.models.elasticity import lame_parameters, linear_elasticity
 
         basis = Basis(_mesh(self.V, self.F), ElementVector(ElementTriP1()))

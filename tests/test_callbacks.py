@@ -11,6 +11,7 @@ from quasiharmonic import (
     flatten,
     harmonise,
     injective_map,
+    injective_maps,
     keep_distances,
     morph,
     polish,
@@ -29,6 +30,7 @@ FLIPPED = V * np.where(np.arange(len(V)) == 1, -1.0, 1.0)[:, None]
 
 TAKERS = {
     "injective_map": lambda callback: injective_map(V, F, LOOP, PLACES, callback=callback),
+    "injective_maps": lambda callback: injective_maps([(V, F, LOOP, PLACES)], callback=callback),
     "solve": lambda callback: solve(Problem(V, F, LOOP, PLACES), callback=callback),
     "polish": lambda callback: polish(V, F, V, fixed=LOOP, callback=callback),
     "harmonise": lambda callback: harmonise(V, F, V, fixed=LOOP, callback=callback),

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from quasiharmonic.exact.predicates import (
     SegmentRelation,
     box_pairs,
     box_pairs_between,
+    box_pairs_within,
     orientation,
     orientation_or_nonfinite,
     segment_relation,
@@ -148,6 +151,20 @@ def test_segments_that_miss_each_other_by_a_rounding():
     away = np.array([[0.0, 5.0]])
     assert segment_relation(p, q, r, away)[0] == exact_relation(p[0], q[0], r[0], away[0]) != SegmentRelation.TOUCHING
     assert segment_relation(p, q, q / 2, away)[0] == SegmentRelation.TOUCHING
+
+
+def test_box_pairs_within_groups(rng):
+    starts = np.array([0, 5, 5, 6, 30, 63])
+    lo = rng.random((63, 2))
+    hi = lo + rng.random((63, 2)) * 0.3
+    found = {pair for i, j in box_pairs_within(lo, hi, starts) for pair in zip(i.tolist(), j.tolist(), strict=True)}
+    meeting = set()
+    for first, last in itertools.pairwise(starts.tolist()):
+        for i, j in itertools.combinations(range(first, last), 2):
+            if (lo[i] <= hi[j]).all() and (lo[j] <= hi[i]).all():
+                meeting.add((i, j))
+    assert found == meeting
+    assert len(meeting) > 20
 
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])

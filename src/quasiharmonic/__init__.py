@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
     from quasiharmonic.search.harmonising import harmonise
+    from quasiharmonic.search.many import injective_maps
     from quasiharmonic.search.solving import injective_map, quasi_harmonic_map, solve
 
 __version__ = "0.1.0"
@@ -80,6 +81,7 @@ _HOME = {
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
     "injective_map": "search.solving",
+    "injective_maps": "search.many",
     "is_injective": "exact.certificate",
     "keep_distances": "flattening.distance_descent",
     "morph": "apply.morphing",
@@ -132,6 +134,7 @@ __all__ = [
     "flipped_triangles",
     "harmonise",
     "injective_map",
+    "injective_maps",
     "is_injective",
     "keep_distances",
     "morph",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from shared.differentiated import flattened_ring, held_ring, tensors
 
 jax = pytest.importorskip("jax")

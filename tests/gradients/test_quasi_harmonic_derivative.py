@@ -6,10 +6,10 @@ import threading
 
 import numpy as np
 import pytest
-from shared.differentiated import held_ring, tensors, worst_difference
 
 from quasiharmonic import Problem, quasi_harmonic_derivative, quasi_harmonic_map
 from quasiharmonic.gradients import Doubt
+from shared.differentiated import held_ring, tensors, worst_difference
 
 
 @pytest.mark.parametrize("curved", [False, True], ids=["flat", "curved"])

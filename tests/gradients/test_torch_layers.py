@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from shared.differentiated import flattened_ring, held_ring, tensors
 
 from quasiharmonic import injective_map, polish_derivative
 from quasiharmonic.gradients import Doubt
+from shared.differentiated import flattened_ring, held_ring, tensors
 
 torch = pytest.importorskip("torch")
 layers = pytest.importorskip("quasiharmonic.torch")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias, get_args
+from typing import Any, ClassVar, Protocol, TypeAlias, get_args
 
 import numpy as np
 
@@ -54,6 +54,9 @@ class Runner(Protocol):
 
     def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
         """Descend on the mesh itself; where that finds no map, later stages go on from where this one began."""
+
+    def take_over(self, begun: Any) -> Status:
+        """Go on from what was found elsewhere by the stage that the search would begin with."""
 
 
 class SearchStage(ABC):

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.descent.base import FunctionalDescent, Iterates
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.reference import blocks
@@ -68,26 +69,60 @@ class VectorAdam(FunctionalDescent):
     def _steps(self) -> Sequence[tuple[int, float]]:
         return self.schedule or (TANH_STEPS if self.parameterisation == "tanh" else SI_LOG_STEPS)
 
+    def pace(self, triangles: int) -> Pace:
+        """What the method remembers of so many triangles, to be asked for one step after another."""
+        times, lengths = zip(*self._steps, strict=True)
+        return Pace(triangles, self.momenta, times, lengths)
+
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""
-        first, second = self.momenta
-        times, lengths = zip(*self._steps, strict=True)
-        mean = np.zeros_like(start.xi)
-        square = np.zeros(start.xi.shape)
+        pace = self.pace(start.xi.size)
         here = start
-        for k in range(1, self.iterations + 1):
-            gradient, step = here.gradient, np.empty_like(mean)
-            length = float(np.interp(k - 1, times, lengths)) * np.sqrt(1 - second**k) / (1 - first**k)
-            for part in blocks(mean.size):
-                g, average, squares = gradient[part], mean[part], square[part]
-                average *= first
-                average += (1 - first) * g
-                squares *= second
-                squares += (1 - second) * (g.real**2 + g.imag**2)
-                root = np.sqrt(squares)
-                # A triangle whose gradient has never differed from zero stays where it is.
-                root[root == 0] = np.inf
-                np.multiply(average, -length / root, out=step[part])
-            here = objective.step(here, step)
+        for _ in range(self.iterations):
+            here = objective.step(here, pace.step(here.gradient))
             yield here
         return False
+
+
+class Pace:
+    """The mean gradient and the mean square of it, triangle by triangle, and the steps that follow from them.
+
+    No triangle knows of another, so the triangles may be of one mesh or of many.
+
+    Parameters
+    ----------
+    triangles : int
+    momenta, times, lengths
+        As `VectorAdam` has them.
+    """
+
+    def __init__(
+        self, triangles: int, momenta: tuple[float, float], times: Sequence[int], lengths: Sequence[float]
+    ) -> None:
+        self._momenta, self._times, self._lengths = momenta, times, lengths
+        self._mean = np.zeros(triangles, dtype=np.complex128)
+        self._square = np.zeros(triangles)
+        self._steps = 0
+
+    def keep(self, triangles: IntArray) -> None:
+        """Forget all but these triangles."""
+        self._mean, self._square = self._mean[triangles], self._square[triangles]
+
+    def step(self, gradient: ComplexArray) -> ComplexArray:
+        """The step in ξ that a gradient calls for, after those before it; (f,) complex128."""
+        first, second = self._momenta
+        length = float(np.interp(self._steps, self._times, self._lengths))
+        self._steps += 1
+        length *= np.sqrt(1 - second**self._steps) / (1 - first**self._steps)
+        step = np.empty_like(self._mean)
+        for part in blocks(step.size):
+            g, average, squares = gradient[part], self._mean[part], self._square[part]
+            average *= first
+            average += (1 - first) * g
+            squares *= second
+            squares += (1 - second) * (g.real**2 + g.imag**2)
+            root = np.sqrt(squares)
+            # A triangle whose gradient has never differed from zero stays where it is.
+            root[root == 0] = np.inf
+            np.multiply(average, -length / root, out=step[part])
+        return step

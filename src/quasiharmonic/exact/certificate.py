@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_range, map_array, named, triangle_rows
-from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed
+from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.mesh.topology import edges, trace_loops
 
@@ -185,7 +185,10 @@ def certify(
     if boundary and len(F):
         known, broken = _loops(F, len(uv)) if loops is None else (list(loops), [])
         reasons += broken
-        if not broken:
+        # If all triangles are positive and the only loop is simple, then it encloses the sum of their areas, so it runs
+        # counterclockwise and winds once around what it encloses, and nothing is left to ask.
+        plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
+        if not broken and not plain:
             overwound = _overwound(F, uv, sign, known)
             if np.isfinite(uv[np.concatenate(known)]).all():
                 crossings, found = judge_loops(known, uv)

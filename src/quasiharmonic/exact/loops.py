@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.exact.predicates import SegmentRelation, box_pairs, orientation, segment_relation
+from quasiharmonic.exact.predicates import SegmentRelation, box_pairs, box_pairs_within, orientation, segment_relation
 
 SignArray = NDArray[np.int8]
 
@@ -114,6 +114,40 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
     return Contacts(np.concatenate(found)[:most], np.concatenate(relations)[:most], number <= most)
 
 
+def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
+    """Which of many loops are simple, whatever they have in common with the others.
+
+    Parameters
+    ----------
+    loops : list of (l,) int64
+        Vertices, at least three each.
+    uv : (n, 2) float64
+        Places, finite where the loops use them.
+
+    Returns
+    -------
+    (k,) bool
+    """
+    curves = _Curves.of(loops, uv)
+    simple = np.ones(len(loops), dtype=bool)
+    p, q, following = curves.p, curves.q, curves.following
+    # An edge without length shares all it is with the edges before and after it; others overlap with the next where
+    # the curve turns back.
+    beyond = q[following]
+    back = ((p < q) == (beyond < q)).all(axis=1) & ((p > q) == (beyond > q)).all(axis=1)
+    back[back] = orientation(p[back], q[back], beyond[back]) == 0
+    simple[curves.owner[back | (p == q).all(axis=1)]] = False
+    for i, j in box_pairs_within(np.minimum(p, q), np.maximum(p, q), curves.start):
+        apart = (following[i] != j) & (following[j] != i)
+        i, j = i[apart], j[apart]
+        if i.size:
+            met = segment_relation(p[i], q[i], p[j], q[j]) != SegmentRelation.DISJOINT
+            simple[curves.owner[i[met]]] = False
+        if not simple.any():
+            break
+    return simple
+
+
 def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
     """Winding number of closed curves around points.
 
@@ -191,6 +225,8 @@ class _Curves:
     """(k, 2) Places of the first vertices."""
     q: FloatArray
     """(k, 2) Places of the second vertices."""
+    following: IntArray
+    """(k,) The next edge of the same loop."""
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
@@ -200,7 +236,9 @@ class _Curves:
         following = np.arange(1, len(tail) + 1)
         following[start[1:] - 1] = start[:-1]
         head = tail[following]
-        return cls(start, np.repeat(np.arange(len(loops)), length), np.stack([tail, head], 1), uv[tail], uv[head])
+        return cls(
+            start, np.repeat(np.arange(len(loops)), length), np.stack([tail, head], 1), uv[tail], uv[head], following
+        )
 
 
 def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
@@ -225,9 +263,7 @@ def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[R
 
 def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
     """Pairs of edges (m, 2) that share more than the vertex they have in common, if any; sorted."""
-    following = np.arange(1, len(curves.ends) + 1)
-    following[curves.start[1:] - 1] = curves.start[:-1]
-    consecutive = np.stack([np.arange(len(following)), following], axis=1)
+    consecutive = np.stack([np.arange(len(curves.ends)), curves.following], axis=1)
     # An edge without length shares all it is with the edges before and after it.
     point = (curves.p == curves.q).all(axis=1)
     swallowed = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)

@@ -44,6 +44,8 @@ _UNDERFLOW_BOUND = 2.0**-1060
 _SMALLEST_SCALED = 2.0**-440
 # Triples that stage 2 takes at a time, so that its sixteen components stay in the cache.
 _EXACT_CHUNK = 8192
+# Levels of a tree of boxes that are not gone through one by one.
+_SKIPPED = 5
 # Pairs of boxes that `box_pairs` handles at a time.
 PAIR_CHUNK = 1 << 17
 
@@ -327,6 +329,34 @@ def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArr
         yield i[i < j], j[i < j]
 
 
+def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of closed boxes that meet and are of the same group; as `box_pairs` of one group after another.
+
+    Parameters
+    ----------
+    lo, hi : (k, 2) float64
+        Corners, group after group.
+    starts : (g + 1,) int64
+        Where each group starts, and the last one ends.
+
+    Yields
+    ------
+    i, j : (m,) int64
+        Indices of boxes that meet, ``i < j``, each pair once.
+    """
+    sizes, groups = np.diff(starts), len(starts) - 1
+    depth = int(max(sizes.max(initial=1) - 1, 0)).bit_length()
+    # Each group has a tree of its own, all of one depth.
+    place = np.arange(len(lo)) + np.repeat((np.arange(groups) << depth) - starts[:-1], sizes)
+    number = np.full(groups << depth, -1)
+    number[place] = np.arange(len(lo))
+    leaves = np.full((2, groups << depth, 2), np.array([np.inf, -np.inf])[:, None, None])
+    leaves[0, place], leaves[1, place] = lo, hi
+    tree = _box_tree(leaves[0], leaves[1], depth)
+    for i, j in _meeting(tree, tree):
+        yield number[i[i < j]], number[j[i < j]]
+
+
 def box_pairs_between(
     lo: FloatArray, hi: FloatArray, other_lo: FloatArray, other_hi: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
@@ -345,9 +375,9 @@ _BoxTree = list[tuple[FloatArray, FloatArray]]
 
 
 def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
-    """Boxes, the boxes around each two of them, and so on up to the one around all."""
+    """Boxes, the boxes around each two of them, and so on up to those around 2^depth: one, or one for each group."""
     # Missing leaves are boxes that nothing meets.
-    padding = ((0, (1 << depth) - len(lo)), (0, 0))
+    padding = ((0, max((1 << depth) - len(lo), 0)), (0, 0))
     tree = [(np.pad(lo, padding, constant_values=np.inf), np.pad(hi, padding, constant_values=-np.inf))]
     for _ in range(depth):
         lo, hi = tree[-1]
@@ -356,9 +386,20 @@ def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
 
 
 def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArray]]:
-    """Leaves of two trees of the same depth that meet; of a tree with itself, those with ``i ≤ j``."""
+    """Leaves of two trees of the same depth that meet; of a tree with itself, those with ``i ≤ j``.
+
+    Where there are several roots, what is below one meets nothing of what is below the others.
+    """
+    # The first few levels have so few boxes that all pairs of theirs are looked at sooner than level after level.
+    depth, roots = len(one) - 1, np.arange(len(one[-1][0]))
+    skipped = min(depth, _SKIPPED)
+    number = np.arange(1 << skipped)
+    i, j = (part.ravel() for part in np.broadcast_arrays(number[:, None], number))
+    if one is other:
+        i, j = i[i <= j], j[i <= j]
+    i, j = ((np.add.outer(roots << skipped, part)).ravel() for part in (i, j))
     # The deepest portion first, so that what waits stays small however many pairs there are.
-    waiting = [(len(one) - 1, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))]
+    waiting = [(depth - skipped, i, j)]
     while waiting:
         level, i, j = waiting.pop()
         (lo, hi), (other_lo, other_hi) = one[level], other[level]

@@ -302,6 +302,12 @@ def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) 
     gradient : (f,) complex128
         ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
     """
+    density, gradient = beltrami_terms(mesh, field, dw)
+    return 2.0 * float(density.sum()), gradient
+
+
+def beltrami_terms(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[FloatArray, ComplexArray]:
+    """As `beltrami_gradient`, with half of the energy of each triangle, (f,) float64, in place of their sum."""
     residual = dw.q - field.mu * dw.p
     weight = mesh.m / field.defect
     density = residual.real**2 + residual.imag**2
@@ -313,7 +319,7 @@ def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) 
     weight /= field.defect
     weight *= -4.0
     gradient *= weight
-    return 2.0 * float(density.sum()), gradient
+    return density, gradient
 
 
 def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatArray, ComplexArray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -23,6 +24,7 @@ class Cholmod(LinearSolver):
     requirement = "pip install scikit-sparse (which needs SuiteSparse and a C compiler)"
 
     @classmethod
+    @cache  # to look for what is not there takes as long as to solve for a hundred unknowns
     def present(cls) -> bool:
         """Whether the package scikit-sparse is installed."""
         return find_spec("sksparse") is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -22,6 +23,7 @@ class Qdldl(LinearSolver):
     takes_order = False
 
     @classmethod
+    @cache
     def present(cls) -> bool:
         """Whether the package qdldl is installed."""
         return find_spec("qdldl") is not None

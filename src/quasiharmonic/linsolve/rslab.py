@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import cache
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -45,6 +46,7 @@ class Rslab(LinearSolver):
     takes_order = False
 
     @classmethod
+    @cache
     def present(cls) -> bool:
         """Whether the package rslab is installed."""
         return find_spec("rslab") is not None

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, IntArray
-from quasiharmonic.mesh.topology import edge_keys
+from quasiharmonic.mesh.topology import edge_keys, linked
 
 
 def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
@@ -27,9 +26,6 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     component : (f,) int64
         The component of each triangle; both are numbered by first appearance.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     corner = np.arange(F.size).reshape(-1, 3)
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     ahead = corner[:, (1, 2, 0)].ravel()
@@ -43,12 +39,11 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
         opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
     one, other = one[opposed], other[opposed]
     # The half-edge of a corner begins there: a joined pair identifies begin with end and end with begin.
-    joined = np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other])
-    ones = np.ones(joined[0].size, dtype=np.int8)
-    split = connected_components(coo_array((ones, joined), shape=(F.size, F.size)), directed=False)[1]
-    pairs = one // 3, other // 3
-    component = connected_components(coo_array((ones[: one.size], pairs), shape=(len(F), len(F))), directed=False)[1]
-    return _by_appearance(split).reshape(-1, 3), _by_appearance(component)
+    split = linked(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
+    component = linked(one // 3, other // 3, len(F))
+    # What is called by its smallest element is in the order of appearance.
+    split, component = (np.unique(label, return_inverse=True)[1] for label in (split, component))
+    return split.reshape(-1, 3), component.ravel()
 
 
 def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
@@ -101,11 +96,3 @@ def numbered(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArray]:
     own[kept] = vertex[kept]
     own[copies] = np.arange(n, n + copies.size)
     return own[split], np.concatenate([np.arange(n), vertex[copies]])
-
-
-def _by_appearance(label: NDArray[np.integer]) -> IntArray:
-    """Labels numbered in the order in which they appear."""
-    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
-    rank = np.empty(first.size, dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(first.size)
-    return rank[inverse.ravel()]

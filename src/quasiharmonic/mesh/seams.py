@@ -128,7 +128,7 @@ class SeamedMesh:
         """Triangles that have a place, ascending; (g,) int64."""
         return np.flatnonzero((self.FT >= 0).all(axis=1))
 
-    @property
+    @cached_property
     def seamless(self) -> bool:
         """Whether every triangle and no vertex has more than one place."""
         return len(self.mapped) == len(self.F) and len(np.unique(self._welded)) == len(np.unique(self.F))

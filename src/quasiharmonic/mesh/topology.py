@@ -143,12 +143,12 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
         When the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
         not a consistently oriented surface.
     """
-    tails, times = np.unique(boundary[:, 0], return_counts=True)
-    if np.any(times > 1):
-        shared = tails[times > 1]
-        raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', shared)}")
-    unpaired = np.setxor1d(tails, boundary[:, 1])
-    if unpaired.size:
+    tails, heads = np.sort(boundary, axis=0).T
+    shared = tails[1:][tails[1:] == tails[:-1]]
+    if shared.size:
+        raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', np.unique(shared))}")
+    if not np.array_equal(tails, heads):
+        unpaired = np.setxor1d(tails, heads)
         raise ValueError(f"the boundary does not close at {named('vertex', 'vertices', unpaired)}")
     following = dict(zip(boundary[:, 0].tolist(), boundary[:, 1].tolist(), strict=True))
     loops = []
@@ -177,12 +177,29 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     (n,) int64
         The smallest vertex of the component. A vertex without triangle is a component of its own.
     """
+    F = np.asarray(F, dtype=np.int64)
+    # Two edges of a triangle connect its three vertices.
+    return linked(F[:, :2].ravel(), F[:, 1:].ravel(), n)
+
+
+def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
+    """Label of the connected component of every node of a graph.
+
+    Parameters
+    ----------
+    tail, head : (e,) int64
+        Nodes ``0 … n - 1`` at the ends of each link.
+    n : int
+        Number of nodes.
+
+    Returns
+    -------
+    (n,) int64
+        The smallest node of the component.
+    """
     # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
     # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
     # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
-    F = np.asarray(F, dtype=np.int64)
-    # Two edges of a triangle connect its three vertices.
-    tail, head = F[:, :2].ravel(), F[:, 1:].ravel()
     label = np.arange(n)
     # Any smaller neighbour will do to begin with, and there is nothing to look up yet.
     label[np.maximum(tail, head)] = np.minimum(tail, head)

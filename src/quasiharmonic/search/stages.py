@@ -15,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Descent, Newton, Patches, Untangling, VectorAdam
-from quasiharmonic.descent.base import Runner, SearchStage, SoFar, Steps
+from quasiharmonic.descent.base import FunctionalDescent, Runner, SearchStage, SoFar, Steps
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.field.objective import Iterate, Objective
@@ -86,6 +86,48 @@ class InPassing(SearchStage):
     def run(self, search: Runner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.attempt_in_passing(self.tried, before)
+
+
+@dataclass(frozen=True, eq=False)
+class Begun(SearchStage):
+    """A stage that has been run elsewhere and has found no map, as a search is to go on from it.
+
+    Attributes
+    ----------
+    descent : FunctionalDescent
+        What was run.
+    history : list of Step
+        Its iterations, the start included.
+    best, best_map, best_xi
+        The map of the fewest inverted triangles, as `Search` compares them, and its tensors.
+    deepest_map, deepest_xi : (n,), (f,) complex128
+        The map of the lowest V₃, and its tensors.
+    stage : Stage
+        What reports say of it.
+    """
+
+    descent: FunctionalDescent
+    history: list[Step]
+    best: tuple[int, float]
+    best_map: ComplexArray
+    best_xi: ComplexArray
+    deepest_map: ComplexArray
+    deepest_xi: ComplexArray
+    stage: Stage
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return self.descent.name
+
+    @property
+    def begins_with(self) -> Descent:
+        """``descent``."""
+        return self.descent
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.take_over(self)
 
 
 #: Whatever a strategy is made of.
@@ -200,6 +242,20 @@ class Search:
         if status is not Status.INJECTIVE:
             self.deepest = deepest
         return status
+
+    def take_over(self, begun: Begun) -> Status:
+        """Go on from a stage that was run elsewhere, as `attempt` does from its own."""
+        objective = begun.descent.objective(self.problem, self._asked)
+        self.linear_solver = objective.laplacian.solver.name
+        for step in begun.history:
+            self._note(step)
+        tensors = objective.parameterisation.field
+        self.best, self.best_map, self.best_field = begun.best, begun.best_map, tensors(begun.best_xi)
+        self.best_reference = objective.mesh.kind
+        self.deepest = Iterate(objective, tensors(begun.deepest_xi), begun.deepest_map)
+        self.stages.append(begun.stage)
+        self._examine()
+        return Status.OUT_OF_ITERATIONS
 
     def _descend_by_any(self, stage: Descent, before: Status) -> Status:
         """Run one stage, by another linear solver where one has failed; how it ended, or else the search so far."""

@@ -1,0 +1,270 @@
+"""The first stage of many small searches, run as one.
+
+A call of NumPy or of a sparse solver takes some microseconds however little there is to do, and one iteration on a few
+hundred triangles is a hundred such calls. So small meshes are laid side by side, none joined to another: their
+Laplacian has one block for each, one analysis, one factorisation and one solve serve all, and VectorAdam does not mind,
+as it looks at each triangle by itself. Every problem walks the way that it would walk alone, to rounding. Whichever is
+solved falls out, and when half have, the others move up.
+
+What is left when the stage has run is handed on as `Begun`, and each is searched on by itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.descent import VectorAdam
+from quasiharmonic.exact.side_by_side import certify_each
+from quasiharmonic.field.functionals import beltrami_terms
+from quasiharmonic.field.tensor import PARAMETERISATIONS
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.mesh.reference import ReferenceMesh, blocks
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.result import MapResult, Stage, Status, Step
+from quasiharmonic.search.stages import Begun
+
+# Patterns kept for meshes that come again, as where one mesh is mapped to many targets.
+_PATTERNS = 8
+
+
+class Patterns:
+    """Laplacians of meshes side by side, the last few of them, each analysed once. For one thread at a time.
+
+    Parameters
+    ----------
+    linear_solver : str
+        A name of `quasiharmonic.linsolve`, or ``"auto"``.
+    """
+
+    def __init__(self, linear_solver: str) -> None:
+        self._linear_solver = linear_solver
+        self._kept: dict[tuple[Domain, ...], Laplacian] = {}
+
+    def of(self, domains: tuple[Domain, ...], F: IntArray, n: int, fixed: IntArray) -> Laplacian:
+        """That of these domains, whose triangles and fixed vertices are given in their common numbers."""
+        pattern = self._kept.pop(domains, None) or Laplacian(F, n, fixed, self._linear_solver)
+        self._kept[domains] = pattern
+        if len(self._kept) > _PATTERNS:
+            del self._kept[next(iter(self._kept))]
+        return pattern
+
+
+class _Member:
+    """One of the problems, and what `Search` would know of it after the same iterations.
+
+    Attributes
+    ----------
+    problem : Problem
+    live : bool
+        Whether the stage has anything left to do for it.
+    found : MapResult, Begun or None
+        What has come of it.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.live = True
+        self.found: MapResult | Begun | None = None
+        self.history: list[Step] = []
+        self.best, self._deepest = (len(problem.F) + 1, np.inf), np.inf
+        self.best_map = self._deepest_map = np.empty(0, dtype=np.complex128)
+        self.best_xi = self._deepest_xi = np.empty(0, dtype=np.complex128)
+
+    def note(self, flipped: int, energy: float, w: ComplexArray, xi: ComplexArray) -> None:
+        """Take note of a map and its tensors."""
+        self.history.append(Step(len(self.history), flipped, energy))
+        if (flipped, energy) < self.best:
+            self.best, self.best_map, self.best_xi = (flipped, energy), w.copy(), xi.copy()
+        if energy < self._deepest or not self._deepest_map.size:
+            self._deepest, self._deepest_map, self._deepest_xi = energy, w.copy(), xi.copy()
+
+    def stage(self, descent: VectorAdam, seconds: float) -> Stage:
+        """What reports say of what was done."""
+        first, last = self.history[0], self.best
+        return Stage(
+            name=descent.name,
+            iterations=len(self.history) - 1,
+            seconds=seconds,
+            flipped=(first.flipped, last[0]),
+            energy=(first.energy, last[1]),
+        )
+
+    def hand_on(self, descent: VectorAdam, seconds: float) -> None:
+        """The stage is over, and a search by itself begins."""
+        self.live = False
+        self.found = Begun(
+            descent=descent,
+            history=self.history,
+            best=self.best,
+            best_map=self.best_map,
+            best_xi=self.best_xi,
+            deepest_map=self._deepest_map,
+            deepest_xi=self._deepest_xi,
+            stage=self.stage(descent, seconds),
+        )
+
+
+class _Maps(NamedTuple):
+    """Maps of all meshes at some tensors: places, gradient of V₃ in ξ, and for each mesh its flips and its energy."""
+
+    w: ComplexArray
+    gradient: ComplexArray
+    flipped: IntArray
+    energy: FloatArray
+
+
+class _SideBySide:
+    """Meshes with common numbers for their vertices and triangles, one mesh after another."""
+
+    def __init__(self, members: Sequence[_Member], descent: VectorAdam, patterns: Patterns) -> None:
+        self.members = members
+        self._parameterisation = PARAMETERISATIONS[descent.parameterisation]
+        problems = [member.problem for member in members]
+        self.vertices = np.cumsum([0, *(problem.n for problem in problems)])
+        self.triangles = np.cumsum([0, *(len(problem.F) for problem in problems)])
+        starts, n = self.vertices[:-1].tolist(), int(self.vertices[-1])
+        F = np.concatenate([problem.F + start for problem, start in zip(problems, starts, strict=True)])
+        fixed = np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)])
+        self._mesh = ReferenceMesh(np.empty((n, 2)), F, "equilateral")
+        self.laplacian = patterns.of(tuple(problem.domain for problem in problems), F, n, fixed)
+        self._boundary = np.zeros(n, dtype=np.complex128)
+        self._boundary[fixed] = np.concatenate([problem.frame.inward(problem.target) for problem in problems])
+
+    def evaluate(self, xi: ComplexArray) -> _Maps:
+        """As `Objective.evaluate` and what an `Iterate` computes."""
+        stiffness, gradient = np.empty((3, xi.size)), np.empty_like(xi)
+        for part in blocks(xi.size):
+            tensors = self._parameterisation.field(xi[part]).entries()
+            stiffness[:, part] = self._mesh[part].edge_stiffness(tensors)
+        w = self.laplacian.factor(stiffness).extend(self._boundary)
+        if not np.isfinite(w.view(np.float64)).all():
+            raise NotPositiveDefinite("the solution is not finite")
+        density, area = np.empty(xi.size), np.empty(xi.size)
+        for part in blocks(xi.size):
+            mesh, tensor_field = self._mesh[part], self._parameterisation.field(xi[part])
+            dw = mesh.derivatives(w)
+            area[part] = dw.area
+            density[part], in_mu = beltrami_terms(mesh, tensor_field, dw)
+            gradient[part] = tensor_field.pull(in_mu)
+        # Areas that are not numbers are not positive either.
+        flipped = np.add.reduceat(~(area > 0), self.triangles[:-1], dtype=np.int64)
+        covered = np.add.reduceat(area, self.triangles[:-1])
+        covered = np.where(covered > 0, covered, np.add.reduceat(np.abs(area), self.triangles[:-1]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            energy = np.where(covered > 0, 2 * np.add.reduceat(density, self.triangles[:-1]) / covered, np.inf)
+        return _Maps(w, gradient, flipped, energy)
+
+    def bounded(self, xi: ComplexArray) -> ComplexArray:
+        """ξ with moduli clipped, in place, to where the rounded tensor is still positive definite."""
+        bound = self._parameterisation.bound
+        square = xi.real**2 + xi.imag**2
+        far = np.flatnonzero(square > bound**2)
+        xi[far] *= bound / np.sqrt(square[far])
+        return xi
+
+    def vertices_of(self, k: int) -> slice:
+        """The vertices of the k-th mesh."""
+        return slice(int(self.vertices[k]), int(self.vertices[k + 1]))
+
+    def triangles_of(self, k: int) -> slice:
+        """The triangles of the k-th mesh."""
+        return slice(int(self.triangles[k]), int(self.triangles[k + 1]))
+
+
+def first_stage(
+    problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, budget: int, still_wanted: Callable[[], None]
+) -> list[MapResult | Begun | None]:
+    """Run a stage on many problems together.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        Of any targets that enclose an area, with no kind of reference triangles of their own but equilateral ones.
+    descent : VectorAdam
+        Down V₃, by equilateral triangles.
+    patterns : Patterns
+        Of the thread that calls.
+    budget : int
+        Iterations at most.
+    still_wanted : callable
+        Called at every iteration; what it raises comes out of here.
+
+    Returns
+    -------
+    list
+        For each problem its result, or how far the stage has come with it; None where rounding has spoilt something
+        for all: then it is as if nothing had been done.
+    """
+    members = [_Member(problem) for problem in problems]
+    try:
+        _descend(members, descent, patterns, budget, still_wanted)
+    except NotPositiveDefinite:
+        return [member.found if isinstance(member.found, MapResult) else None for member in members]
+    return [member.found for member in members]
+
+
+def _descend(
+    members: list[_Member],
+    descent: VectorAdam,
+    patterns: Patterns,
+    budget: int,
+    still_wanted: Callable[[], None],
+) -> None:
+    """Descend until all are solved or the stage is over."""
+    side = _SideBySide(members, descent, patterns)
+    xi = np.zeros(int(side.triangles[-1]), dtype=np.complex128)
+    pace, spent, since = descent.pace(xi.size), 0.0, time.perf_counter()
+    for iteration in range(min(descent.iterations, budget) + 1):
+        still_wanted()
+        if iteration:
+            side.bounded(xi)
+        maps = side.evaluate(xi)
+        live = [k for k, member in enumerate(side.members) if member.live]
+        flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
+        for k in live:
+            side.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], xi[side.triangles_of(k)])
+        # Nobody knows what an iteration takes for one of them alone: all are charged alike.
+        now = time.perf_counter()
+        spent, since = spent + (now - since) / len(live), now
+        _judge([side.members[k] for k in live if flipped[k] == 0], descent, side.laplacian.solver.name, spent)
+        live = [k for k in live if side.members[k].live]
+        if not live:
+            return
+        xi += pace.step(maps.gradient)
+        size = 1 << (len(live) - 1).bit_length()
+        if 2 * size <= len(side.members):
+            # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
+            done = [k for k, member in enumerate(side.members) if not member.live]
+            kept = sorted(live + done[: size - len(live)])
+            triangles = np.concatenate([np.r_[side.triangles_of(k)] for k in kept])
+            pace.keep(triangles)
+            xi = xi[triangles]
+            side = _SideBySide([side.members[k] for k in kept], descent, patterns)
+    for k in live:
+        side.members[k].hand_on(descent, spent)
+
+
+def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: float) -> None:
+    """Decide exactly on maps without inverted triangles, as far as floating point can tell."""
+    problems = [member.problem for member in members]
+    uv = [member.problem.positions(member.best_map) for member in members]
+    verdicts = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])
+    for member, places, certificate in zip(members, uv, verdicts, strict=True):
+        member.live = False
+        if certificate.injective:
+            member.found = MapResult(
+                uv=places,
+                status=Status.INJECTIVE,
+                certificate=certificate,
+                stages=[member.stage(descent, seconds)],
+                history=member.history,
+                linear_solver=solver,
+                seconds=seconds,
+                mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu,
+            )

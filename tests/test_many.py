@@ -1,0 +1,249 @@
+"""`injective_maps`: what one call makes of many problems, beside what a call for each makes of them."""
+
+from __future__ import annotations
+
+from itertools import count, islice
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Problem, Status, certify, injective_map, injective_maps, solve
+from quasiharmonic.descent import Newton, VectorAdam
+from quasiharmonic.exact.side_by_side import certify_each
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.problem import Domain
+from quasiharmonic.search import many
+from quasiharmonic.search.together import Patterns, first_stage
+from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.exact import inverted
+from shared.meshes import boundary_of, random_annulus
+from shared.obstructed import OBSTRUCTED
+from shared.solvable import star_problem, turned_ring
+
+
+def ellipses(number, rings=4):
+    """A disk onto ellipses."""
+    V, F = disk(rings)
+    (loop,) = boundary_loops(F, len(V))
+    return [(V, F, loop, V[loop] * [1, 0.9 - 0.8 * k / number]) for k in range(number)]
+
+
+def pinned():
+    """A square whose middle is held elsewhere."""
+    V, F = grid(6, 6)
+    fixed = np.append(boundary_of(F), 24)
+    target = V[fixed].copy()
+    target[-1] += [0.2, 0.15]
+    return V, F, fixed, target
+
+
+def mixed():
+    """Problems of every kind: easy and hard, with holes and pins, in the plane and in space."""
+    backwards = star_problem(n=100)
+    return [
+        *ellipses(3),
+        star_problem(n=200),
+        turned_ring(60),
+        pinned(),
+        (*backwards[:3], backwards[3] * [1, -1]),
+        star_problem(depth=0.2, points=7, n=400, seed=3),
+        (np.eye(3)[:, :2], np.array([[0, 1, 2]]), [0, 1, 2], 5 * np.eye(3)[:, :2]),
+        star_problem(n=3000),
+        OBSTRUCTED["chord over a notch"][0],
+    ]
+
+
+def outline(result):
+    """What a report says of a result, without times."""
+    told = result.to_dict()
+    del told["seconds"]
+    return told | {"stages": [{**stage, "seconds": 0} for stage in told["stages"]]}
+
+
+class TestAgreement:
+    def test_each_is_as_by_itself(self):
+        problems = mixed()
+        together = list(injective_maps(problems))
+        for given, result in zip(problems, together, strict=True):
+            alone = solve(given) if isinstance(given, Problem) else injective_map(*given)
+            assert result.status is alone.status
+            assert [stage.name for stage in result.stages] == [stage.name for stage in alone.stages]
+            assert [step.flipped for step in result.history] == [step.flipped for step in alone.history]
+            np.testing.assert_allclose(
+                [step.energy for step in result.history], [step.energy for step in alone.history], rtol=1e-6
+            )
+            assert result.certificate.to_dict() == alone.certificate.to_dict()
+            np.testing.assert_allclose(result.uv, alone.uv, atol=1e-9 * np.ptp(alone.uv))
+            if result.mu is not None and result.injective:
+                np.testing.assert_allclose(result.mu, alone.mu, atol=1e-6)
+        assert [result.status for result in together].count(Status.INJECTIVE) == 9
+        assert {Status.IMPOSSIBLE} == {together[6].status, together[-1].status}
+
+    def test_maps_are_injective_and_keep_what_is_fixed(self):
+        problems = ellipses(40)
+        for (_, F, fixed, target), result in zip(problems, injective_maps(problems), strict=True):
+            assert inverted(F, result.uv) == 0
+            np.testing.assert_array_equal(result.uv[fixed], target)
+
+    def test_threads_are_no_matter(self, monkeypatch):
+        monkeypatch.setattr(many, "GROUP", 500)
+        problems = [*ellipses(12), star_problem(n=150), turned_ring(40)]
+        one, other = (list(injective_maps(problems, jobs=jobs)) for jobs in (1, 3))
+        for a, b in zip(one, other, strict=True):
+            assert outline(a) == outline(b)
+            np.testing.assert_array_equal(a.uv, b.uv)
+
+    def test_a_stage_in_vain_is_gone_on_from(self):
+        """The history goes on where that of the common stage ends, and the stages after it are run."""
+        problems = [star_problem(depth=0.15, points=6, n=150, seed=seed) for seed in range(3)]
+        strategy = [VectorAdam(iterations=2), Newton(iterations=100, resume=True)]
+        results = list(injective_maps(problems, strategy=strategy))
+        for given, result in zip(problems, results, strict=True):
+            alone = injective_map(*given, strategy=strategy)
+            assert len(result.stages) == 2
+            assert result.stages[0].iterations == 2
+            assert [step.flipped for step in result.history] == [step.flipped for step in alone.history]
+            assert result.injective == alone.injective
+        assert any(result.injective for result in results)
+
+    def test_iterations_are_counted_over_both(self):
+        problem = star_problem(depth=0.05, points=9, n=300, seed=1)
+        (result,) = injective_maps([problem], max_iterations=3)
+        assert result.iterations == 3
+        assert not result.injective
+
+    def test_polished(self):
+        problems = ellipses(3)
+        for given, result in zip(problems, injective_maps(problems, polish="mips"), strict=True):
+            alone = injective_map(*given, polish="mips")
+            assert result.status is alone.status is Status.POLISHED
+            np.testing.assert_allclose(result.history[-1].energy, alone.history[-1].energy, rtol=1e-9)
+
+    def test_other_strategies_and_references(self):
+        problems = ellipses(2)
+        for options in ({"strategy": "quality"}, {"reference": "rest"}, {"strategy": [Newton(iterations=30)]}):
+            for given, result in zip(problems, injective_maps(problems, **options), strict=True):
+                np.testing.assert_array_equal(result.uv, injective_map(*given, **options).uv)
+
+    def test_rounding_that_spoils_one_harms_no_other(self, monkeypatch):
+        problems = [Problem(*arrays) for arrays in ellipses(5)]
+
+        def defeated(pattern, stiffness):
+            raise NotPositiveDefinite("for once")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Laplacian, "factor", defeated)
+            found = first_stage(problems, VectorAdam(iterations=5), Patterns("auto"), 100, lambda: None)
+        assert found == [None] * 5
+        monkeypatch.setattr(many, "first_stage", lambda problems, *_: [None] * len(problems))
+        assert all(result.injective for result in injective_maps(problems))
+
+
+class TestStream:
+    def test_problems_are_read_as_they_are_needed(self):
+        read = count()
+        endless = (ellipses(1)[0] for _ in read)
+        assert [result.injective for result in islice(injective_maps(endless, jobs=1), 3)] == [True] * 3
+        assert next(read) < 5000
+
+    def test_none_at_all(self):
+        assert list(injective_maps([])) == []
+
+    def test_equal_meshes_are_looked_at_once(self, monkeypatch):
+        looked = []
+        monkeypatch.setattr(Domain, "check_areas", lambda domain: looked.append(domain))
+        copies = [tuple(np.array(part) for part in given) for given in ellipses(6)]
+        assert all(result.injective for result in injective_maps(copies, jobs=1))
+        assert len(looked) == 1
+        assert all(result.injective for result in injective_maps([*ellipses(2, 3), *ellipses(2, 4)], jobs=1))
+        assert len(looked) == 3
+
+    def test_done_is_told(self):
+        told = []
+        list(injective_maps(ellipses(5), callback=told.append))
+        assert told[-1] == 5
+        assert told == sorted(told)
+
+    def test_what_a_callback_raises_ends_all(self):
+        def tired(done):
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            list(injective_maps(ellipses(5), callback=tired))
+
+    def test_closing_ends_the_work(self):
+        hard = star_problem(depth=0.02, points=30, n=3000, seed=1)
+        results = injective_maps([*ellipses(1), hard, hard], jobs=1)
+        assert next(results).injective
+        results.close()
+
+
+class TestTrouble:
+    def test_a_malformed_problem_is_named(self):
+        V, F, fixed, target = ellipses(1)[0]
+        results = injective_maps([(V, F, fixed, target), (V, F, fixed[1:], target[1:]), (V, F, fixed, target)])
+        assert next(results).injective
+        with pytest.raises(ValueError, match=r"problem 1: the boundary vertex 37 not in fixed"):
+            next(results)
+
+    def test_or_takes_the_place_of_its_result(self):
+        V, F, fixed, target = ellipses(1)[0]
+        broken = target.copy()
+        broken[3] = np.nan
+        first, second, third, fourth = injective_maps(
+            [(V, F, fixed, broken), (V, F, fixed, target), (V, F), 7], errors="yield"
+        )
+        assert second.injective
+        assert "problem 0: target is not finite at row 3" in str(first)
+        for error, number in ((third, 2), (fourth, 3)):
+            assert f"problem {number}: give each as a Problem or as V, F, fixed, target" in str(error)
+
+    def test_an_unknown_solver(self):
+        with pytest.raises(ValueError, match="no linear solver 'gauss'"):
+            list(injective_maps(ellipses(2), linear_solver="gauss"))
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"jobs": 0}, "jobs must be a whole number of at least 1"),
+            ({"errors": "ignore"}, "errors must be one of raise, yield"),
+            ({"strategy": "haste"}, "strategy must be one of speed, quality"),
+            ({"reference": "round"}, "reference must be one of equilateral"),
+            ({"max_iterations": 0}, "max_iterations must be"),
+            ({"polish": "shine"}, "shine"),
+        ],
+    )
+    def test_options(self, options, message):
+        with pytest.raises(ValueError, match=message):
+            injective_maps([], **options)
+
+
+def test_verdicts_on_many_maps_are_those_on_each(rng):
+    """Good maps and bad ones: flipped, flat, not finite, boundaries that cross, touch and repeat, holes, islands."""
+    maps = []
+    for seed in range(60):
+        V, F = random_delaunay(30, seed=seed)
+        uv = V + rng.normal(scale=0.02 * (seed % 4), size=V.shape)
+        if seed % 7 == 1:
+            uv[boundary_of(F)[:2]] = uv[boundary_of(F)[0]]
+        if seed % 11 == 2:
+            uv[int(rng.integers(len(uv)))] = np.nan
+        if seed % 13 == 3:
+            uv = uv[:, ::-1].copy()
+        maps.append((F, uv))
+    for V, F in (annulus(4), random_annulus()):
+        maps += [(F, V), (F, V + rng.normal(scale=0.1, size=V.shape))]
+    # Positive triangles all along a strip that comes round to itself: injective, its boundary crossing.
+    strip, F = grid(24, 2)
+    angle = 7.5 * strip[:, 0]
+    maps.append((F, ((1.5 - strip[:, 1]) * np.array([np.cos(angle), np.sin(angle)])).T.copy()))
+    F, uv = zip(*maps, strict=True)
+    loops = [boundary_loops(T, len(places)) for T, places in maps]
+    found = certify_each(F, uv, loops)
+    for T, places, rims, verdict in zip(F, uv, loops, found, strict=True):
+        assert verdict.to_dict() == certify(T, places, loops=rims).to_dict()
+    kinds = {(verdict.injective, verdict.bijective) for verdict in found}
+    assert kinds == {(True, True), (True, False), (False, False)}
+    assert certify_each([], [], []) == []
