@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.cutting import Opened, cut_open
     from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
     from quasiharmonic.apply.morphing import Morphed, morph
-    from quasiharmonic.apply.refining import RefinedProblem, refine_problem
+    from quasiharmonic.apply.refining import RefinedProblem, refine, refine_problem
     from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
     from quasiharmonic.apply.transfer import SurfaceMap
     from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from quasiharmonic.flattening.distance_descent import keep_distances
     from quasiharmonic.flattening.flattened import flatten
     from quasiharmonic.flattening.patterns import write_pattern
-    from quasiharmonic.mesh.refinement import Refined, refine
+    from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
     from quasiharmonic.search.harmonising import harmonise
@@ -79,7 +79,7 @@ _HOME = {
     "morph": "apply.morphing",
     "polish": "energy.polishing",
     "quasi_harmonic_map": "search.solving",
-    "refine": "mesh.refinement",
+    "refine": "apply.refining",
     "refine_problem": "apply.refining",
     "repair": "apply.repairing",
     "solve": "search.solving",

@@ -20,6 +20,7 @@ from quasiharmonic.arrays import (
 from quasiharmonic.energy.distances import DistanceError, surface_distances
 from quasiharmonic.energy.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.mesh.shapes import rest_shapes
 
 #: Measures that `Distortion` has for every triangle, in the order in which reports list them.
@@ -181,12 +182,13 @@ class Distortion:
         }
 
 
+@takes_mesh
 def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None = None) -> Distortion:
     """Measure what a map does to every triangle of a surface; and, if asked for, to distances farther apart.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles are
         counterclockwise.
     F : (f, 3) array of int

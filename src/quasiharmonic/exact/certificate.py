@@ -40,6 +40,7 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_range, map_array, named, triangle_rows
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.given.objects import mesh_triangles
 from quasiharmonic.mesh.topology import edges, trace_loops
 
 SignArray = NDArray[np.int8]
@@ -255,10 +256,10 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
 
 def _checked(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
-    triangles, places = triangle_rows(F, copy=False), map_array("uv", uv, finite=False)
+    triangles, places = triangle_rows(mesh_triangles(F), copy=False), map_array("uv", uv, finite=False)
     check_range("F", triangles, len(places))
     # Of the numeric types, wide integers and extended precision have values that double has not.
-    given = np.asarray(uv)
+    given = np.asarray(getattr(uv, "uv", uv))
     rounded = np.zeros(places.shape, dtype=bool)
     if given.dtype.kind != "f":
         rounded = np.abs(places) >= 2.0**53

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.given.taking import writes_mesh
 from quasiharmonic.plot.canvas import BORDER, INK, RED, as_mesh, caption, fit, new_figure, paint_surface, save_png
 from quasiharmonic.plot.shading import view
 
@@ -18,6 +19,7 @@ _INCHES, _SIZE = 10.0, 7.5
 _DIGIT, _HEIGHT, _OFF = 0.68, 1.25, 0.3
 
 
+@writes_mesh
 def save_boundary_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, loops: Sequence[IntArray], corners: ArrayLike = ()
 ) -> None:
@@ -30,7 +32,7 @@ def save_boundary_figure(
     ----------
     path : path
         Replaced as a whole once the picture is complete.
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     loops : sequence of (l,) int64
         Boundary vertices in order.

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, check_choice, map_array
 from quasiharmonic.energy.measures import Distortion, distortion
+from quasiharmonic.given.taking import takes_mesh, writes_mesh
 from quasiharmonic.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
 from quasiharmonic.plot.shading import lit, view
 
@@ -75,6 +76,7 @@ class _Scale:
         return colors
 
 
+@takes_mesh
 def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric") -> Figure:
     """Draw a surface and its map coloured by a measure of distortion, and the measure's histogram.
 
@@ -83,7 +85,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface.
     F : (f, 3) int
     uv : (n, 2) float
@@ -124,6 +126,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     return figure
 
 
+@writes_mesh
 def save_distortion_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric"
 ) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.given.taking import takes_mesh, writes_mesh
 from quasiharmonic.plot.canvas import (
     as_mesh,
     caption,
@@ -27,12 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@takes_mesh
 def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     """Draw a rest surface, shaded and coloured as `plot_map` colours its map.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     ax : matplotlib Axes
         Ordinary two-dimensional ones; the surface is projected here.
@@ -47,6 +49,7 @@ def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     paint_surface(ax, seen, F, seen.color)
 
 
+@takes_mesh
 def plot_map(
     V: ArrayLike,
     F: ArrayLike,
@@ -60,7 +63,7 @@ def plot_map(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface, whose look colours the triangles.
     F : (f, 3) int
     uv : (n, 2) float
@@ -89,6 +92,7 @@ def plot_map(
     return ax
 
 
+@takes_mesh
 def plot_before_after(
     V: ArrayLike,
     F: ArrayLike,
@@ -101,7 +105,7 @@ def plot_before_after(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     before, after : (n, 2) float
     fixed : (k,) int, optional
@@ -123,6 +127,7 @@ def plot_before_after(
     return figure
 
 
+@writes_mesh
 def save_map_figure(
     path: str | PathLike[str],
     V: ArrayLike,
@@ -139,7 +144,7 @@ def save_map_figure(
     ----------
     path : path
         Replaced as a whole once the picture is complete.
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     uv : (n, 2) float
     before : (n, 2) float, optional

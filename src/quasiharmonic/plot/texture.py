@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.given.taking import takes_mesh, writes_mesh
 from quasiharmonic.plot.canvas import (
     RED,
     as_mesh,
@@ -35,6 +36,7 @@ _SAMPLES = 2  # per pixel and direction
 _CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
 
 
+@takes_mesh
 def plot_texture(
     V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24, picture: str | PathLike[str] | None = None
 ) -> Figure:
@@ -45,7 +47,7 @@ def plot_texture(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface.
     F : (f, 3) int
     uv : (n, 2) float
@@ -88,6 +90,7 @@ def plot_texture(
     return figure
 
 
+@writes_mesh
 def save_texture_figure(
     path: str | PathLike[str],
     V: ArrayLike,

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import get_args
+from typing import get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, held_places
+from quasiharmonic.given.objects import MeshLike
+from quasiharmonic.given.taking import made_of_mesh
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.frame import Frame
@@ -24,7 +26,7 @@ class Problem(ReadOnly):
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions, planar or curved; any real dtype.
     F : (f, 3) array of int
         Triangles, 0-based and consistently oriented. Never reordered. A planar target is wound as the
@@ -57,6 +59,21 @@ class Problem(ReadOnly):
     target: FloatArray
     reference: Reference | None
 
+    @overload
+    def __init__(
+        self,
+        V: ArrayLike,
+        F: ArrayLike,
+        fixed: ArrayLike,
+        target: ArrayLike,
+        *,
+        reference: Reference | None = None,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self, V: MeshLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None
+    ) -> None: ...
+    @made_of_mesh
     def __init__(
         self,
         V: ArrayLike,

@@ -23,6 +23,7 @@ from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
@@ -31,6 +32,7 @@ from quasiharmonic.search.stages import Search, Stages
 from quasiharmonic.search.strategy import stages_of
 
 
+@takes_mesh
 @heard
 def injective_map(
     V: ArrayLike,
@@ -52,7 +54,7 @@ def injective_map(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions of a planar or curved mesh, disk-like or with holes.
     F : (f, 3) array of int
         Triangles, consistently oriented.
