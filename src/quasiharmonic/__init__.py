@@ -137,7 +137,13 @@ __all__ = [
 ]
 
 
+# Modules that are part of what is public; they too are imported when they are first used.
+_MODULES = ("atlas", "batch", "curves", "io", "linsolve", "plot", "surfaces", "targets")
+
+
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f".{name}", __name__)
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOME[name]}", __name__), name)
@@ -146,4 +152,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*__all__, *_MODULES, "__version__"])

@@ -217,6 +217,7 @@ def polish_map(
         history=history,
         linear_solver=descent.system.solver.name,
         seconds=seconds,
+        V=domain.V,
     )
 
 

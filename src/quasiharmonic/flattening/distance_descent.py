@@ -134,7 +134,8 @@ def keep_distances(
     result = kept(piece, places, rings, settings)
     uv = np.ldexp(result.uv, piece.exponent)
     certificate = certify(piece.F, uv, loops=piece.loops)
-    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began)
+    rest = np.ldexp(piece.V, piece.exponent)
+    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began, V=rest)
 
 
 def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first: int = 0) -> MapResult:

@@ -175,7 +175,7 @@ def flatten(
         pins = checked_pins(fixed, target, len(V))
         if len(parts) == 1:
             result = pinned(parts[0].piece, *pins, settings, weights, given)
-            return replace(result, seconds=time.perf_counter() - began)
+            return replace(result, seconds=time.perf_counter() - began, V=V)
         has_pins = [bool(np.isin(pins[0], part.vertices).any()) for part in parts]
         held = [part for part, has in zip(parts, has_pins, strict=True) if has]
         free = [part for part, has in zip(parts, has_pins, strict=True) if not has]
@@ -215,6 +215,7 @@ def flatten(
         diagnosis=results[0].diagnosis,
         linear_solver=results[0].linear_solver,
         seconds=time.perf_counter() - began,
+        V=V,
     )
 
 

@@ -18,7 +18,7 @@ from quasiharmonic.plot.canvas import (
     paint_map,
     paint_surface,
     panels,
-    save_png,
+    save_picture,
     verdict,
 )
 from quasiharmonic.plot.shading import View, view
@@ -87,7 +87,9 @@ def plot_map(
     """
     rest, F = as_mesh(V, F)
     if ax is None:
-        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9))
+        from quasiharmonic.plot.figures import ShownAxes
+
+        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9), axes_class=ShownAxes)
     _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), flipped, fixed)
     return ax
 
@@ -138,12 +140,12 @@ def save_map_figure(
     flipped: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
 ) -> None:
-    """Write a PNG of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
+    """Write a picture of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
 
     Parameters
     ----------
     path : path
-        Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
     V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     uv : (n, 2) float
@@ -155,10 +157,23 @@ def save_map_figure(
     Raises
     ------
     ValueError
-        When a vertex of the surface or a map is not finite.
+        When a vertex of the surface or a map is not finite, or the path has another ending.
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
+    save_picture(path, map_figure(V, F, uv, before, flipped=flipped, fixed=fixed))
+
+
+def map_figure(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    before: ArrayLike | None = None,
+    *,
+    flipped: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
+) -> Figure:
+    """Draw what `save_map_figure` writes."""
     rest, F = as_mesh(V, F)
     seen = view(rest, F)
     count = 2 if before is None else 3
@@ -170,7 +185,7 @@ def save_map_figure(
         guess = map_array("before", before, len(rest))
         verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, guess, None, fixed))
     verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, map_array("uv", uv, len(rest)), flipped, fixed))
-    save_png(path, figure)
+    return figure
 
 
 def _draw_map(

@@ -20,7 +20,7 @@ from quasiharmonic.plot.canvas import (
     not_positive,
     outline,
     panels,
-    save_png,
+    save_picture,
     verdict,
 )
 from quasiharmonic.plot.shading import drawable, lit, view
@@ -100,12 +100,12 @@ def save_texture_figure(
     squares: int = 24,
     picture: str | PathLike[str] | None = None,
 ) -> None:
-    """Write `plot_texture`'s figure as a PNG of 960 × 480 pixels.
+    """Write `plot_texture`'s figure, a picture of 960 × 480 pixels.
 
     Parameters
     ----------
     path : path
-        Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
     V, F, uv, squares, picture
         As for `plot_texture`.
 
@@ -116,7 +116,7 @@ def save_texture_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    save_png(path, plot_texture(V, F, uv, squares=squares, picture=picture))
+    save_picture(path, plot_texture(V, F, uv, squares=squares, picture=picture))
 
 
 def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:

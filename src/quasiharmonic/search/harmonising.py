@@ -252,6 +252,7 @@ def harmonise_map(
         diagnosis=diagnosis,
         linear_solver=objective.laplacian.solver.name,
         seconds=time.perf_counter() - began,
+        V=domain.V,
     )
 
 

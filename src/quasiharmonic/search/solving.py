@@ -191,6 +191,7 @@ def solve(
         linear_solver=search.linear_solver,
         mu=None if field is None else field.mu,
         reference=search.best_reference,
+        V=problem.V,
     )
     if lower is not None and status is Status.INJECTIVE:
         result = polished(problem, result, energy=lower, linear_solver=linear_solver, callback=callback, slide=slide)
