@@ -14,7 +14,7 @@ FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent
 MODULES = sorted(FOLDER.rglob("*.py"))
 TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
-# What `namedtuple` offers has an underscore so that it is no field; notebooks ask for names like these: neither is private.
+# What `namedtuple` offers has an underscore so that it is no field, what notebooks ask for by custom: none is private.
 PUBLIC = {"_replace", "_asdict", "_fields", "_make", "_repr_html_", "_repr_png_"}
 
 
