@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Drawing takes a second for half as many triangles; more are drawn when somebody asks for it.
 MOST_TRIANGLES = 200_000
-_COLORS = 96
+_COLORS = 128
 _STYLE = "white-space: pre-wrap; margin: 0 0 0.5em; font-size: 90%"
 
 
