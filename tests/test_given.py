@@ -15,6 +15,7 @@ import quasiharmonic
 from quasiharmonic import (
     InverseMap,
     Problem,
+    atlas,
     certify,
     cut_open,
     distortion,
@@ -23,8 +24,10 @@ from quasiharmonic import (
     flipped_triangles,
     harmonise,
     injective_map,
+    io,
     is_injective,
     keep_distances,
+    morph,
     plot,
     polish,
     refine,
@@ -184,6 +187,32 @@ def test_triangles_alone():
         assert not flipped_triangles(given, MAP).size
         assert len(pattern(given, MAP).seam) == 1
         assert not len(targets.flattened_edges(given, LOOP, BEAN))
+
+
+def test_meshes_in_the_plane_are_moved():
+    points, triangles = grid(4, 4)
+    upper = np.flatnonzero(points[:, 1] == 1)
+    to = points[upper] * [1, 0.8]
+    wanted = morph(points, triangles, upper, to).points
+    flat = SimpleNamespace(
+        points=np.column_stack([points, np.full(len(points), 3.0)]), cells=[block("triangle", triangles)]
+    )
+    np.testing.assert_array_equal(morph(flat, upper, to).points, wanted)
+    np.testing.assert_array_equal(morph(points=flat, moved=upper, positions=to).points, wanted)
+    with pytest.raises(ValueError, match=r"points must have shape \(n, 2\)"):
+        morph(MESH, upper, to)
+
+
+def test_atlases_of_files_and_objects(tmp_path):
+    mapped = SeamedMesh(V, F, F, MAP.uv)
+    io.write_mapped(tmp_path / "map.obj", MeshData(V, F).with_places(mapped))
+    wanted = atlas.polish(mapped, max_iterations=2).mesh.uv
+    for given in (tmp_path / "map.obj", MeshData(V, F).with_map(MAP.uv)):
+        np.testing.assert_array_equal(atlas.polish(given, max_iterations=2).mesh.uv, wanted)
+        assert atlas.certify(given).bijective
+    assert len(atlas.flatten(MESH, max_iterations=1).islands) == 1
+    with pytest.raises(TypeError, match="a list is no mesh: hand over a SeamedMesh"):
+        atlas.certify([V, F])
 
 
 def test_outlines_in_words():

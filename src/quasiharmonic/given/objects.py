@@ -15,6 +15,7 @@ import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array, kind_of, triangle_rows, vertex_array
 from quasiharmonic.mesh.polygons import triangulated
+from quasiharmonic.mesh.seams import SeamedMesh
 
 
 class _VerticesFaces(Protocol):
@@ -117,6 +118,27 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     name = f"{faces} of {what}"
     V = vertex_array(_part(mesh, positions), f"{positions} of {what}")
     return V, _triangles(V, name, _part(mesh, faces), _part(mesh, "celltypes"))
+
+
+def planar_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
+    """As `mesh_arrays`, of a mesh in the plane: positions (n, 2), whose third coordinate is the same everywhere."""
+    V, F = mesh_arrays(mesh)
+    return (V[:, :2] if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V), F
+
+
+def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
+    """A mesh with the seams and the map that it carries: a `SeamedMesh`, `MeshData` or file; others have none."""
+    from quasiharmonic import io
+
+    if isinstance(mesh, SeamedMesh):
+        return mesh
+    if isinstance(mesh, str | PathLike):
+        return io.seamed(io.read_mesh(mesh))
+    if isinstance(mesh, io.MeshData):
+        return io.seamed(mesh)
+    if not stands_for_mesh(mesh):
+        raise TypeError(f"{kind_of(mesh)} is no mesh: hand over a SeamedMesh, or the path of a file")
+    return SeamedMesh(*mesh_arrays(mesh))
 
 
 def mesh_triangles(F: Any) -> Any:

@@ -11,8 +11,8 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import kind_of
-from quasiharmonic.given.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.arrays import FloatArray, IntArray, kind_of
+from quasiharmonic.given.objects import MeshLike, mesh_arrays, planar_arrays, stands_for_mesh
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -38,6 +38,15 @@ class WritesMesh(Protocol[P, R_co]):
     def __call__(self, path: Path, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
 
 
+class TakesPlanarMesh(Protocol[P, R_co]):
+    """A function of ``points``, ``F`` and further arguments, or of a mesh in the plane and these."""
+
+    @overload
+    def __call__(self, points: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+    @overload
+    def __call__(self, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+
+
 def takes_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesMesh[P, R]:
     """Let a function whose first two arguments are ``V`` and ``F`` take one mesh in their place."""
     return _taking(function, 0)
@@ -48,26 +57,34 @@ def writes_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R
     return _taking(function, 1)
 
 
+def takes_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesPlanarMesh[P, R]:
+    """Let a function whose first two arguments are ``points`` in the plane and ``F`` take one mesh in their place."""
+    return _taking(function, 0, planar_arrays)
+
+
 def made_of_mesh(init: Callable[..., None]) -> Callable[..., None]:
     """Let an ``__init__`` whose arguments after ``self`` are ``V`` and ``F`` take one mesh in their place."""
     made: Callable[..., None] = _taking(init, 1)
     return made
 
 
-def _taking(function: Callable[..., Any], place: int) -> Any:
-    """A function that takes a mesh as its argument number ``place``, where ``V`` is, and as ``F`` after it."""
+def _taking(
+    function: Callable[..., Any], place: int, arrays: Callable[[Any], tuple[FloatArray, IntArray]] = mesh_arrays
+) -> Any:
+    """A function that takes a mesh as its argument number ``place``, where positions are, and as ``F`` after it."""
+    first = list(inspect.signature(function).parameters)[place]
 
     @wraps(function)
     def taking(*args: Any, **kwargs: Any) -> Any:
         if len(args) > place and stands_for_mesh(args[place]):
             mesh, before, after = args[place], args[:place], args[place + 1 :]
             _check_room(function, mesh, len(args) + 1, kwargs)
-            args = (*before, *mesh_arrays(mesh), *after)
+            args = (*before, *arrays(mesh), *after)
         elif len(args) > place and isinstance(args[place], tuple) and np.ndim(args[place][:1]) > 2:
             pair = f"a tuple of {len(args[place])} arrays"
             raise TypeError(f"V is {pair}: hand these over one by one, as in {function.__name__}(*mesh)")
-        elif "V" in kwargs and "F" not in kwargs and stands_for_mesh(kwargs["V"]):
-            kwargs["V"], kwargs["F"] = mesh_arrays(kwargs["V"])
+        elif first in kwargs and "F" not in kwargs and stands_for_mesh(kwargs[first]):
+            kwargs[first], kwargs["F"] = arrays(kwargs[first])
         return function(*args, **kwargs)
 
     return taking

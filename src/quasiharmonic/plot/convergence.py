@@ -36,6 +36,8 @@ def plot_convergence(result: MapResult) -> Figure:
     ValueError
         When the result has no history.
     """
+    from matplotlib.ticker import MaxNLocator
+
     if not result.history:
         raise ValueError("the result has no history to draw")
     figure = new_figure((8, 4.5))
@@ -60,7 +62,7 @@ def plot_convergence(result: MapResult) -> Figure:
         ax.spines[["top", "right"]].set_visible(False)
     flips.set_xlabel("iterations", color=INK)
     energy.tick_params(labelbottom=False)
-    flips.xaxis.get_major_locator().set_params(integer=True)
+    flips.xaxis.set_major_locator(MaxNLocator(integer=True))
     energy.legend(frameon=False, fontsize=9)
     return figure
 
