@@ -179,7 +179,7 @@ class TestRefuses:
             ("--json", out),
             ("--json", star),
             ("--plot", out),
-            ("--plot", tmp_path / "p.pdf"),
+            ("--plot", tmp_path / "p.jpg"),
             ("--fixed", tmp_path / "handles.txt", "--json", tmp_path / "handles.txt"),
             ("--plot", tmp_path / "x.png", "--json", tmp_path / "x.png"),
         ):

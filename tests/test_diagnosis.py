@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from quasiharmonic.apply.refining import refine
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
-from quasiharmonic.mesh.refinement import refine
 from quasiharmonic.problem import Problem
 from quasiharmonic.search.solving import injective_map
 from quasiharmonic.surfaces import disk

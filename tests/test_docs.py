@@ -19,6 +19,7 @@ PAGES = (
     FOLDER / "docs" / "flatten.md",
     FOLDER / "docs" / "howto.md",
     FOLDER / "docs" / "method.md",
+    FOLDER / "docs" / "notebook.md",
     FOLDER / "docs" / "tutorial.md",
 )
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import io
+from quasiharmonic.apply.refining import refine
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.mesh.polygons import triangulated
-from quasiharmonic.mesh.refinement import refine
 
 
 def rings(polygons):

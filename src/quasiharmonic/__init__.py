@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.cutting import Opened, cut_open
     from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
     from quasiharmonic.apply.morphing import Morphed, morph
-    from quasiharmonic.apply.refining import RefinedProblem, refine_problem
+    from quasiharmonic.apply.refining import RefinedProblem, refine, refine_problem
     from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
     from quasiharmonic.apply.transfer import SurfaceMap
     from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from quasiharmonic.gradients.flattened import flatten_derivative
     from quasiharmonic.gradients.polished import polish_derivative
     from quasiharmonic.gradients.tensors import quasi_harmonic_derivative
-    from quasiharmonic.mesh.refinement import Refined, refine
+    from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
     from quasiharmonic.search.harmonising import harmonise
@@ -89,7 +89,7 @@ _HOME = {
     "polish_derivative": "gradients.polished",
     "quasi_harmonic_derivative": "gradients.tensors",
     "quasi_harmonic_map": "search.solving",
-    "refine": "mesh.refinement",
+    "refine": "apply.refining",
     "refine_problem": "apply.refining",
     "repair": "apply.repairing",
     "solve": "search.solving",
@@ -152,7 +152,13 @@ __all__ = [
 ]
 
 
+# Modules that are part of what is public; they too are imported when they are first used.
+_MODULES = ("atlas", "batch", "curves", "io", "linsolve", "plot", "surfaces", "targets")
+
+
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f".{name}", __name__)
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOME[name]}", __name__), name)
@@ -161,4 +167,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*__all__, *_MODULES, "__version__"])

@@ -6,8 +6,9 @@ One wording for each error: whoever takes ``V``, ``F`` or rows of coordinates ta
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from numbers import Integral, Real
-from typing import Any
+from numbers import Integral, Number, Real
+from os import PathLike
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,7 +45,7 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
     """
     array = _array(name, values)
     if array.dtype.kind not in "iufb":
-        raise ValueError(f"{name} must hold real numbers, not {array.dtype}")
+        raise ValueError(f"{name} must hold real numbers, not {_held(values, array)}")
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float64, order="C")
 
@@ -61,7 +62,7 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
     if array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must hold integer indices, not {array.dtype}")
+        raise ValueError(f"{name} must hold integer indices, not {_held(values, array)}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
     made = np.array if copy else np.asarray
@@ -121,7 +122,7 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     Parameters
     ----------
     name : str
-    uv : (n, 2) array
+    uv : (n, 2) array, or anything with such a ``uv``, as results have
     n : int, optional
         How many there must be, one for each vertex; any number by default.
     finite : bool
@@ -132,7 +133,7 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     ValueError
         When they are not; names the first vertices that are not finite.
     """
-    array = real_array(name, uv)
+    array = real_array(name, getattr(uv, "uv", uv))
     if array.ndim != 2 or array.shape[1] != 2 or n not in (None, len(array)):
         wanted = "(n, 2)" if n is None else f"({n}, 2), a position for every vertex"
         raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
@@ -201,10 +202,43 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """An array of what may be one, those of PyTorch and JAX included, or a ValueError that says what it is instead."""
     try:
+        # What offers its memory in no other way is an object to `asarray`.
+        if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
+            return np.from_dlpack(cast(Any, values))
         return np.asarray(values)
     except ValueError as error:
         raise ValueError(f"{name} is not an array: its rows differ in length") from error
+    except (TypeError, RuntimeError, BufferError) as error:
+        raise ValueError(f"{name} is {kind_of(values)} {_withheld(name, values, error)}") from error
+
+
+def _withheld(name: str, values: Any, error: Exception) -> str:
+    """Why an array of another library does not give its numbers away, and what to do."""
+    if getattr(values, "requires_grad", False):
+        return f"that requires grad, which would be lost here: hand over {name}.detach()"
+    device = getattr(values, "device", "cpu")
+    if not str(device).startswith("cpu"):
+        return f"on {device}: hand over {name}.{'cpu' if hasattr(values, 'cpu') else 'get'}()"
+    return f"whose numbers NumPy cannot have: {str(error).partition(chr(10))[0]}"
+
+
+def _held(values: object, array: NDArray[Any]) -> str:
+    """What an array holds that should hold numbers."""
+    if not array.ndim:
+        return kind_of(values)
+    if array.dtype == object and array.size:
+        return f"objects, of which the first is {kind_of(array.flat[0])}"
+    return str(array.dtype)
+
+
+def kind_of(value: object) -> str:
+    """Name what was given, for messages: ``a Trimesh``, ``None``, ``'letter:R'``."""
+    if value is None or isinstance(value, str | bytes | Number | PathLike):
+        return repr(value) if len(repr(value)) <= 80 else f"{repr(value)[:77]}…"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
 
 def whole_number(name: str, value: Any, *, least: int) -> None:

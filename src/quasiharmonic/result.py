@@ -11,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.exact.certificate import Certificate
+from quasiharmonic.showing import Shown
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from quasiharmonic.exact.diagnosis import Diagnosis
 
 
@@ -85,6 +88,11 @@ class Stage:
     energy: tuple[float, float]
     kept: bool = True
 
+    def __str__(self) -> str:
+        before, after = (f"{flips:,}" for flips in self.flipped)
+        kept = "" if self.kept else ", discarded"
+        return f"{self.name}: {self.iterations} iterations, {self.seconds:.3g} s, {before} → {after} inverted{kept}"
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
@@ -131,8 +139,8 @@ class Snapshot:
     uv: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class MapResult:
+@dataclass(frozen=True, repr=False)
+class MapResult(Shown):
     """A map of the mesh into the plane.
 
     Attributes
@@ -160,6 +168,8 @@ class MapResult:
         The triangles in whose frames they are expressed.
     path : list of Snapshot
         Maps on the way, where the caller asked to have them recorded.
+    V : (n, 2) or (n, 3) float64 or None
+        Rest positions of what was mapped, for pictures and measures; None where whoever made the map did not say.
     """
 
     uv: NDArray[np.float64]
@@ -173,6 +183,12 @@ class MapResult:
     mu: NDArray[np.complex128] | None = None
     reference: str = "equilateral"
     path: list[Snapshot] = field(default_factory=list)
+    V: NDArray[np.float64] | None = None
+
+    @property
+    def F(self) -> NDArray[np.int64]:
+        """The triangles (f, 3) int64, as they were judged."""
+        return self.certificate.F
 
     @property
     def injective(self) -> bool:
@@ -183,6 +199,41 @@ class MapResult:
     def iterations(self) -> int:
         """Iterations over all stages."""
         return sum(stage.iterations for stage in self.stages)
+
+    def in_short(self) -> str:
+        steps = f"{self.iterations} iteration{'' if self.iterations == 1 else 's'}"
+        return f"{self.certificate.in_short()}, {steps}, {self.seconds:.3g} s"
+
+    def summary(self) -> str:
+        """Say in a few lines what happened, what is certified, what ran, and what forbids a map where that is known."""
+        lines = [self.status.value, self.certificate.summary()]
+        lines += [str(stage) for stage in self.stages]
+        lines.append(f"{self.seconds:.3g} s in all, solved by {self.linear_solver or 'no linear solver'}")
+        return "\n".join(lines if self.diagnosis is None else [*lines, self.diagnosis.summary()])
+
+    def plot(self, kind: str = "map", *, measure: str = "isometric") -> Figure:
+        """Draw the surface and its map, or how the search went.
+
+        Parameters
+        ----------
+        kind : {"map", "distortion", "texture", "convergence"}
+            The surface beside the map, inverted triangles in red; both coloured by a measure, and its histogram; with
+            a checkerboard; or flips and energy by iteration.
+        measure : str
+            For ``"distortion"``: one of `quasiharmonic.energy.measures.MEASURES`.
+
+        Returns
+        -------
+        matplotlib Figure
+            Shown by notebooks as it is; see `quasiharmonic.plot`.
+
+        Raises
+        ------
+        ValueError
+            When there is no such kind or measure, or the result does not know its surface.
+        """
+        figure: Figure = self._drawn(kind, measure=measure)
+        return figure
 
     def to_dict(self) -> dict[str, Any]:
         """The report of ``--json``: everything but the map itself, in plain Python types."""

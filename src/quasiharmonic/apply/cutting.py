@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, triangle_array, vertex_array
 from quasiharmonic.cuts.finding import find_cuts
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.mesh.opening import opened_along
 
 
@@ -30,12 +31,13 @@ class Opened(NamedTuple):
     origin: IntArray
 
 
+@takes_mesh
 def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain: float = np.inf) -> Opened:
     """Cut a surface along edges into a disk, which has one boundary loop and fits into any outline without holes.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Vertices.
     F : (f, 3) array of int
         Triangles of any number of surfaces, each of which becomes a disk. One that is a disk stays as it is.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quasiharmonic.apply.refining import refine_problem
 from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.mesh.refinement import Refined, composed, refine
+from quasiharmonic.mesh.refinement import Refined, composed, split_edges
 from quasiharmonic.mesh.seams import Island
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
@@ -162,7 +162,7 @@ def with_room(fitted: Fitted) -> Fitted:
     before = fitted.problem
     # A chord along a straight side of the outline may be a rounding error off it; a diagnosis, which is exact, then
     # does not name it.
-    flat = refine(before.V, before.F, flattened_edges(before.F, before.fixed, before.target))
+    flat = split_edges(before.V, before.F, flattened_edges(before.F, before.fixed, before.target))
     roomy = refine_problem(_on(flat, before))
     refined = composed(flat, roomy.refined)
     if not len(refined.parents):

@@ -13,14 +13,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_choice, check_range, vertex_array
+from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_choice, check_range, map_array, vertex_array
 from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.exact.point_location import PointLocator
+from quasiharmonic.given.objects import MeshLike
+from quasiharmonic.given.taking import made_of_mesh
 
 # Points handled at a time: what is in work stays in the cache.
 _POINTS = 1 << 14
@@ -55,7 +57,7 @@ class InverseMap(ReadOnly):
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         The surface.
     F : (f, 3) array of int
         Triangles.
@@ -109,13 +111,18 @@ class InverseMap(ReadOnly):
            [  nan,   nan,   nan]])
     """
 
+    @overload
+    def __init__(self, V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, overlapping: bool = False) -> None: ...
+    @overload
+    def __init__(self, V: MeshLike, uv: ArrayLike, *, overlapping: bool = False) -> None: ...
+    @made_of_mesh
     def __init__(self, V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, overlapping: bool = False) -> None:
         certificate = certify(F, uv)
         _check(certificate, overlapping)
         self.certificate: Certificate = certificate
         self.V = vertex_array(V, finite=False)
         self.F = np.array(F, dtype=np.int64)
-        self.uv = np.array(uv, dtype=np.float64)
+        self.uv = map_array("uv", uv, finite=False)
         if len(self.V) != len(self.uv):
             raise ValueError(f"V must have as many rows as uv, {len(self.uv)}, not {len(self.V)}")
         self._seal()

@@ -22,6 +22,7 @@ from quasiharmonic.arrays import (
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.given.taking import takes_planar_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
@@ -67,6 +68,7 @@ class Morphed:
         }
 
 
+@takes_planar_mesh
 @heard
 def morph(
     points: ArrayLike,
@@ -84,7 +86,7 @@ def morph(
 
     Parameters
     ----------
-    points : (n, 2) array
+    points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
         The mesh as it is, valid.
     F : (f, 3) array of int
         Triangles, wound either way.

@@ -24,6 +24,7 @@ from quasiharmonic.arrays import (
 from quasiharmonic.atlas.verdict import mirrored_islands
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.exact.diagnosis import Diagnosis
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.seams import Island, SeamedMesh, which_island
 from quasiharmonic.result import Step
@@ -148,6 +149,7 @@ class Repaired:
         }
 
 
+@takes_mesh
 @heard
 def repair(
     V: ArrayLike,
@@ -169,7 +171,7 @@ def repair(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         The surface.
     F : (f, 3) array of int
         Triangles.

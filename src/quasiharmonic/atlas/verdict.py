@@ -12,6 +12,7 @@ from quasiharmonic.arrays import FloatArray, IntArray, counted, named
 from quasiharmonic.exact import certificate
 from quasiharmonic.exact.certificate import Certificate
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.given.objects import MeshLike, seamed_mesh
 from quasiharmonic.mesh.seams import Island, SeamedMesh, which_island
 
 #: What a map is multiplied by to be reflected at the v axis.
@@ -134,12 +135,12 @@ class AtlasVerdict:
         }
 
 
-def certify(mesh: SeamedMesh) -> AtlasVerdict:
+def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
     """Judge a map with seams exactly, island by island.
 
     Parameters
     ----------
-    mesh : SeamedMesh
+    mesh : SeamedMesh, or a mesh or path that stands for one
         Triangles without a place are in no island, and not judged.
 
     Returns
@@ -153,6 +154,7 @@ def certify(mesh: SeamedMesh) -> AtlasVerdict:
     >>> print(certify(SeamedMesh(V, F, uv=V)).summary())
     1 island: 1 injective, 1 bijective.
     """
+    mesh = seamed_mesh(mesh)
     judged = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)

@@ -18,6 +18,7 @@ from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening import flattened
 from quasiharmonic.flattening.layout import in_unit_square, side_by_side
+from quasiharmonic.given.objects import MeshLike, seamed_mesh
 from quasiharmonic.mesh.seams import Island, SeamedMesh
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Domain, Problem
@@ -27,7 +28,7 @@ from quasiharmonic.search.solving import solve
 
 
 def polish(
-    mesh: SeamedMesh,
+    mesh: SeamedMesh | MeshLike,
     *,
     free: bool = False,
     fixed: ArrayLike | None = None,
@@ -38,7 +39,7 @@ def polish(
 
     Parameters
     ----------
-    mesh : SeamedMesh
+    mesh : SeamedMesh, or a mesh or path that stands for one
         A map whose islands are injective, mirrored ones included.
     free : bool
         Let their borders go where distortion is least, rather than keep them. Islands then stay where they are as far
@@ -60,6 +61,7 @@ def polish(
     ValueError
         When an island is not injective or no surface, named by its first triangle.
     """
+    mesh = seamed_mesh(mesh)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     if free and fixed is not None:
         raise ValueError("with free borders nothing is held: leave fixed out, or free")
@@ -76,12 +78,12 @@ def polish(
     return each_island(mesh, lower)
 
 
-def harmonise(mesh: SeamedMesh, *, fixed: ArrayLike | None = None, **rest: Any) -> MappedAtlas:
+def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **rest: Any) -> MappedAtlas:
     """Lower an energy of every island within the injective maps, its border kept; see `quasiharmonic.harmonise`.
 
     Parameters
     ----------
-    mesh : SeamedMesh
+    mesh : SeamedMesh, or a mesh or path that stands for one
     fixed : (k,) array of int, optional
         As `polish` has it.
     **rest
@@ -91,18 +93,19 @@ def harmonise(mesh: SeamedMesh, *, fixed: ArrayLike | None = None, **rest: Any) 
     -------
     MappedAtlas
     """
+    mesh = seamed_mesh(mesh)
     held = _fixed(mesh, fixed)
     return each_island(mesh, lambda island: harmonise_map(_domain(island, held), island.uv, **rest))
 
 
 def injective_map(
-    mesh: SeamedMesh, *, fixed: ArrayLike | None = None, reference: Any = None, **rest: Any
+    mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, reference: Any = None, **rest: Any
 ) -> MappedAtlas:
     """Map every island anew, its border kept; see `quasiharmonic.injective_map`.
 
     Parameters
     ----------
-    mesh : SeamedMesh
+    mesh : SeamedMesh, or a mesh or path that stands for one
     fixed : (k,) array of int, optional
         As `polish` has it.
     reference, **rest
@@ -113,6 +116,7 @@ def injective_map(
     MappedAtlas
         Where an island has no injective map, its result says so.
     """
+    mesh = seamed_mesh(mesh)
     held = _fixed(mesh, fixed)
 
     def find(island: Island) -> MapResult:
@@ -123,7 +127,7 @@ def injective_map(
 
 
 def flatten(
-    mesh: SeamedMesh,
+    mesh: SeamedMesh | MeshLike,
     *,
     start: bool = False,
     fixed: ArrayLike | None = None,
@@ -136,7 +140,7 @@ def flatten(
 
     Parameters
     ----------
-    mesh : SeamedMesh
+    mesh : SeamedMesh, or a mesh or path that stands for one
         Its islands need have no places.
     start : bool
         Begin with the places that the islands have.
@@ -153,6 +157,7 @@ def flatten(
     MappedAtlas
         In the surface's own unit of length, or in the unit square.
     """
+    mesh = seamed_mesh(mesh)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     held = _fixed(mesh, fixed)
     if held is not None and unit_square:
@@ -222,12 +227,12 @@ def _joined(islands: Sequence[Island], name: str) -> Any:
     return np.concatenate([getattr(island, name) for island in islands])
 
 
-def pack(mesh: SeamedMesh, *, margin: float = 1 / 256) -> SeamedMesh:
+def pack(mesh: SeamedMesh | MeshLike, *, margin: float = 1 / 256) -> SeamedMesh:
     """Lay islands into the unit square, all at one texel density; see `quasiharmonic.atlas.packing.packed`.
 
     Parameters
     ----------
-    mesh : SeamedMesh
+    mesh : SeamedMesh, or a mesh or path that stands for one
         Its islands injective, or mirrored; these stay mirrored.
     margin : float
         Least room between two islands, as a share of the square's side.
@@ -241,6 +246,7 @@ def pack(mesh: SeamedMesh, *, margin: float = 1 / 256) -> SeamedMesh:
     ValueError
         When an island has no places, or so many have no room with such a margin.
     """
+    mesh = seamed_mesh(mesh)
     islands = mesh.islands
     F = [island.F[:, ::-1] if is_mirrored(island.F, island.uv) else island.F for island in islands]
     return mesh.with_places(packed([island.uv for island in islands], F, _surface_areas(mesh), margin=margin))

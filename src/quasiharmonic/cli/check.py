@@ -40,7 +40,7 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="judge nothing, but number the boundary of the surface: its loops, and corners for qhm map --corners",
     )
-    parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the boundary that --boundary numbers")
+    parser.add_argument("--plot", type=Path, metavar="PICTURE", help="draw the boundary that --boundary numbers")
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 

@@ -46,7 +46,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     targets.add_options(parser)
-    parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the rest surface, the start and the map")
+    parser.add_argument("--plot", type=Path, metavar="PICTURE", help="draw the rest surface, the start and the map")
     parser.add_argument(
         "--plot-kind",
         choices=("map", "distortion"),

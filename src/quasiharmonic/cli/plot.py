@@ -21,7 +21,9 @@ def add_parser(commands: Commands) -> None:
         epilog="Exit status: 0 the picture is written; 2 wrong input or call, nothing written.",
     )
     parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB or glTF file with a map")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="picture to write")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="PICTURE", help="picture to write: .png, .svg or .pdf"
+    )
     parser.add_argument(
         "--kind",
         choices=("map", "distortion", "texture"),

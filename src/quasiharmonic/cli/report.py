@@ -107,10 +107,12 @@ def check_new(outputs: Mapping[str, Path], json_path: str | None, inputs: Sequen
         taken.append(path)
 
 
-def check_picture(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
+def check_picture(
+    option: str, path: Path, inputs: Sequence[Path | None], endings: Sequence[str] = (".png", ".svg", ".pdf")
+) -> None:
     """`check_outputs` for a picture."""
-    if path.suffix.lower() != ".png":
-        raise ValueError(f"{option} {path}: pictures are written as .png")
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{option} {path}: pictures are written as {', '.join(endings)}")
     _check_replaces_nothing(option, path, inputs)
 
 

@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.plot.interactive import show
 
     if options.screenshot is not None:
-        report.check_picture("--screenshot", options.screenshot, inputs=(options.input,))
+        report.check_picture("--screenshot", options.screenshot, inputs=(options.input,), endings=(".png",))
     V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
     with report.about(options.input):
         show(V, F, uv, screenshot=options.screenshot)

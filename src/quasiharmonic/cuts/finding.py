@@ -13,6 +13,7 @@ from quasiharmonic.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.cuts.reaching import reached
 from quasiharmonic.cuts.shortening import shortened
 from quasiharmonic.cuts.topological import opening_cuts
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.mesh.opening import opened_along
 from quasiharmonic.mesh.surface import manifold_edges
 from quasiharmonic.mesh.topology import components, edge_keys
@@ -21,6 +22,7 @@ from quasiharmonic.mesh.topology import components, edge_keys
 _DEAR = 1e6
 
 
+@takes_mesh
 def find_cuts(
     V: ArrayLike,
     F: ArrayLike,
@@ -38,7 +40,7 @@ def find_cuts(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Vertices. Their unit and place do not matter.
     F : (f, 3) array of int
         Triangles of any number of surfaces, each treated as if it were alone: closed or not, with handles and holes.

@@ -24,7 +24,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, real_array, whole_number
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_finite,
+    check_range,
+    index_array,
+    map_array,
+    real_array,
+    whole_number,
+)
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import still_at_it
 from quasiharmonic.mesh.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
 
@@ -149,17 +159,15 @@ class SurfaceDistances:
         -------
         DistanceError
         """
-        places = real_array("uv", uv)
-        if places.ndim != 2 or places.shape[1] != 2:
-            raise ValueError(f"uv must have shape (n, 2), not {places.shape}")
+        places = map_array("uv", uv)
         check_range("a pair", np.concatenate([self.source, self.target]), len(places))
-        check_finite("uv", "vertex", "vertices", places)
         apart = places[self.source] - places[self.target]
         ratio = np.hypot(apart[:, 0], apart[:, 1]) / self.length
         scale = _best_scale(ratio)
         return DistanceError(scale, scale * ratio - 1, self.sampling)
 
 
+@takes_mesh
 def surface_distances(
     V: ArrayLike,
     F: ArrayLike,
@@ -174,7 +182,7 @@ def surface_distances(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles of a surface, consistently oriented.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
     check_choice,
+    counted,
     map_array,
     triangle_array,
     vertex_array,
@@ -20,7 +21,12 @@ from quasiharmonic.arrays import (
 from quasiharmonic.energy.distances import DistanceError, surface_distances
 from quasiharmonic.energy.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.mesh.shapes import rest_shapes
+from quasiharmonic.showing import Shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Measures that `Distortion` has for every triangle, in the order in which reports list them.
 MEASURES = (
@@ -63,8 +69,8 @@ class Summary:
         return {key: value if np.isfinite(value) else None for key, value in vars(self).items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Distortion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distortion(Shown):
     """What a map does to every triangle; made by `distortion`.
 
     The Jacobian is that of the affine map from the rest triangle, laid into the plane counterclockwise, to
@@ -108,6 +114,8 @@ class Distortion:
         Triangles without area in the rest mesh.
     flipped : (l,) int64
         Triangles whose image is inverted or has no area, flat ones excepted.
+    V, F, uv : arrays
+        The surface and the map that were measured.
     distances : DistanceError or None
         How far distances between vertices are off, where that was asked for.
     """
@@ -126,25 +134,38 @@ class Distortion:
     beltrami: ComplexArray
     flat: IntArray
     flipped: IntArray
+    V: FloatArray
+    F: IntArray
+    uv: FloatArray
     distances: DistanceError | None = None
 
     def per_triangle(self) -> dict[str, FloatArray]:
         """Every measure by its name, (f,) float64 each."""
         return {name: getattr(self, name) for name in MEASURES}
 
-    def summary(self, measure: str) -> Summary:
-        """Sum up one measure.
+    @overload
+    def summary(self, measure: None = None) -> str: ...
+    @overload
+    def summary(self, measure: str) -> Summary: ...
+    def summary(self, measure: str | None = None) -> str | Summary:
+        """Sum up one measure, or all of them in a table of text.
 
         Parameters
         ----------
-        measure : str
+        measure : str, optional
             One of `MEASURES`.
+
+        Returns
+        -------
+        Summary or str
 
         Raises
         ------
         ValueError
             When there is no such measure, or no triangle on which it is defined.
         """
+        if measure is None:
+            return self._table()
         check_choice("measure", measure, MEASURES)
         values = self.per_triangle()[measure]
         defined = np.flatnonzero(~np.isnan(values))
@@ -166,6 +187,32 @@ class Distortion:
             highest=int(defined[order[-1]]),
         )
 
+    def _table(self) -> str:
+        """All measures, a line each."""
+        lines = [f"{'':>19} {'median':>10} {'95 %':>10} {'max':>10}"]
+        for name, values in self.per_triangle().items():
+            if not np.isnan(values).all():
+                one = self.summary(name)
+                lines.append(f"{name:>19} {one.median:>10.4g} {one.p95:>10.4g} {one.maximum:>10.4g}")
+        for found, what in ((self.flipped, "inverted or without area"), (self.flat, "without area in the rest mesh")):
+            if found.size:
+                lines.append(f"{len(found):,} of {len(self.F):,} triangles {what}")
+        return "\n".join(lines)
+
+    def in_short(self) -> str:
+        triangles = counted("triangle", "triangles", len(self.F))
+        if self.flipped.size:
+            return f"{triangles}, {self.flipped.size:,} inverted or without area"
+        if np.isnan(self.isometric).all():
+            return f"{triangles}, all without area in the rest mesh"
+        one = self.summary("isometric")
+        return f"{triangles}, stretch max(σ₁, 1/σ₂) {one.median:.3g} in the median, {one.maximum:.3g} at most"
+
+    def plot(self, measure: str = "isometric") -> Figure:
+        """Draw surface and map coloured by a measure, and its histogram; `quasiharmonic.plot.plot_distortion`."""
+        figure: Figure = self._drawn("distortion", measure=measure)
+        return figure
+
     def to_dict(self) -> dict[str, Any]:
         """Counts, and the summaries of all measures (None where undefined), for JSON."""
         summaries = {
@@ -181,12 +228,13 @@ class Distortion:
         }
 
 
+@takes_mesh
 def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None = None) -> Distortion:
     """Measure what a map does to every triangle of a surface; and, if asked for, to distances farther apart.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles are
         counterclockwise.
     F : (f, 3) array of int
@@ -301,6 +349,9 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
         beltrami=beltrami + undefined,
         flat=shapes.flat,
         flipped=np.flatnonzero(defined & (sign <= 0)),
+        V=V,
+        F=F,
+        uv=uv,
     )
 
 

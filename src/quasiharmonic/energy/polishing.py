@@ -24,6 +24,7 @@ from quasiharmonic.energy.energies import (
 from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
 from quasiharmonic.energy.sliding import SlidingDescent, lay_boundary
 from quasiharmonic.exact.certificate import certify, flipped_triangles
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
@@ -37,6 +38,7 @@ ENERGIES: dict[str, Energy] = {
 }
 
 
+@takes_mesh
 @heard
 def polish(
     V: ArrayLike,
@@ -56,7 +58,7 @@ def polish(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles.
@@ -215,6 +217,7 @@ def polish_map(
         history=history,
         linear_solver=descent.system.solver.name,
         seconds=seconds,
+        V=domain.V,
     )
 
 

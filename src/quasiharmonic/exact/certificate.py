@@ -32,15 +32,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_range, map_array, named, triangle_rows
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    ReadOnly,
+    check_range,
+    counted,
+    map_array,
+    named,
+    triangle_rows,
+)
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.given.objects import mesh_triangles
 from quasiharmonic.mesh.topology import edges, trace_loops
+from quasiharmonic.showing import Shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SignArray = NDArray[np.int8]
 
@@ -48,8 +62,8 @@ SignArray = NDArray[np.int8]
 TRIANGLE_CHUNK = 1 << 16
 
 
-@dataclass(frozen=True, eq=False)
-class Certificate(ReadOnly):
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(ReadOnly, Shown):
     """What was decided exactly about a map; made by `certify`.
 
     Attributes
@@ -70,6 +84,9 @@ class Certificate(ReadOnly):
         not share. At most 1000 are listed.
     overwound : (k,) int64
         Interior vertices around which positive triangles wind more than once.
+    F : (f, 3) int64
+    uv : (n, 2) float64
+        What was judged.
     """
 
     triangles: int
@@ -81,12 +98,23 @@ class Certificate(ReadOnly):
     loops: tuple[IntArray, ...]
     crossings: IntArray
     overwound: IntArray
+    F: IntArray
+    uv: FloatArray
 
     def __post_init__(self) -> None:
         self._seal()
 
-    def _read_only(self) -> tuple[IntArray, ...]:
-        return self.flipped, self.degenerate, self.nonfinite, self.crossings, self.overwound, *self.loops
+    def _read_only(self) -> tuple[NDArray[Any], ...]:
+        return (
+            self.F,
+            self.uv,
+            self.flipped,
+            self.degenerate,
+            self.nonfinite,
+            self.crossings,
+            self.overwound,
+            *self.loops,
+        )
 
     @property
     def injective(self) -> bool:
@@ -110,6 +138,19 @@ class Certificate(ReadOnly):
             return said
         more = f"; and {len(further) - 3} more" if len(further) > 3 else ""
         return f"{said} Not bijective{'' if self.injective else ' either'}: {'; '.join(further[:3])}{more}."
+
+    def in_short(self) -> str:
+        bad = self.flipped.size + self.degenerate.size + self.nonfinite.size
+        triangles = counted("triangle", "triangles", self.triangles)
+        if bad or not self.triangles:
+            return f"not injective, {bad:,} of {triangles} not positive"
+        also = {True: " and bijective", False: ", not bijective", None: ""}[self.bijective]
+        return f"injective{also}, {triangles}"
+
+    def plot(self) -> Figure:
+        """Draw the map that was judged, triangles that are not positive in red, boundary edges that meet marked."""
+        figure: Figure = self._drawn("certificate")
+        return figure
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain Python types, fit for JSON; of a loop, its first vertex and its length."""
@@ -206,6 +247,9 @@ def certify(
         loops=tuple(known),
         crossings=crossings,
         overwound=overwound,
+        # What nobody can change any more is not copied.
+        F=F if not F.flags.writeable else F.copy(),
+        uv=uv,
     )
 
 
@@ -258,10 +302,10 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
 
 def _checked(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
-    triangles, places = triangle_rows(F, copy=False), map_array("uv", uv, finite=False)
+    triangles, places = triangle_rows(mesh_triangles(F), copy=False), map_array("uv", uv, finite=False)
     check_range("F", triangles, len(places))
     # Of the numeric types, wide integers and extended precision have values that double has not.
-    given = np.asarray(uv)
+    given = np.asarray(getattr(uv, "uv", uv))
     rounded = np.zeros(places.shape, dtype=bool)
     if given.dtype.kind != "f":
         rounded = np.abs(places) >= 2.0**53

@@ -20,9 +20,8 @@ from quasiharmonic.arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
-    check_finite,
+    map_array,
     not_negative,
-    real_array,
     whole_number,
 )
 from quasiharmonic.energy.distances import Sampling, SurfaceDistances, sampled
@@ -32,6 +31,7 @@ from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
 from quasiharmonic.flattening.piece import Piece, Settings
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
@@ -45,6 +45,7 @@ _WORK, _FEWEST, _MOST = 1_000_000, 1000, 4000
 _ACCURACY, _GRADIENTS = 0.1, 20
 
 
+@takes_mesh
 @heard
 def keep_distances(
     V: ArrayLike,
@@ -69,7 +70,7 @@ def keep_distances(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles of a connected surface with at least one boundary loop and without handles.
@@ -125,10 +126,7 @@ def keep_distances(
     not_negative("tolerance", tolerance)
     piece = Piece(V, F)
     n = len(piece.V)
-    places = real_array("uv", uv)
-    if places.shape != (n, 2):
-        raise ValueError(f"uv must have shape ({n}, 2), a position for every vertex, not {places.shape}")
-    check_finite("uv", "vertex", "vertices", places)
+    places = map_array("uv", uv, n)
     judged = certify(piece.F, places, loops=piece.loops)
     if not judged.bijective:
         raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
@@ -136,7 +134,8 @@ def keep_distances(
     result = kept(piece, places, rings, settings)
     uv = np.ldexp(result.uv, piece.exponent)
     certificate = certify(piece.F, uv, loops=piece.loops)
-    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began)
+    rest = np.ldexp(piece.V, piece.exponent)
+    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began, V=rest)
 
 
 def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first: int = 0) -> MapResult:

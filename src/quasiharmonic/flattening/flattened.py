@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
-    index_array,
     map_array,
     named,
     not_negative,
-    real_array,
+    triangle_rows,
+    vertex_array,
     whole_number,
 )
 from quasiharmonic.energy.deformation import positive_weights
@@ -36,6 +36,7 @@ from quasiharmonic.flattening.distance_descent import kept
 from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
 from quasiharmonic.flattening.parts import Part, furthest_last, parts_of
 from quasiharmonic.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.result import MapResult, Status, Step
 
@@ -43,6 +44,7 @@ from quasiharmonic.result import MapResult, Status, Step
 _SAMPLED = 10.0
 
 
+@takes_mesh
 @heard
 def flatten(
     V: ArrayLike,
@@ -66,7 +68,7 @@ def flatten(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles of one or several surfaces, each with at least one boundary loop, holes welcome, and no handles.
@@ -159,7 +161,7 @@ def flatten(
     density = SymmetricDirichlet() if of_distances else energy_named(energy)
     name = "symmetric-dirichlet" if of_distances else energy if isinstance(energy, str) else type(energy).__name__
     settings = Settings(density, name, tolerance, max_iterations, linear_solver, callback, record)
-    V, F = real_array("V", V), index_array("F", F)
+    V, F = vertex_array(V), triangle_rows(F)
     weights = None if weights is None else positive_weights(weights, len(F))
     given = None if start is None else _injective(start, V, F)
     parts = parts_of(V, F)
@@ -173,7 +175,7 @@ def flatten(
         pins = checked_pins(fixed, target, len(V))
         if len(parts) == 1:
             result = pinned(parts[0].piece, *pins, settings, weights, given)
-            return replace(result, seconds=time.perf_counter() - began)
+            return replace(result, seconds=time.perf_counter() - began, V=V)
         has_pins = [bool(np.isin(pins[0], part.vertices).any()) for part in parts]
         held = [part for part, has in zip(parts, has_pins, strict=True) if has]
         free = [part for part, has in zip(parts, has_pins, strict=True) if not has]
@@ -213,6 +215,7 @@ def flatten(
         diagnosis=results[0].diagnosis,
         linear_solver=results[0].linear_solver,
         seconds=time.perf_counter() - began,
+        V=V,
     )
 
 
@@ -237,7 +240,7 @@ def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
     ValueError
         As `flatten` says of surfaces.
     """
-    V, F = real_array("V", V), index_array("F", F)
+    V, F = vertex_array(V), triangle_rows(F)
     pieces = [part.piece for part in parts_of(V, F)]
     for piece in pieces:
         # Says which rest triangles have no area.

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, index_array, not_negative, real_array
+from quasiharmonic.arrays import FloatArray, index_array, map_array, not_negative
 from quasiharmonic.exact.certificate import certify
+from quasiharmonic.given.objects import mesh_triangles
 from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.mesh.topology import components
 
@@ -85,7 +86,7 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     if unit not in UNITS:
         raise ValueError(f"unit must be one of {', '.join(UNITS)}, not {unit!r}")
     not_negative("allowance", allowance)
-    triangles, places = index_array("F", F), real_array("uv", uv)
+    triangles, places = index_array("F", mesh_triangles(F)), map_array("uv", uv)
     judged = certify(triangles, places)
     if not judged.bijective:
         raise ValueError(f"what overlaps itself cannot be cut out. {judged.summary()}")

@@ -33,7 +33,7 @@ from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent, descend
 from quasiharmonic.flattening.piece import Flattening, Piece, Settings
 from quasiharmonic.flattening.pin_obstructions import pin_obstructions
-from quasiharmonic.mesh.refinement import refine
+from quasiharmonic.mesh.refinement import split_edges
 from quasiharmonic.mesh.topology import edge_keys, edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
@@ -257,7 +257,7 @@ class Pinned:
         inner = edges(F, len(points)).interior
         split = self._of_air(inner[np.isin(inner, fixed).all(axis=1)])
         for _ in range(1 + _SPLITS):
-            refined = refine(points, F, split)
+            refined = split_edges(points, F, split)
             F, points = refined.F, refined.V
             problem = Problem(points, F, fixed, target, reference="equilateral")
             settings = self._settings

@@ -94,48 +94,8 @@ def composed(first: Refined, second: Refined) -> Refined:
     return Refined(second.V, second.F, first.parent[second.parent], parents, weights_)
 
 
-def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
-    """Split edges of a mesh at their midpoints, and the triangles beside them to match.
-
-    A triangle with one split edge becomes two, with two three (along the shorter diagonal of the
-    quadrilateral that remains), with three four. No other triangle changes, and no old vertex moves
-    or changes its index, so that fixed vertices stay as they are.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) array
-        Vertices.
-    F : (f, 3) array of int
-        Triangles, no edge in more than two of them.
-    edges : (s, 2) array of int
-        Edges to split, as pairs of vertices in any order; naming one twice does no harm.
-        `Diagnosis.split` names those that stand in the way of a map.
-    boundary : bool
-        Also split edges on the boundary. Their midpoints are new boundary vertices, which need a
-        position in the target: `Refined.extend` finds them one.
-
-    Returns
-    -------
-    Refined
-
-    Raises
-    ------
-    ValueError
-        When a pair is not an edge of the mesh, or is on its boundary and ``boundary`` is false; when
-        indices are no integers, have the wrong shape or refer to no vertex; when positions are no real
-        numbers, not finite or of the wrong shape.
-
-    See Also
-    --------
-    refine_problem : splits what a diagnosis names.
-
-    Examples
-    --------
-    >>> V = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
-    >>> refined = refine(V, [[0, 1, 2], [0, 2, 3]], [[0, 2]])
-    >>> refined.F.tolist(), refined.parent.tolist()
-    ([[4, 1, 2], [4, 3, 0], [4, 0, 1], [4, 2, 3]], [0, 1, 0, 1])
-    """
+def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
+    """Split edges at their midpoints; `quasiharmonic.refine` on arrays."""
     V, F = vertex_array(V), triangle_rows(F)
     n = len(V)
     check_range("F", F, n)

@@ -2,14 +2,18 @@
 
 from quasiharmonic.plot.animation import save_animation, save_figures
 from quasiharmonic.plot.boundary import save_boundary_figure
+from quasiharmonic.plot.convergence import plot_convergence
 from quasiharmonic.plot.distortion import plot_distortion, save_distortion_figure
 from quasiharmonic.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
+from quasiharmonic.plot.problems import plot_problem
 from quasiharmonic.plot.texture import plot_texture, save_texture_figure
 
 __all__ = [
     "plot_before_after",
+    "plot_convergence",
     "plot_distortion",
     "plot_map",
+    "plot_problem",
     "plot_surface",
     "plot_texture",
     "save_animation",

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import map_array
+from quasiharmonic.given.taking import writes_mesh
 from quasiharmonic.plot.canvas import as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.plot.shading import view
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@writes_mesh
 def save_animation(
     path: str | PathLike[str],
     V: ArrayLike,
@@ -36,7 +38,7 @@ def save_animation(
     ----------
     path, frames_per_second
         As for `save_figures`.
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface, whose look colours the triangles.
     F : (f, 3) int
     frames : iterable of (str, (n, 2) float)

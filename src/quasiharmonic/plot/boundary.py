@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.plot.canvas import BORDER, INK, RED, as_mesh, caption, fit, new_figure, paint_surface, save_png
+from quasiharmonic.given.taking import writes_mesh
+from quasiharmonic.plot.canvas import BORDER, INK, RED, as_mesh, caption, fit, new_figure, paint_surface, save_picture
 from quasiharmonic.plot.shading import view
 
 # Of a figure's side and of the numbers in it: inches, points.
@@ -18,10 +19,11 @@ _INCHES, _SIZE = 10.0, 7.5
 _DIGIT, _HEIGHT, _OFF = 0.68, 1.25, 0.3
 
 
+@writes_mesh
 def save_boundary_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, loops: Sequence[IntArray], corners: ArrayLike = ()
 ) -> None:
-    """Write a PNG of a surface with its boundary vertices numbered, 1000 × 1000 pixels.
+    """Write a picture of a surface with its boundary vertices numbered, 1000 × 1000 pixels.
 
     A number that would lie over another one is left out; corners have theirs first. Boundaries that the surface hides
     are drawn too.
@@ -29,8 +31,8 @@ def save_boundary_figure(
     Parameters
     ----------
     path : path
-        Replaced as a whole once the picture is complete.
-    V : (n, 2) or (n, 3) float
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     loops : sequence of (l,) int64
         Boundary vertices in order.
@@ -65,7 +67,7 @@ def save_boundary_figure(
         ax.text(x, y, str(border[k]), size=_SIZE, color=color, ha="center", va="center", zorder=7)
     count, many = sum(len(loop) for loop in loops), "" if len(loops) == 1 else "s"
     caption(ax, f"{count:,} boundary vertices in {len(loops)} loop{many}; corners in red")
-    save_png(path, figure)
+    save_picture(path, figure)
 
 
 def _outward(points: FloatArray, F: IntArray, border: IntArray) -> FloatArray:

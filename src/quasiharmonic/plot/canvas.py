@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+#: Endings of pictures: pixels, and two in which lines stay lines.
+PICTURES = (".png", ".svg", ".pdf")
+# So many triangles and more are pixels in these too: as shapes they would fill megabytes.
+_MOST_SHAPES = 10_000
+
 RED = (0.89, 0.07, 0.17)
 INK = (0.06, 0.12, 0.29)
 BORDER = 1.2  # width in points
@@ -26,29 +32,46 @@ _INSIDE = np.array((0.80, 0.82, 0.86))
 
 
 def new_figure(inches: tuple[float, float]) -> Figure:
-    """A white figure of 100 pixels an inch, known to nobody but its owner."""
+    """A white figure of 100 pixels an inch, known to nobody but its owner; a notebook shows it."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+
+        from quasiharmonic.plot.figures import ShownFigure
     except ImportError as error:
         raise ImportError(f"pictures need matplotlib ({error}): pip install 'matplotlib>=3.8'") from error
 
-    figure = Figure(figsize=inches, dpi=100, facecolor="white")
+    figure = ShownFigure(figsize=inches, dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
-def save_png(path: str | PathLike[str], figure: Figure) -> None:
-    """Write a figure as a PNG, replacing the file as a whole.
+def save_picture(path: str | PathLike[str], figure: Figure) -> None:
+    """Write a figure in the format that the file's ending says, replacing the file as a whole.
 
     Raises
     ------
+    ValueError
+        When the ending is none of `PICTURES`.
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
+    from matplotlib import rc_context
+
     from quasiharmonic.io.atomic import write_whole
 
-    write_whole(path, lambda file: figure.savefig(file, format="png"))
+    suffix = check_ending(path)
+    # The same figure is the same file: no date, and no name drawn by lot.
+    metadata: dict[str, dict[str, Any]] = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    with rc_context({"svg.hashsalt": "quasiharmonic"}):
+        write_whole(path, lambda file: figure.savefig(file, format=suffix[1:], metadata=metadata[suffix]))
+
+
+def check_ending(path: str | PathLike[str]) -> str:
+    """The ending of a picture's name in small letters, or a ValueError where it is none of `PICTURES`."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in PICTURES:
+        raise ValueError(f"{path}: pictures are written as {', '.join(PICTURES)}")
+    return suffix
 
 
 def panels(figure: Figure, count: int) -> list[Axes]:
@@ -155,6 +178,7 @@ def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, w
     triangles = PolyCollection(
         _polygons(corners), facecolors=color, edgecolors=edges, linewidths=width, joinstyle="round", zorder=1
     )
+    triangles.set_rasterized(len(corners) > _MOST_SHAPES)
     ax.add_collection(triangles, autolim=False)
 
 

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, check_choice, map_array
 from quasiharmonic.energy.measures import Distortion, distortion
-from quasiharmonic.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_png
+from quasiharmonic.given.taking import takes_mesh, writes_mesh
+from quasiharmonic.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_picture
 from quasiharmonic.plot.shading import lit, view
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class _Scale:
         return colors
 
 
+@takes_mesh
 def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric") -> Figure:
     """Draw a surface and its map coloured by a measure of distortion, and the measure's histogram.
 
@@ -83,7 +85,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface.
     F : (f, 3) int
     uv : (n, 2) float
@@ -124,15 +126,16 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     return figure
 
 
+@writes_mesh
 def save_distortion_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric"
 ) -> None:
-    """Write `plot_distortion`'s figure as a PNG of 1350 × 450 pixels.
+    """Write `plot_distortion`'s figure, a picture of 1350 × 450 pixels.
 
     Parameters
     ----------
     path : path
-        Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
     V, F, uv, measure
         As for `plot_distortion`.
 
@@ -143,7 +146,7 @@ def save_distortion_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    save_png(path, plot_distortion(V, F, uv, measure))
+    save_picture(path, plot_distortion(V, F, uv, measure))
 
 
 _LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.265, 0.74))

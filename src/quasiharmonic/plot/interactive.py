@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, map_array
 from quasiharmonic.energy.measures import distortion
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.plot.canvas import RED, as_mesh
 
 #: Measures of distortion that the window offers as colours.
@@ -19,6 +20,7 @@ SHOWN = ("isometric", "conformal", "area_ratio", "mips")
 _CHECKERS = (0.93, 0.93, 0.90), (0.16, 0.38, 0.75)
 
 
+@takes_mesh
 def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLike[str] | None = None) -> None:
     """Open a window on a surface and its map, and return when it is closed.
 
@@ -27,7 +29,7 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface.
     F : (f, 3) int
     uv : (n, 2) float

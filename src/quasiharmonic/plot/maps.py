@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.given.taking import takes_mesh, writes_mesh
 from quasiharmonic.plot.canvas import (
     as_mesh,
     caption,
@@ -17,7 +18,7 @@ from quasiharmonic.plot.canvas import (
     paint_map,
     paint_surface,
     panels,
-    save_png,
+    save_picture,
     verdict,
 )
 from quasiharmonic.plot.shading import View, view
@@ -27,12 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@takes_mesh
 def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     """Draw a rest surface, shaded and coloured as `plot_map` colours its map.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     ax : matplotlib Axes
         Ordinary two-dimensional ones; the surface is projected here.
@@ -47,6 +49,7 @@ def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     paint_surface(ax, seen, F, seen.color)
 
 
+@takes_mesh
 def plot_map(
     V: ArrayLike,
     F: ArrayLike,
@@ -60,7 +63,7 @@ def plot_map(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface, whose look colours the triangles.
     F : (f, 3) int
     uv : (n, 2) float
@@ -84,11 +87,14 @@ def plot_map(
     """
     rest, F = as_mesh(V, F)
     if ax is None:
-        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9))
+        from quasiharmonic.plot.figures import ShownAxes
+
+        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9), axes_class=ShownAxes)
     _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), flipped, fixed)
     return ax
 
 
+@takes_mesh
 def plot_before_after(
     V: ArrayLike,
     F: ArrayLike,
@@ -101,7 +107,7 @@ def plot_before_after(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     before, after : (n, 2) float
     fixed : (k,) int, optional
@@ -123,6 +129,7 @@ def plot_before_after(
     return figure
 
 
+@writes_mesh
 def save_map_figure(
     path: str | PathLike[str],
     V: ArrayLike,
@@ -133,13 +140,13 @@ def save_map_figure(
     flipped: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
 ) -> None:
-    """Write a PNG of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
+    """Write a picture of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
 
     Parameters
     ----------
     path : path
-        Replaced as a whole once the picture is complete.
-    V : (n, 2) or (n, 3) float
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     uv : (n, 2) float
     before : (n, 2) float, optional
@@ -150,10 +157,23 @@ def save_map_figure(
     Raises
     ------
     ValueError
-        When a vertex of the surface or a map is not finite.
+        When a vertex of the surface or a map is not finite, or the path has another ending.
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
+    save_picture(path, map_figure(V, F, uv, before, flipped=flipped, fixed=fixed))
+
+
+def map_figure(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    before: ArrayLike | None = None,
+    *,
+    flipped: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
+) -> Figure:
+    """Draw what `save_map_figure` writes."""
     rest, F = as_mesh(V, F)
     seen = view(rest, F)
     count = 2 if before is None else 3
@@ -165,7 +185,7 @@ def save_map_figure(
         guess = map_array("before", before, len(rest))
         verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, guess, None, fixed))
     verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, map_array("uv", uv, len(rest)), flipped, fixed))
-    save_png(path, figure)
+    return figure
 
 
 def _draw_map(

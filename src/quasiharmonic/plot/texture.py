@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.given.taking import takes_mesh, writes_mesh
 from quasiharmonic.plot.canvas import (
     RED,
     as_mesh,
@@ -19,7 +20,7 @@ from quasiharmonic.plot.canvas import (
     not_positive,
     outline,
     panels,
-    save_png,
+    save_picture,
     verdict,
 )
 from quasiharmonic.plot.shading import drawable, lit, view
@@ -35,6 +36,7 @@ _SAMPLES = 2  # per pixel and direction
 _CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
 
 
+@takes_mesh
 def plot_texture(
     V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24, picture: str | PathLike[str] | None = None
 ) -> Figure:
@@ -45,7 +47,7 @@ def plot_texture(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) float
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
         The rest surface.
     F : (f, 3) int
     uv : (n, 2) float
@@ -88,6 +90,7 @@ def plot_texture(
     return figure
 
 
+@writes_mesh
 def save_texture_figure(
     path: str | PathLike[str],
     V: ArrayLike,
@@ -97,12 +100,12 @@ def save_texture_figure(
     squares: int = 24,
     picture: str | PathLike[str] | None = None,
 ) -> None:
-    """Write `plot_texture`'s figure as a PNG of 960 × 480 pixels.
+    """Write `plot_texture`'s figure, a picture of 960 × 480 pixels.
 
     Parameters
     ----------
     path : path
-        Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
     V, F, uv, squares, picture
         As for `plot_texture`.
 
@@ -113,7 +116,7 @@ def save_texture_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    save_png(path, plot_texture(V, F, uv, squares=squares, picture=picture))
+    save_picture(path, plot_texture(V, F, uv, squares=squares, picture=picture))
 
 
 def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:

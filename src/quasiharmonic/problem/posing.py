@@ -5,18 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import get_args
+from typing import TYPE_CHECKING, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, held_places
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, counted, held_places
+from quasiharmonic.given.objects import MeshLike
+from quasiharmonic.given.taking import made_of_mesh
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.frame import Frame
+from quasiharmonic.showing import Shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
-class Problem(ReadOnly):
+class Problem(ReadOnly, Shown):
     """A mesh with positions in the plane for its boundary and any pinned interior vertices.
 
     What is malformed raises; what is merely hard or hopeless (a target that crosses itself, is wound
@@ -24,7 +30,7 @@ class Problem(ReadOnly):
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions, planar or curved; any real dtype.
     F : (f, 3) array of int
         Triangles, 0-based and consistently oriented. Never reordered. A planar target is wound as the
@@ -57,6 +63,21 @@ class Problem(ReadOnly):
     target: FloatArray
     reference: Reference | None
 
+    @overload
+    def __init__(
+        self,
+        V: ArrayLike,
+        F: ArrayLike,
+        fixed: ArrayLike,
+        target: ArrayLike,
+        *,
+        reference: Reference | None = None,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self, V: MeshLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None
+    ) -> None: ...
+    @made_of_mesh
     def __init__(
         self,
         V: ArrayLike,
@@ -150,6 +171,29 @@ class Problem(ReadOnly):
     def fixed(self) -> IntArray:
         """The domain's held vertices (k,) int64."""
         return self.domain.fixed
+
+    def in_short(self) -> str:
+        loops = counted("boundary loop", "boundary loops", len(self.domain.loops))
+        return f"{self.n:,} vertices, {len(self.F):,} triangles, {loops}, {len(self.fixed):,} fixed"
+
+    def summary(self) -> str:
+        """Say in a few lines what is to be mapped and where its fixed vertices go."""
+        (left, lower), (right, upper) = self.target.min(axis=0), self.target.max(axis=0)
+        curved = self.V.shape[1] == 3 and np.ptp(self.V[:, 2]) > 0
+        loops = counted("boundary loop", "boundary loops", len(self.domain.loops))
+        lengths = ", ".join(f"{len(loop):,}" for loop in self.domain.loops)
+        return "\n".join(
+            (
+                f"{'A curved surface' if curved else 'A planar mesh'}: {self.n:,} vertices, {len(self.F):,} triangles.",
+                f"{loops}, of {lengths} vertices; {counted('pin', 'pins', len(self.domain.pins))} inside.",
+                f"Its fixed vertices go to [{left:.4g}, {right:.4g}] × [{lower:.4g}, {upper:.4g}].",
+            )
+        )
+
+    def plot(self) -> Figure:
+        """Draw the surface beside where its boundary and its pins go; a matplotlib Figure."""
+        figure: Figure = self._drawn("problem")
+        return figure
 
     @cached_property
     def frame(self) -> Frame:

@@ -28,6 +28,7 @@ from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.exact.diagnosis import diagnose
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.regularisers import Conformal
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Domain, Problem
@@ -49,6 +50,7 @@ BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
 ETA = (0.1, 0.1, 0.01, 0.001)
 
 
+@takes_mesh
 @heard
 def harmonise(
     V: ArrayLike,
@@ -74,7 +76,7 @@ def harmonise(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles.
@@ -259,6 +261,7 @@ def harmonise_map(
         diagnosis=diagnosis,
         linear_solver=objective.laplacian.solver.name,
         seconds=time.perf_counter() - began,
+        V=domain.V,
     )
 
 

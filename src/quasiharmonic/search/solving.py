@@ -22,6 +22,7 @@ from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH, beltrami_coefficients
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
@@ -30,6 +31,7 @@ from quasiharmonic.search.stages import Search, Stages
 from quasiharmonic.search.strategy import stages_of
 
 
+@takes_mesh
 @heard
 def injective_map(
     V: ArrayLike,
@@ -51,7 +53,7 @@ def injective_map(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions of a planar or curved mesh, disk-like or with holes.
     F : (f, 3) array of int
         Triangles, consistently oriented.
@@ -188,6 +190,7 @@ def solve(
         linear_solver=search.linear_solver,
         mu=None if field is None else field.mu,
         reference=search.best_reference,
+        V=problem.V,
     )
     if lower is not None and status is Status.INJECTIVE:
         result = polished(problem, result, energy=lower, linear_solver=linear_solver, callback=callback, slide=slide)

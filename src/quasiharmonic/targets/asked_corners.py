@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, vertex_array
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.io.textual import integer
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.targets.pins import Corners
@@ -130,12 +131,13 @@ def read_corners(text: str) -> AskedCorners:
     return AskedCorners(tuple(entries))
 
 
+@takes_mesh
 def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArray:
     """Find the boundary vertex nearest to each of some places.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Vertices.
     F : (f, 3) array of int
         Triangles, consistently oriented.

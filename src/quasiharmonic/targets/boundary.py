@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from os import PathLike
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, kind_of
 from quasiharmonic.exact.loops import judge_loops, listed
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.targets.chords import chords_of
 from quasiharmonic.targets.contours import from_corner, in_unit
 from quasiharmonic.targets.corner_fit import pins_by_angle
 from quasiharmonic.targets.correspondence import arc, seen_flat
 from quasiharmonic.targets.holes import least_stretch, match_holes
-from quasiharmonic.targets.nesting import Arranged, arranged
+from quasiharmonic.targets.nesting import Arranged, arranged, filled
 from quasiharmonic.targets.pins import Corners, Pins
 from quasiharmonic.targets.placement import Placement
+from quasiharmonic.targets.specification import outline as specified
 from quasiharmonic.targets.turning import boundary_turning, in_space, outermost
 
 
+@takes_mesh
 def boundary_to(
     V: ArrayLike,
     F: ArrayLike,
-    outline: Sequence[ArrayLike] | FloatArray,
+    outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str],
     *,
     corners: Corners | Literal["auto"] | None = None,
     corner_angle: float = 20.0,
@@ -42,13 +46,14 @@ def boundary_to(
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles of one connected surface without handles.
-    outline : list of (k, 2) float, or one (k, 2) float
+    outline : list of (k, 2) float, one (k, 2) float, or str or path
         An outer contour and as many holes as the surface has further boundary loops, wound as they like.
-        None may cross or touch itself or another.
+        None may cross or touch itself or another. Or the words for one, as `outline` takes them: ``"letter:R"``,
+        ``"rect:2x1"``, ``"drawing.svg"``; its holes are filled for a surface that has none.
     corners : sequence of int, mapping from int, or "auto", optional
         Boundary vertices that go to corners of the outline. In a sequence there is one for every corner
         of its contour, in order from the contour's first (an outline without corners has its first
@@ -78,7 +83,7 @@ def boundary_to(
     surface = Domain(V, F, [])
     count = surface.n
     # Numbers of corners are the user's, whichever way the outline runs: the first of them stays the first point.
-    given = [outline] if isinstance(outline, np.ndarray) and outline.ndim == 2 else list(outline)
+    given = _contours(outline, surface)
     found = arranged(given)
     if not found:
         raise ValueError("the outline has no contour")
@@ -120,6 +125,18 @@ def boundary_to(
     target = np.ldexp(np.concatenate([places[i] for i in range(len(loops))]), exponent)
     _check_simple(loops, target, count)
     return np.concatenate(loops), target
+
+
+def _contours(outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str], surface: Domain) -> list[ArrayLike]:
+    """The contours that were given, or that the words for them mean."""
+    if isinstance(outline, str | PathLike):
+        meant = specified(outline)
+        return list(filled(meant)) if len(surface.loops) == 1 else list(meant)
+    if not isinstance(outline, Iterable):
+        raise ValueError(f'outline must be contours (k, 2), or words as "letter:R", not {kind_of(outline)}')
+    contours = list(outline)
+    # Rows of two numbers are the points of one contour.
+    return [contours] if contours and all(np.ndim(row) == 1 for row in contours) else contours
 
 
 def _check_fit(surface: Domain, contours: list[Arranged]) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, triangle_rows
+from quasiharmonic.given.objects import mesh_triangles
 from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.targets.contours import as_complex
 
@@ -55,7 +56,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     (s, 2) int64
         The edges, smaller vertex first.
     """
-    F = np.asarray(F, dtype=np.int64)
+    F = triangle_rows(mesh_triangles(F))
     fixed = np.asarray(fixed, dtype=np.int64)
     places = np.asarray(target, dtype=np.float64)
     n = int(F.max()) + 1

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_finite, real_array
 
 # A path of lines and Bézier curves: the control points (degree + 1, 2) of each piece, joined end to start.
 Pieces = list[FloatArray]
@@ -58,7 +58,7 @@ def in_unit(contours: Sequence[FloatArray]) -> tuple[list[FloatArray], int]:
 
 def checked(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> FloatArray:
     """A closed curve as float64; `ValueError` unless it has at least three points, all finite."""
-    points = np.asarray(curve, dtype=np.float64)
+    points = real_array(name, curve)
     if points.ndim != 2 or points.shape[1] not in widths or len(points) < 3:
         wanted = " or ".join(f"(k, {w})" for w in widths)
         raise ValueError(f"{name} must be {wanted} with k at least 3, not {points.shape}")

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, triangle_array, vertex_array, whole_number
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.mesh.reference import rest_frames
 from quasiharmonic.mesh.topology import boundary_loops
 
@@ -88,12 +89,13 @@ class BoundaryLoop:
         return found, mean_turns(lengths, self.turning, found)
 
 
+@takes_mesh
 def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     """Measure how the boundary of a surface turns at each of its vertices.
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles, consistently oriented; in as many pieces as they like.
@@ -132,6 +134,7 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     ]
 
 
+@takes_mesh
 def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
     """Find corners of a surface by angle: boundary vertices between which the boundary is as straight as it can be.
 
@@ -140,7 +143,7 @@ def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
         Triangles, consistently oriented.

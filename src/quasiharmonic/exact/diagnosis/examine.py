@@ -85,7 +85,7 @@ def diagnose(problem: Problem) -> Diagnosis:
         message = "The target is wound against the mesh: every loop runs the wrong way around."
         loops = np.arange(len(problem.domain.loops))
         reversed_ = Obstruction(Kind.REVERSED, Forbids.INJECTIVE, message, loops=loops)
-        return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",))
+        return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",), problem)
 
     proper = _proper(curves)
     unchecked = list(_unchecked(curves, proper))
@@ -112,7 +112,7 @@ def diagnose(problem: Problem) -> Diagnosis:
         unchecked.append(f"link distances of boundary vertices that are {shortcuts.unchecked} or more edges apart")
     elif proper:
         unchecked.append("link distances of fixed vertices that are three or more edges apart, around holes")
-    return Diagnosis(tuple(found), tuple(unchecked))
+    return Diagnosis(tuple(found), tuple(unchecked), problem)
 
 
 def _unplaced(

@@ -6,12 +6,18 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import IntArray, ReadOnly, named
+from quasiharmonic.showing import Shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from quasiharmonic.problem import Problem
 
 
 class Forbids(Enum):
@@ -111,8 +117,8 @@ class Obstruction(ReadOnly):
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown):
     """All obstructions found, and what was not looked for.
 
     Attributes
@@ -122,10 +128,13 @@ class Diagnosis:
         which does not prove that a map exists.
     unchecked : tuple of str
         Conditions that do not apply or were not decided for this problem, and why.
+    problem : Problem or None
+        What was examined, where it is a whole problem.
     """
 
     obstructions: tuple[Obstruction, ...]
     unchecked: tuple[str, ...] = ()
+    problem: Problem | None = None
 
     @property
     def forbids_injective(self) -> bool:
@@ -169,6 +178,28 @@ class Diagnosis:
             lines.append(f"Splitting {edges} may help: refine_problem, or qhm refine on the command line.")
         lines += [f"Not checked: {text}" for text in self.unchecked]
         return "\n".join(lines)
+
+    def in_short(self) -> str:
+        if not self.obstructions:
+            return "no known obstruction"
+        kinds = Counter(o.kind.name.lower().replace("_", " ") for o in self.obstructions)
+        found = ", ".join(f"{count} × {kind}" for kind, count in kinds.items())
+        return f"no {'injective' if self.forbids_injective else 'bijective'} map: {found}"
+
+    def plot(self) -> Figure:
+        """Draw the surface and where its fixed vertices go, what forbids a map in red.
+
+        Returns
+        -------
+        matplotlib Figure
+
+        Raises
+        ------
+        ValueError
+            When the problem is not known.
+        """
+        figure: Figure = self._drawn("diagnosis")
+        return figure
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the verdicts, every obstruction, the edges to split."""
