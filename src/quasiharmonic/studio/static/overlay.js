@@ -19,13 +19,14 @@ export function drawOverlay(context, scene, space, plane) {
   outline(context, scene, plane);
   badTriangles(context, scene, plane);
   obstructions(context, scene, (v) => plane.pointOf(...scene.placeOf(v)));
-  handles(context, scene, (v) => plane.pointOf(...scene.placeOf(v)), true);
+  handles(context, scene, (v) => plane.pointOf(...scene.placeOf(v)), { numbered: true });
   if (scene.sketch.length) sketch(context, scene, plane);
   context.restore();
   context.save();
   clip(context, space.box);
   obstructions(context, scene, (v) => space.project(v));
-  handles(context, scene, (v) => space.project(v), false);
+  const faint = (v) => (space.looksAway(v, scene.triangles) ? 0.25 : 1);
+  handles(context, scene, (v) => space.project(v), { faint });
   context.restore();
 }
 
@@ -98,20 +99,27 @@ function obstructions(context, scene, point) {
   }
 }
 
-function handles(context, scene, point, numbered) {
+function handles(context, scene, point, { numbered = false, faint = () => 1 }) {
   context.font = "600 12px system-ui, sans-serif";
   context.textAlign = "center";
   context.textBaseline = "middle";
-  for (const vertex of scene.corners) square(context, point(vertex), vertex === scene.chosen ? 8 : 6, HANDLE);
-  for (const vertex of scene.pins) disc(context, point(vertex), vertex === scene.chosen ? 8 : 6, PIN);
+  for (const [vertices, draw, colour] of [[scene.corners, square, HANDLE], [scene.pins, disc, PIN]]) {
+    for (const vertex of vertices) {
+      context.globalAlpha = faint(vertex);
+      draw(context, point(vertex), vertex === scene.chosen ? 8 : 6, colour);
+    }
+  }
   if (numbered) scene.corners.forEach((vertex, i) => label(context, point(vertex), scene.numbers[i]));
   const marked = scene.chosen >= 0 ? scene.chosen : scene.hovered;
-  if (marked < 0) return;
-  context.strokeStyle = scene.chosen >= 0 ? HANDLE : INK;
-  context.lineWidth = 2.5;
-  context.beginPath();
-  context.arc(...point(marked), 10, 0, 2 * Math.PI);
-  context.stroke();
+  if (marked >= 0) {
+    context.globalAlpha = faint(marked);
+    context.strokeStyle = scene.chosen >= 0 ? HANDLE : INK;
+    context.lineWidth = 2.5;
+    context.beginPath();
+    context.arc(...point(marked), 10, 0, 2 * Math.PI);
+    context.stroke();
+  }
+  context.globalAlpha = 1;
 }
 
 function square(context, [x, y], half, colour) {
@@ -135,7 +143,6 @@ function disc(context, [x, y], radius, colour) {
 }
 
 function label(context, [x, y], text) {
-  if (text === undefined || text < 0) return;
   context.lineWidth = 3;
   context.strokeStyle = PAPER;
   context.fillStyle = INK;

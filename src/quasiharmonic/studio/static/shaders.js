@@ -63,7 +63,7 @@ void main() {
   }
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
   float facing = dot(normal, toward);
-  float light = flat_pane ? 0.62 + 0.38 * max(facing, 0.0) : 0.45 + 0.55 * abs(facing);
+  float light = flat_pane ? 0.82 + 0.18 * facing : 0.45 + 0.55 * abs(facing);
   vec3 base = colouring == 0 ? checker() : ramp(log2(stretch()) / reach);
   if (!flat_pane && !gl_FrontFacing) base *= 0.6;
   colour = vec4(base * light, 1.0);
@@ -172,7 +172,8 @@ export class Painter {
     gl.uniform1i(this.at.colouring, FLAT);
     if (look.edges) {
       gl.enable(gl.BLEND);
-      gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+      // Opaque as before: what shines through would be the page.
+      gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
       gl.uniform4f(this.at.flat_colour, 0.06, 0.12, 0.29, 0.35);
       this.#draw(gl.LINES, this.buffers.edges, this.surface.edges.length);
       gl.disable(gl.BLEND);

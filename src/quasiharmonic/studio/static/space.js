@@ -10,6 +10,7 @@ export class SpaceView {
       high[i % 3] = Math.max(high[i % 3], positions[i]);
     }
     this.positions = positions;
+    this.normals = new Map();
     this.centre = low.map((value, k) => (value + high[k]) / 2);
     this.radius = Math.hypot(...low.map((value, k) => (high[k] - value) / 2)) || 1;
     this.box = { x: 0, y: 0, width: 1, height: 1 };
@@ -76,6 +77,24 @@ export class SpaceView {
       this.box.x + this.box.width / 2 + x * this.pixels + this.shift[0],
       this.box.y + this.box.height / 2 - y * this.pixels + this.shift[1],
     ];
+  }
+
+  /** Whether a vertex looks away from the eye, by the triangles around it. */
+  looksAway(vertex, triangles) {
+    if (!this.normals.has(vertex)) this.normals.set(vertex, this.#normal(vertex, triangles));
+    const normal = this.normals.get(vertex);
+    return this.axes[2].reduce((sum, a, k) => sum + a * normal[k], 0) < 0;
+  }
+
+  #normal(vertex, triangles) {
+    const sum = [0, 0, 0];
+    for (let t = 0; t < triangles.length; t += 3) {
+      if (triangles[t] !== vertex && triangles[t + 1] !== vertex && triangles[t + 2] !== vertex) continue;
+      const [a, b, c] = [0, 1, 2].map((k) => this.positions.subarray(3 * triangles[t + k], 3 * triangles[t + k] + 3));
+      const [u, v] = [b, c].map((p) => [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
+      [0, 1, 2].forEach((k) => (sum[k] += u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3]));
+    }
+    return sum;
   }
 
   /** The nearest triangle under a point of the screen and the vertex of it nearest to that point, or null. */
