@@ -15,9 +15,9 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "studio",
         help="take hold of a map in the browser",
-        description="Open a page with a surface beside its map: drag corners, pins and the boundary, and the map follows, "
-        "each picture of it certified. Needs the extra 'studio'. Only this machine can open the page, by the address "
-        "that is printed. Ctrl-C ends it.",
+        description="Open a page with a surface beside its map: drag corners, pins and the boundary, and the map "
+        "follows, each picture of it certified. Needs the extra 'studio'. Only this machine can open the page, by the "
+        "address that is printed. Ctrl-C ends it.",
         epilog="Exit status: 0 ended by Ctrl-C; 2 wrong input or call.",
     )
     parser.add_argument(
@@ -25,7 +25,8 @@ def add_parser(commands: Commands) -> None:
         type=Path,
         nargs="?",
         metavar="INPUT",
-        help="OBJ, OFF, PLY, GLB, glTF or STL file, or a folder with input.obj and handles.txt (default: a surface of ours)",
+        help="OBJ, OFF, PLY, GLB, glTF or STL file, or a folder with input.obj and handles.txt (default: a surface of "
+        "ours)",
     )
     parser.add_argument("--port", type=int, default=0, metavar="N", help="listen there (default: any that is free)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and leave the browser alone")
@@ -36,6 +37,7 @@ def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     import asyncio
     import webbrowser
+    from contextlib import suppress
 
     try:
         from quasiharmonic.studio.server import Studio
@@ -57,8 +59,6 @@ def run(options: argparse.Namespace) -> int:
         if not options.no_browser:
             webbrowser.open(address)
 
-    try:
+    with suppress(KeyboardInterrupt):
         asyncio.run(Studio(source).run(options.port, ready))
-    except KeyboardInterrupt:
-        pass
     return 0

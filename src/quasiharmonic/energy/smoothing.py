@@ -1,4 +1,4 @@
-"""The worst distortion taken off a map by a few steps, where that is cheap: what is done when nobody has asked for more."""
+"""The worst distortion taken off a map by a few steps, where that is cheap: what is done unasked."""
 
 from __future__ import annotations
 

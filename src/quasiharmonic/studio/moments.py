@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,12 +34,15 @@ class Moment:
     recipe : Recipe
     corners : tuple of int
         Boundary vertices at which sides end, in the order of the outline's corners.
+    chosen : tuple of (int, int)
+        Vertices that the visitor has sent to a corner, and its number.
     """
 
     problem: Problem
     result: MapResult
     recipe: Recipe
     corners: tuple[int, ...] = ()
+    chosen: tuple[tuple[int, int], ...] = ()
 
     @property
     def pins(self) -> list[int]:
@@ -48,10 +50,20 @@ class Moment:
         edge = sum(map(len, self.problem.domain.loops))
         return [int(v) for v in self.problem.fixed[edge:]]
 
+    @property
+    def held(self) -> list[int]:
+        """Boundary vertices at corners that somebody has chosen, or their angles: what does not slide."""
+        return list(self.corners) if self.recipe.corners == "auto" else [v for v, _ in self.chosen]
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the map's held vertices are where they are to be."""
+        return np.array_equal(self.result.uv[self.problem.fixed], self.problem.target)
+
     def with_target(self, target: FloatArray) -> Moment:
         """The same with its held vertices elsewhere, by hand."""
         recipe = replace(self.recipe, outline=None, corners=None, free=False, energy=None, slide=False)
-        return replace(self, problem=self.problem.moved(target), recipe=recipe)
+        return replace(self, problem=self.problem.moved(target), recipe=recipe, chosen=())
 
 
 class Measured:
@@ -99,9 +111,10 @@ def bad_triangles(certificate: Certificate) -> Array:
     return np.sort(some).astype(np.uint32)
 
 
-def told(result: MapResult) -> list[dict[str, Any]]:
+def told(moment: Moment) -> list[dict[str, Any]]:
     """What forbids a map, or a bijective one, as the page marks it."""
-    if result.diagnosis is None:
+    diagnosis, loops = moment.result.diagnosis, moment.problem.domain.loops
+    if diagnosis is None:
         return []
     return [
         {
@@ -109,14 +122,13 @@ def told(result: MapResult) -> list[dict[str, Any]]:
             "advice": one.advice,
             "forbids": one.forbids.value,
             "vertices": one.vertices.tolist()[:_MOST_ELEMENTS],
-            "edges": one.edges.tolist()[:_MOST_ELEMENTS],
+            "edges": [*one.edges.tolist(), *(edge for k in one.loops for edge in _around(loops[k]))][:_MOST_ELEMENTS],
             "triangles": one.triangles.tolist()[:_MOST_ELEMENTS],
         }
-        for one in result.diagnosis.obstructions[:_MOST_TOLD]
+        for one in diagnosis.obstructions[:_MOST_TOLD]
     ]
 
 
-def held_at(problem: Problem, vertices: Sequence[int]) -> list[int]:
-    """Of some vertices, the rows of ``problem.fixed`` that they are; those not held are left out."""
-    row = {int(v): i for i, v in enumerate(problem.fixed)}
-    return [row[v] for v in vertices if v in row]
+def _around(loop: Array) -> list[list[int]]:
+    """A loop's edges."""
+    return np.stack([loop, np.roll(loop, -1)], axis=1).tolist()

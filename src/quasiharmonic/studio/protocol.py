@@ -78,6 +78,8 @@ def decode(data: bytes) -> Frame:
         raise ProtocolError("a message is shorter than it says")
     try:
         header = json.loads(data[4 : 4 + length])
+        if not isinstance(header, dict):
+            raise ProtocolError("a message has no header")
         arrays = {str(name): _array(data, 4 + length, *about) for name, about in header.pop("arrays", {}).items()}
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ProtocolError(f"a message cannot be read: {error}") from None

@@ -100,7 +100,7 @@ class Studio:
         path = urlsplit(request.path).path
         token, _, name = path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.token.encode()):
-            return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of the address")
+            return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of it")
         if name == "socket":
             origins = request.headers.get_all("Origin")
             if origins != [f"http://{hosts[0]}"]:
@@ -163,4 +163,3 @@ def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; char
 def _port_of(server: Server) -> int:
     port: int = next(iter(server.sockets)).getsockname()[1]
     return port
-

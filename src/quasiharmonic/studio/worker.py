@@ -9,14 +9,13 @@ from __future__ import annotations
 import faulthandler
 import os
 import signal
-import sys
 import threading
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.studio.protocol import Array, Frame, ProtocolError, decode, encode
+from quasiharmonic.studio.protocol import Array, Frame, decode, encode
 from quasiharmonic.studio.session import Session
 from quasiharmonic.studio.sheets import read_sheet
 
@@ -72,10 +71,7 @@ class Inbox:
 
     def _listen(self, source: BinaryIO) -> None:
         while len(head := source.read(8)) == 8:
-            try:
-                self.put(decode(source.read(int.from_bytes(head, "little"))))
-            except ProtocolError as error:
-                print(f"qhm studio: {error}", file=sys.stderr)
+            self.put(decode(source.read(int.from_bytes(head, "little"))))
         # The page has gone, and nobody waits for what is at hand.
         os._exit(0)
 
