@@ -94,19 +94,23 @@ def running(tmp_path_factory):
 def test_files_are_served_to_those_with_the_token_and_to_nobody_else(running):
     token = running.studio.token
     status, headers, content = running.get(f"/{token}/")
-    assert status == 200 and b"qhm studio" in content
+    assert status == 200
+    assert b"qhm studio" in content
     assert "default-src 'none'" in headers["Content-Security-Policy"]
-    assert headers["Referrer-Policy"] == "no-referrer" and "Server" not in headers
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "Server" not in headers
     for name in assets():
         assert running.get(f"/{token}/{name}")[0] == 200
     for path in ("/", "/index.html", f"/{token[:-1]}/", f"/{token}x/", f"/x/{token}/", f"//{token}/"):
         status, _, content = running.get(path)
-        assert status == 403 and b"token" in content and token.encode() not in content
+        assert status == 403
+        assert b"token" in content
+        assert token.encode() not in content
 
 
 @pytest.mark.parametrize(
     "name",
-    ["../server.py", "..%2fserver.py", "static/view.js", "%2e%2e/server.py", "/etc/passwd", "view.js%00", "page"],
+    ["../server.py", "..%2fserver.py", "static/view.js", "%2e%2e/server.py", "/etc/passwd", "view.js%00", "x"],
 )
 def test_no_path_of_the_servers_is_readable(running, name):
     assert running.get(f"/{running.studio.token}/{name}")[0] == 404
@@ -115,7 +119,8 @@ def test_no_path_of_the_servers_is_readable(running, name):
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1", ""])
 def test_a_foreign_host_is_refused(running, host):
     status, _, content = running.get(f"/{running.studio.token}/", Host=host)
-    assert status == 421 and b"studio" not in content
+    assert status == 421
+    assert b"studio" not in content
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,7 @@ _FIRST_OUTLINE = "rect:1x1"
 
 
 def first_moment(sheet: Sheet) -> Moment:
-    """The problem that a surface comes with, its boundary where its own map has it; or a square; or, for one with holes,
-    its boundary where distortion is least.
+    """The problem that a surface comes with: its boundary where its own map has it, on a square, or, with holes, free.
 
     Raises
     ------

@@ -24,7 +24,7 @@ from quasiharmonic.studio.laying import first_moment, freed, holding, laid, with
 from quasiharmonic.studio.moments import Measured, Moment, bad_triangles, told, verdict
 from quasiharmonic.studio.outlines import outline_by_hand, outline_drawn, outline_named
 from quasiharmonic.studio.protocol import Array, Frame
-from quasiharmonic.studio.recipes import FIXED, MAP, Recipe
+from quasiharmonic.studio.recipes import FIXED, MAP
 from quasiharmonic.studio.settling import settle
 from quasiharmonic.studio.sheets import Sheet, dropped_sheet, first_sheet
 
