@@ -1,11 +1,11 @@
-"""How quickly the page follows a hand: maps a second, and milliseconds from the mouse to the picture, in a real browser.
+"""How quickly the page follows a hand: maps a second, and milliseconds from the mouse to the picture, in a browser.
 
     pip install '.[studio]' playwright
     python benchmarks/studio.py --triangles 5000 20000 100000
 
-The mouse goes around in a circle with a corner of the square in its hand. A picture counts when all of it is drawn, by the
-processor where there is no graphics card, which takes its share of the cores. The last columns are the same without a
-browser: what a map costs by itself, its exact verdict included.
+The mouse goes around in a circle with a corner of the square in its hand. A picture counts when all of it is drawn, by
+the processor where there is no graphics card, which takes its share of the cores. The last columns are the same without
+a browser: what a map costs by itself, its exact verdict included.
 """
 
 from __future__ import annotations
@@ -22,16 +22,9 @@ from pathlib import Path
 import numpy as np
 
 ARGUMENTS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
+    *("--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 ]
 
 

@@ -44,8 +44,15 @@ def browser():
 
 
 @pytest.fixture(scope="session")
-def address(browser):
-    with served() as at:
+def address(browser, tmp_path_factory):
+    """A server of a small surface, so that most of the time goes into the browser."""
+    from quasiharmonic.surfaces import cat
+
+    V, F = cat(16)
+    lines = [*(f"v {x!r} {y!r} {z!r}" for x, y, z in V.tolist()), *(f"f {a} {b} {c}" for a, b, c in (F + 1).tolist())]
+    source = tmp_path_factory.mktemp("studio") / "cat.obj"
+    source.write_text("\n".join(lines))
+    with served(source) as at:
         yield at
 
 

@@ -74,8 +74,12 @@ def deed(page, settled, do):
     settled(page)
 
 
-def test_a_first_visit_shows_a_certified_map_and_what_to_drag(address, opened):
-    page = opened(address)
+def test_a_first_visit_shows_a_certified_map_and_what_to_drag(serving, opened):
+    with serving() as address:
+        first_visit(opened(address))
+
+
+def first_visit(page):
     assert "no inverted triangle, no overlap" in page.inner_text("#verdict")
     assert "orange corner" in page.inner_text("#hint")
     assert "qhm map cat.obj --to rect:1x1" in page.inner_text("#command")
@@ -94,7 +98,7 @@ def test_the_map_follows_the_hand_without_a_flip_in_any_frame(address, opened, s
     page = opened(address)
     page.evaluate(RECORD)
     vertex = corner(page, 2)
-    drag(page, vertex, [(-3 * k, 2 * k + 10 * np.sin(k / 4)) for k in range(50)])
+    drag(page, vertex, [(-3 * k, 2 * k + 10 * np.sin(k / 4)) for k in range(40)])
     wait_for_new_rest(page, settled)
     seen = page.evaluate("seen.filter(one => one.seq >= 0)")
     F = triangles(page)
