@@ -314,7 +314,7 @@ class TestPolish:
         worst = {name: distortion(V, F, uv).summary("isometric").maximum for name, uv in maps.items()}
         assert worst["unasked"] < 0.9 * worst["none"]
         # On large meshes the first map is what one gets.
-        monkeypatch.setattr("quasiharmonic.cli.map.LARGEST", 100)
+        monkeypatch.setattr("quasiharmonic.energy.smoothing.LARGEST", 100)
         assert run("map", star, "-o", tmp_path / "large.obj") == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "large.obj")), maps["none"])
 

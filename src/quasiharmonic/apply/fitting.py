@@ -134,14 +134,25 @@ def laid_along(
     chosen = None if corners is None else corners.on(V, F)
     onto = whole if fills else list(contours)
     fixed, target = boundary_to(V, F, onto, corners=chosen, corner_angle=corner_angle)
-    held = _at_corners(fixed, target, onto, corner_angle) if isinstance(chosen, str) else list(chosen or [])
+    held = at_corners(fixed, target, onto, corner_angle) if isinstance(chosen, str) else list(chosen or [])
     problem = Problem(V, F, fixed, target, reference=reference)
     return Fitted(problem, held, holes if fills else 0)
 
 
-def _at_corners(fixed: IntArray, target: FloatArray, contours: list[FloatArray], angle: float) -> list[int]:
-    """Vertices that have come to the corners of an outline, in the order of these."""
-    sharp = [corners_of(unit, angle) for unit in in_unit(contours)[0]]
+def at_corners(fixed: IntArray, target: FloatArray, contours: Sequence[FloatArray], angle: float = 20.0) -> list[int]:
+    """Find the boundary vertices that lie at the corners of an outline, in the order of these.
+
+    Parameters
+    ----------
+    fixed : (b,) int64
+    target : (b, 2) float64
+        As `boundary_to` gives them.
+    contours : sequence of (k, 2) float64
+        What they were laid along.
+    angle : float
+        Degrees by which the outline turns at a corner, at the least.
+    """
+    sharp = [corners_of(unit, angle) for unit in in_unit(list(contours))[0]]
     goals = np.concatenate([contour[marks] for contour, marks in zip(contours, sharp, strict=True)])
     return [int(fixed[(target == goal).all(axis=1)][0]) for goal in goals]
 

@@ -28,6 +28,7 @@ from quasiharmonic.cli import (
     polish,
     refine,
     repair,
+    studio,
     view,
 )
 from quasiharmonic.cli.interrupts import Interrupts
@@ -44,6 +45,7 @@ COMMANDS = (
     measure,
     plot,
     view,
+    studio,
     diagnose,
     refine,
     batch,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,10 +19,6 @@ if TYPE_CHECKING:
     from quasiharmonic.mesh.seams import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
-
-# What is done unasked. On some 10,000 triangles these steps take a few times as long as the first map, and go nearly as
-# far as convergence: a fifth of the MIPS energy, a hundredth of the worst stretch. On larger meshes they are felt.
-STEPS, LARGEST = 20, 100_000
 
 
 def add_parser(commands: Commands) -> None:
@@ -172,25 +167,10 @@ def search(
 def smoothed(problem: Problem, result: MapResult, linear_solver: str, slide: bool | Rails = False) -> MapResult:
     """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
     from quasiharmonic.cli import progress
-    from quasiharmonic.energy.polishing import polished
-    from quasiharmonic.mesh.shapes import rest_shapes
-    from quasiharmonic.result import Status
+    from quasiharmonic.energy import smoothing
 
-    if (len(problem.F) > LARGEST and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
-        return result
     with progress.line() as show:
-        smoother = polished(
-            problem,
-            result,
-            energy="blend",
-            max_iterations=STEPS,
-            linear_solver=linear_solver,
-            callback=show,
-            slide=slide,
-        )
-    # Nobody asked for convergence, so it is not missed.
-    interrupted = smoother.status is Status.INTERRUPTED
-    return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)
+        return smoothing.smoothed(problem, result, linear_solver=linear_solver, callback=show, slide=slide)
 
 
 def summed(facts: list[dict[str, int]]) -> dict[str, int]:

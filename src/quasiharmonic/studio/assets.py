@@ -1,0 +1,69 @@
+"""The page's files, which are read from the package and from nowhere else."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib.resources import files
+from typing import NamedTuple
+
+_KINDS = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+_IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./(\w+)\.js";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
+
+
+class Asset(NamedTuple):
+    """A file of the page: its bytes, and what they are."""
+
+    content: bytes
+    kind: str
+
+
+@cache
+def assets() -> dict[str, Asset]:
+    """All of the page's files by their names."""
+    found = {}
+    for entry in files(__package__).joinpath("static").iterdir():
+        kind = _KINDS.get(entry.name.rpartition(".")[2])
+        if kind is not None and entry.is_file():
+            found[entry.name] = Asset(entry.read_bytes(), kind)
+    return found
+
+
+def bundle(name: str) -> str:
+    """One module with all that a module of the page imports in it, for what has room for one file, as a widget has.
+
+    Parameters
+    ----------
+    name : str
+        Without its ending: ``"view"``.
+
+    Returns
+    -------
+    str
+        JavaScript that exports what the module does.
+
+    Raises
+    ------
+    KeyError
+        When there is no such module.
+    """
+    wrapped: dict[str, str] = {}
+
+    def wrap(module: str) -> list[str]:
+        text = assets()[f"{module}.js"].content.decode()
+        for _, other in _IMPORT.findall(text):
+            if other not in wrapped:
+                wrap(other)
+        exported = _EXPORT.findall(text)
+        inside = _EXPORT.sub("", _IMPORT.sub(r"const \1 = qhm_\2;", text))
+        wrapped[module] = f"const qhm_{module} = (() => {{\n{inside}\nreturn {{ {', '.join(exported)} }};\n}})();\n"
+        return exported
+
+    exported = wrap(name)
+    return "\n".join([*wrapped.values(), f"export const {{ {', '.join(exported)} }} = qhm_{name};\n"])

@@ -1,0 +1,62 @@
+// The certified maps that were shown, kept to be played back and saved as a film.
+
+const MOST_BYTES = 96 * 2 ** 20;
+const MOST_MAPS = 1500;
+const PER_SECOND = 30;
+
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+export class Film {
+  constructor() {
+    this.clear();
+  }
+
+  clear() {
+    this.maps = [];
+    this.bytes = 0;
+    this.playing = false;
+  }
+
+  /** Keep a map; beyond a limit every other one goes, so that the film stays whole and only gets coarser. */
+  add(places) {
+    if (this.playing) return;
+    this.maps.push(places);
+    this.bytes += places.byteLength;
+    if (this.bytes > MOST_BYTES || this.maps.length > MOST_MAPS) {
+      this.maps = this.maps.filter((_, i) => i % 2 === 1);
+      this.bytes = this.maps.reduce((sum, map) => sum + map.byteLength, 0);
+    }
+  }
+
+  /** Show all of them, and then again what was shown. */
+  async play(view, shown = () => {}) {
+    if (this.playing || !this.maps.length) return;
+    this.playing = true;
+    const { places, bad } = view.scene;
+    for (const map of this.maps) {
+      view.show(map);
+      await pause(1000 / PER_SECOND);
+      shown();
+    }
+    view.show(places, bad);
+    this.playing = false;
+  }
+
+  /** Play them into a film; null where the browser cannot. */
+  async record(view) {
+    if (!window.MediaRecorder || !HTMLCanvasElement.prototype.captureStream) return null;
+    const canvas = view.picture();
+    const context = canvas.getContext("2d");
+    const type = ["video/webm;codecs=vp9", "video/webm", "video/mp4"].find((one) => MediaRecorder.isTypeSupported(one));
+    if (!type) return null;
+    const recorder = new MediaRecorder(canvas.captureStream(PER_SECOND), { mimeType: type, videoBitsPerSecond: 6_000_000 });
+    const parts = [];
+    recorder.ondataavailable = (event) => parts.push(event.data);
+    const stopped = new Promise((resolve) => (recorder.onstop = resolve));
+    recorder.start();
+    await this.play(view, () => context.drawImage(view.picture(), 0, 0));
+    recorder.stop();
+    await stopped;
+    return new Blob(parts, { type });
+  }
+}

@@ -1,0 +1,263 @@
+// What pointer and keyboard do: turn the surface, shift the map, take hold of a vertex and move it, pin, choose corners, draw.
+
+const GRIP = 14; // CSS pixels around a handle within which it is taken
+const CLICK = 4; // and by which a click may move
+const ZOOM = 1.0015;
+
+/** The pointer and the keyboard on both panes. Without `send` nothing can be taken hold of. */
+export class Hands {
+  constructor(element, { scene, plane, clock, space, send, redraw }) {
+    Object.assign(this, { scene, plane, clock, space, send, redraw });
+    this.tool = "move";
+    this.seq = 0;
+    this.inFlight = false;
+    this.next = null;
+    this.held = -1;
+    this.panes = [
+      this.#pane(element, "surface", "The surface. Arrow keys turn it, plus and minus enlarge it."),
+      this.#pane(
+        element,
+        "map",
+        "The map. N and P choose a handle, arrow keys move it, with shift finely; without one they shift the map.",
+      ),
+    ];
+  }
+
+  #pane(element, name, label) {
+    const pane = document.createElement("div");
+    pane.className = `qhm-pane qhm-${name}`;
+    pane.tabIndex = 0;
+    pane.setAttribute("role", "application");
+    pane.setAttribute("aria-label", label);
+    Object.assign(pane.style, { position: "absolute", touchAction: "none" });
+    const listener = (kind) => (event) => this[`${name}${kind}`](event, this.#at(event, element));
+    pane.addEventListener("pointerdown", (event) => {
+      pane.setPointerCapture(event.pointerId);
+      listener("Down")(event);
+    });
+    pane.addEventListener("pointermove", listener("Move"));
+    pane.addEventListener("pointerup", listener("Up"));
+    pane.addEventListener("pointercancel", listener("Up"));
+    pane.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      listener("Wheel")(event);
+    });
+    pane.addEventListener("keydown", (event) => {
+      if (!event.ctrlKey && !event.metaKey && !event.altKey && this[`${name}Key`](event)) event.preventDefault();
+    });
+    pane.addEventListener("keyup", () => this.#letGo());
+    pane.addEventListener("blur", () => this.#letGo());
+    element.append(pane);
+    return pane;
+  }
+
+  #at(event, element) {
+    const box = element.getBoundingClientRect();
+    return [event.clientX - box.left, event.clientY - box.top];
+  }
+
+  /** Where the panes lie. */
+  place(...boxes) {
+    boxes.forEach((box, i) => {
+      const style = { left: `${box.x}px`, top: `${box.y}px`, width: `${box.width}px`, height: `${box.height}px` };
+      Object.assign(this.panes[i].style, style);
+    });
+  }
+
+  /** There is a new surface: nothing is held any more. */
+  forget() {
+    this.held = -1;
+    this.inFlight = false;
+    this.next = null;
+    this.seq = 0;
+  }
+
+  // --- the surface -------------------------------------------------------------------------------------------------
+
+  surfaceDown(event, point) {
+    this.from = this.last = point;
+  }
+
+  surfaceMove(event, point) {
+    if (!event.buttons || !this.last || !this.space()) return;
+    const [dx, dy] = [point[0] - this.last[0], point[1] - this.last[1]];
+    if (event.shiftKey || event.buttons === 4) this.space().shiftBy(dx, dy);
+    else this.space().turnBy(dx, dy);
+    this.last = point;
+    this.redraw();
+  }
+
+  surfaceUp(event, point) {
+    const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
+    this.last = null;
+    if (!clicked || event.type !== "pointerup" || !this.send || !["pin", "corner"].includes(this.tool)) return;
+    const hit = this.space()?.pick(point, this.scene.triangles);
+    if (hit) this.send({ do: this.tool === "pin" && this.scene.pins.includes(hit.vertex) ? "unpin" : this.tool, vertex: hit.vertex });
+  }
+
+  surfaceWheel(event) {
+    this.space()?.zoomBy(ZOOM ** -event.deltaY);
+    this.redraw();
+  }
+
+  surfaceKey(event) {
+    const space = this.space();
+    if (!space) return false;
+    const turns = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
+    if (turns[event.key]) space.turnBy(...turns[event.key]);
+    else if (event.key === "+" || event.key === "=") space.zoomBy(1.15);
+    else if (event.key === "-") space.zoomBy(1 / 1.15);
+    else if (event.key === "0") space.reset();
+    else return false;
+    this.redraw();
+    return true;
+  }
+
+  // --- the map -----------------------------------------------------------------------------------------------------
+
+  /** The vertex that could be taken hold of at a point, or -1: pins and corners before the rest of the boundary. */
+  handleAt(point) {
+    const { scene, plane } = this;
+    if (!scene.places || !this.send) return -1;
+    for (const some of [scene.pins, scene.corners, scene.boundary]) {
+      const vertex = plane.nearest(point, some, scene.places, GRIP);
+      if (vertex >= 0) return vertex;
+    }
+    return -1;
+  }
+
+  mapDown(event, point) {
+    this.from = this.last = point;
+    if (this.tool === "draw") return;
+    const vertex = event.button === 0 ? this.handleAt(point) : -1;
+    this.scene.chosen = vertex;
+    if (vertex >= 0) this.#grab(vertex);
+    this.redraw();
+  }
+
+  mapMove(event, point) {
+    if (this.held >= 0 && event.buttons) {
+      this.#moveTo(this.plane.placeOf(point));
+    } else if (event.buttons && this.last) {
+      this.plane.shiftBy(point[0] - this.last[0], point[1] - this.last[1]);
+      this.redraw();
+    } else {
+      const hovered = this.tool === "move" ? this.handleAt(point) : -1;
+      if (hovered !== this.scene.hovered) {
+        this.scene.hovered = hovered;
+        this.panes[1].style.cursor = hovered >= 0 ? "grab" : this.tool === "draw" ? "crosshair" : "default";
+        this.redraw();
+      }
+    }
+    this.last = point;
+  }
+
+  mapUp(event, point) {
+    const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
+    this.from = this.last = null;
+    if (this.held >= 0) this.#letGo();
+    else if (clicked && this.tool === "draw" && event.type === "pointerup") this.#drawTo(point);
+  }
+
+  mapWheel(event, point) {
+    this.plane.zoomBy(ZOOM ** -event.deltaY, point);
+    this.redraw();
+  }
+
+  mapKey(event) {
+    const { scene, plane } = this;
+    const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+    if (event.key === "n" || event.key === "p") this.#choose(event.key === "n" ? 1 : -1);
+    else if (event.key === "Escape") [scene.chosen, scene.sketch] = [-1, []];
+    else if (event.key === "Enter" && scene.sketch.length) this.closeSketch();
+    else if (event.key === "Delete" && scene.pins.includes(scene.chosen)) this.send?.({ do: "unpin", vertex: scene.chosen });
+    else if (event.key === "+" || event.key === "=") plane.zoomBy(1.15, this.#middle());
+    else if (event.key === "-") plane.zoomBy(1 / 1.15, this.#middle());
+    else if (event.key === "0" && scene.places) plane.fit(scene.places);
+    else if (steps[event.key]) {
+      const step = plane.extent * (event.shiftKey ? 0.002 : 0.02);
+      const [dx, dy] = steps[event.key];
+      if (scene.chosen >= 0 && this.send) {
+        if (this.held < 0) this.#grab(scene.chosen);
+        this.#moveTo(this.aim.map((c, k) => c + step * [dx, dy][k]));
+      } else plane.shiftBy(-dx * 24, dy * 24);
+    } else return false;
+    this.redraw();
+    return true;
+  }
+
+  #middle() {
+    const { x, y, width, height } = this.plane.box;
+    return [x + width / 2, y + height / 2];
+  }
+
+  #choose(step) {
+    const { scene } = this;
+    const all = [...scene.pins, ...scene.corners];
+    const some = all.length ? all : scene.boundary.filter((_, i) => i % Math.ceil(scene.boundary.length / 12) === 0);
+    if (!some.length || !this.send) return;
+    const at = some.indexOf(scene.chosen);
+    scene.chosen = some[(at < 0 ? (step > 0 ? 0 : some.length - 1) : at + step + some.length) % some.length];
+  }
+
+  #grab(vertex) {
+    this.held = vertex;
+    this.aim = this.scene.placeOf(vertex);
+    this.next = null;
+    this.inFlight = false;
+    this.send({ do: "grab", vertex });
+  }
+
+  // One map is asked for at a time, always the newest: what is drawn is never older than one round trip.
+  #moveTo(place) {
+    this.aim = place;
+    this.seq += 1;
+    this.clock.move(this.seq);
+    this.next = { do: "drag", seq: this.seq, to: [place[0] + this.scene.origin[0], place[1] + this.scene.origin[1]] };
+    this.#ask();
+  }
+
+  #ask() {
+    if (this.inFlight || !this.next) return;
+    this.inFlight = true;
+    this.send(this.next);
+    this.next = null;
+  }
+
+  /** A map has come; the hand may be farther already. */
+  answered(seq) {
+    if (seq < 0) return;
+    this.inFlight = false;
+    this.#ask();
+  }
+
+  #letGo() {
+    if (this.held < 0) return;
+    this.held = -1;
+    this.inFlight = false;
+    this.#ask();
+    this.inFlight = false;
+    this.send({ do: "drop" });
+  }
+
+  // --- a polygon drawn by hand -------------------------------------------------------------------------------------
+
+  #drawTo(point) {
+    const { sketch } = this.scene;
+    const first = sketch.length ? this.plane.pointOf(...sketch[0]) : null;
+    if (first && sketch.length > 2 && Math.hypot(first[0] - point[0], first[1] - point[1]) < GRIP) this.closeSketch();
+    else sketch.push(this.plane.placeOf(point));
+    this.redraw();
+  }
+
+  /** Make the polygon that has been drawn the outline. */
+  closeSketch() {
+    const { sketch, origin } = this.scene;
+    this.scene.sketch = [];
+    if (sketch.length > 2) {
+      const points = new Float64Array(sketch.flatMap((place) => [place[0] + origin[0], place[1] + origin[1]]));
+      this.send?.({ do: "polygon" }, { points });
+    }
+    this.redraw();
+  }
+}

@@ -1,0 +1,165 @@
+// What is drawn over the panes: the outline, what can be taken hold of, what forbids a map, and the line being drawn by hand.
+
+export const INK = "#0f1f4a";
+export const RED = "#c01030";
+const HANDLE = "#b35900";
+const PIN = "#7a1fa2";
+const PAPER = "#ffffff";
+// Rings around triangles too small to be seen; more would hide the picture.
+const MOST_RINGS = 200;
+
+/** Draw on a 2D canvas whose unit is the CSS pixel. `scene` is what `createView` keeps. */
+export function drawOverlay(context, scene, space, plane) {
+  const { width, height } = scene.size;
+  context.clearRect(0, 0, width, height);
+  if (!scene.places) return;
+  context.lineJoin = "round";
+  context.save();
+  clip(context, plane.box);
+  outline(context, scene, plane);
+  badTriangles(context, scene, plane);
+  obstructions(context, scene, (v) => plane.pointOf(...scene.placeOf(v)));
+  handles(context, scene, (v) => plane.pointOf(...scene.placeOf(v)), { numbered: true });
+  if (scene.sketch.length) sketch(context, scene, plane);
+  context.restore();
+  context.save();
+  clip(context, space.box);
+  obstructions(context, scene, (v) => space.project(v));
+  const faint = (v) => (space.looksAway(v, scene.triangles) ? 0.25 : 1);
+  handles(context, scene, (v) => space.project(v), { faint });
+  context.restore();
+}
+
+function clip(context, box) {
+  context.beginPath();
+  context.rect(box.x, box.y, box.width, box.height);
+  context.clip();
+}
+
+function path(context, loop, point) {
+  loop.forEach((vertex, i) => context[i ? "lineTo" : "moveTo"](...point(vertex, i)));
+  context.closePath();
+}
+
+function outline(context, scene, plane) {
+  context.lineWidth = 1.5;
+  context.strokeStyle = INK;
+  context.beginPath();
+  for (const loop of scene.loops) path(context, loop, (v) => plane.pointOf(...scene.placeOf(v)));
+  context.stroke();
+  if (!scene.asked) return;
+  // Where the hand wants the boundary, while no certified map has followed it there.
+  context.strokeStyle = RED;
+  context.setLineDash([6, 4]);
+  context.beginPath();
+  let start = 0;
+  for (const loop of scene.loops) {
+    const first = start;
+    path(context, loop, (_, i) => plane.pointOf(scene.asked[2 * (first + i)], scene.asked[2 * (first + i) + 1]));
+    start += loop.length;
+  }
+  context.stroke();
+  context.setLineDash([]);
+}
+
+function badTriangles(context, scene, plane) {
+  context.strokeStyle = RED;
+  context.lineWidth = 2;
+  for (const t of scene.bad.subarray(0, MOST_RINGS)) {
+    const corners = [0, 1, 2].map((k) => scene.placeOf(scene.triangles[3 * t + k]));
+    const middle = plane.pointOf(...[0, 1].map((k) => (corners[0][k] + corners[1][k] + corners[2][k]) / 3));
+    context.beginPath();
+    context.arc(...middle, 7, 0, 2 * Math.PI);
+    context.stroke();
+  }
+}
+
+function obstructions(context, scene, point) {
+  const shown = scene.obstruction;
+  if (!shown) return;
+  context.strokeStyle = RED;
+  context.fillStyle = RED;
+  context.lineWidth = 4;
+  context.beginPath();
+  for (const [i, j] of shown.edges) {
+    context.moveTo(...point(i));
+    context.lineTo(...point(j));
+  }
+  context.stroke();
+  context.lineWidth = 2.5;
+  for (const t of shown.triangles) {
+    context.beginPath();
+    path(context, [0, 1, 2].map((k) => scene.triangles[3 * t + k]), point);
+    context.stroke();
+  }
+  for (const vertex of shown.vertices) {
+    context.beginPath();
+    context.arc(...point(vertex), 8, 0, 2 * Math.PI);
+    context.stroke();
+  }
+}
+
+function handles(context, scene, point, { numbered = false, faint = () => 1 }) {
+  context.font = "600 12px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  for (const [vertices, draw, colour] of [[scene.corners, square, HANDLE], [scene.pins, disc, PIN]]) {
+    for (const vertex of vertices) {
+      context.globalAlpha = faint(vertex);
+      draw(context, point(vertex), vertex === scene.chosen ? 8 : 6, colour);
+    }
+  }
+  if (numbered) scene.corners.forEach((vertex, i) => label(context, point(vertex), scene.numbers[i]));
+  const marked = scene.chosen >= 0 ? scene.chosen : scene.hovered;
+  if (marked >= 0) {
+    context.globalAlpha = faint(marked);
+    context.strokeStyle = scene.chosen >= 0 ? HANDLE : INK;
+    context.lineWidth = 2.5;
+    context.beginPath();
+    context.arc(...point(marked), 10, 0, 2 * Math.PI);
+    context.stroke();
+  }
+  context.globalAlpha = 1;
+}
+
+function square(context, [x, y], half, colour) {
+  context.fillStyle = colour;
+  context.strokeStyle = PAPER;
+  context.lineWidth = 2;
+  context.beginPath();
+  context.rect(x - half, y - half, 2 * half, 2 * half);
+  context.fill();
+  context.stroke();
+}
+
+function disc(context, [x, y], radius, colour) {
+  context.fillStyle = colour;
+  context.strokeStyle = PAPER;
+  context.lineWidth = 2;
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fill();
+  context.stroke();
+}
+
+function label(context, [x, y], text) {
+  context.lineWidth = 3;
+  context.strokeStyle = PAPER;
+  context.fillStyle = INK;
+  context.strokeText(text, x + 15, y - 13);
+  context.fillText(text, x + 15, y - 13);
+}
+
+function sketch(context, scene, plane) {
+  context.strokeStyle = HANDLE;
+  context.fillStyle = HANDLE;
+  context.lineWidth = 2;
+  context.beginPath();
+  scene.sketch.forEach((place, i) => context[i ? "lineTo" : "moveTo"](...plane.pointOf(...place)));
+  context.stroke();
+  for (const place of scene.sketch) {
+    context.beginPath();
+    context.arc(...plane.pointOf(...place), 4, 0, 2 * Math.PI);
+    context.fill();
+  }
+}

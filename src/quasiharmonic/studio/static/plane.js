@@ -1,0 +1,90 @@
+// The map in the plane: where it lies on the screen, and what the pointer may take hold of there.
+
+/** A window on the plane, which hands shift and wheels enlarge. */
+export class PlaneView {
+  constructor() {
+    this.box = { x: 0, y: 0, width: 1, height: 1 };
+    this.centre = [0, 0];
+    this.extent = 1;
+    this.pixels = 1;
+    this.followed = true;
+  }
+
+  /** Show all of some places (n × 2), with a margin. */
+  fit(places) {
+    let [left, right, bottom, top] = [Infinity, -Infinity, Infinity, -Infinity];
+    for (let i = 0; i < places.length; i += 2) {
+      left = Math.min(left, places[i]);
+      right = Math.max(right, places[i]);
+      bottom = Math.min(bottom, places[i + 1]);
+      top = Math.max(top, places[i + 1]);
+    }
+    if (!(right >= left)) return;
+    this.centre = [(left + right) / 2, (bottom + top) / 2];
+    this.extent = Math.max(right - left, top - bottom) || 1;
+    this.size = [right - left || 1, top - bottom || 1];
+    this.followed = true;
+    this.#refit();
+  }
+
+  #refit() {
+    if (this.followed && this.size) {
+      this.pixels = 0.84 * Math.min(this.box.width / this.size[0], this.box.height / this.size[1]);
+    }
+  }
+
+  /** The place of the pane on the screen, in CSS pixels. */
+  setBox(box) {
+    this.box = box;
+    this.#refit();
+  }
+
+  shiftBy(dx, dy) {
+    this.followed = false;
+    this.centre = [this.centre[0] - dx / this.pixels, this.centre[1] + dy / this.pixels];
+  }
+
+  /** Enlarge around a point of the screen. */
+  zoomBy(factor, point) {
+    this.followed = false;
+    const before = this.placeOf(point);
+    this.pixels = Math.max(this.pixels * factor, 1e-6);
+    const after = this.placeOf(point);
+    this.centre = this.centre.map((c, k) => c + before[k] - after[k]);
+  }
+
+  /** The place in the plane of a point of the screen. */
+  placeOf([x, y]) {
+    return [
+      this.centre[0] + (x - this.box.x - this.box.width / 2) / this.pixels,
+      this.centre[1] - (y - this.box.y - this.box.height / 2) / this.pixels,
+    ];
+  }
+
+  /** The point of the screen of a place in the plane. */
+  pointOf(u, v) {
+    return [
+      this.box.x + this.box.width / 2 + (u - this.centre[0]) * this.pixels,
+      this.box.y + this.box.height / 2 - (v - this.centre[1]) * this.pixels,
+    ];
+  }
+
+  /** Scale and shift from places to the pane's clip coordinates. */
+  get window() {
+    const sx = (2 * this.pixels) / this.box.width;
+    const sy = (2 * this.pixels) / this.box.height;
+    return new Float32Array([sx, sy, -sx * this.centre[0], -sy * this.centre[1]]);
+  }
+
+  /** The vertex of a list that is drawn nearest to a point, if it is within so many pixels; else -1. */
+  nearest(point, vertices, places, within) {
+    let best = within;
+    let found = -1;
+    for (const vertex of vertices) {
+      const [x, y] = this.pointOf(places[2 * vertex], places[2 * vertex + 1]);
+      const away = Math.hypot(x - point[0], y - point[1]);
+      if (away < best) [best, found] = [away, vertex];
+    }
+    return found;
+  }
+}

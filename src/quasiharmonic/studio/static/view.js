@@ -1,0 +1,258 @@
+// A surface beside its map. Stands alone: give `createView` an element and what sends messages, and feed it frames.
+//
+// It understands the frames "surface", "map" and "obstructions", and sends {do: "grab" | "drag" | "drop" | "pin" | "unpin" |
+// "corner" | "polygon"}; docs/studio.md has their fields. Without `send` it shows, and lets nothing be moved.
+
+import { decodeFrame } from "./frames.js";
+import { Hands } from "./hands.js";
+import { drawOverlay } from "./overlay.js";
+import { PlaneView } from "./plane.js";
+import { Painter } from "./shaders.js";
+import { SpaceView } from "./space.js";
+
+const STACKED_BELOW = 640; // CSS pixels of width
+const NOTHING = { vertices: [], edges: [], triangles: [] };
+
+/** What is drawn, as the last frames have told it; see `drawOverlay`. */
+class Scene {
+  constructor() {
+    this.size = { width: 1, height: 1 };
+    this.places = null;
+    this.loops = [];
+    this.boundary = [];
+    this.triangles = new Uint32Array(0);
+    this.asked = null;
+    this.bad = new Uint32Array(0);
+    this.origin = [0, 0];
+    this.corners = [];
+    this.numbers = [];
+    this.pins = [];
+    this.obstruction = null;
+    this.hovered = -1;
+    this.chosen = -1;
+    this.sketch = [];
+  }
+
+  placeOf(vertex) {
+    return [this.places[2 * vertex], this.places[2 * vertex + 1]];
+  }
+}
+
+/** How quick it is: milliseconds from the hand's movement to the picture of the map it asked for, of the last thousand. */
+class Clock {
+  constructor() {
+    this.moved = new Map();
+    this.latencies = [];
+    this.frames = 0;
+    this.maps = 0;
+  }
+
+  move(seq) {
+    this.moved.set(seq, performance.now());
+  }
+
+  drawn(seq) {
+    this.frames += 1;
+    const began = this.moved.get(seq);
+    if (began === undefined) return;
+    this.latencies.push(performance.now() - began);
+    if (this.latencies.length > 1000) this.latencies.shift();
+    for (const key of this.moved.keys()) if (key <= seq) this.moved.delete(key);
+  }
+}
+
+/**
+ * Fill an element with a surface and its map.
+ *
+ * `options.send(message, arrays)` carries what the hand does away; `options.measured` waits for every picture to be finished,
+ * so that `clock` is true where drawing goes on behind the script's back.
+ */
+export function createView(element, options = {}) {
+  const scene = new Scene();
+  const plane = new PlaneView();
+  const clock = new Clock();
+  const look = { colouring: "checker", edges: false, squares: 16, reach: 3 };
+  let space = null;
+  let scale = 1;
+  let seq = -1;
+  let waiting = false;
+
+  element.classList.add("qhm-view");
+  const canvas = document.createElement("canvas");
+  const over = document.createElement("canvas");
+  for (const each of [canvas, over]) {
+    Object.assign(each.style, { position: "absolute", inset: "0", width: "100%", height: "100%" });
+    each.setAttribute("aria-hidden", "true");
+  }
+  if (getComputedStyle(element).position === "static") element.style.position = "relative";
+  element.append(canvas, over);
+  const painter = new Painter(canvas);
+  const context = over.getContext("2d");
+
+  function redraw() {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(draw);
+  }
+
+  function draw() {
+    waiting = false;
+    paint();
+    if (options.measured) painter.finish();
+    clock.drawn(seq);
+  }
+
+  function paint() {
+    painter.clear();
+    if (space && scene.places) {
+      const ratio = canvas.width / scene.size.width;
+      const within = (box) => ({
+        x: Math.round(box.x * ratio),
+        y: Math.round((scene.size.height - box.y - box.height) * ratio),
+        width: Math.round(box.width * ratio),
+        height: Math.round(box.height * ratio),
+      });
+      const shared = { ...look, scale, squares: look.squares / plane.extent, toward: space.axes[2], turn: space.matrix };
+      painter.pane(within(space.box), { ...shared, flat: false, window: plane.window });
+      painter.pane(within(plane.box), { ...shared, flat: true, window: plane.window });
+    }
+    const density = over.width / scene.size.width;
+    context.setTransform(density, 0, 0, density, 0, 0);
+    if (space) drawOverlay(context, scene, space, plane);
+  }
+
+  function resize() {
+    const width = Math.max(1, element.clientWidth);
+    const height = Math.max(1, element.clientHeight);
+    const density = Math.min(window.devicePixelRatio || 1, 2);
+    for (const each of [canvas, over]) {
+      each.width = Math.round(width * density);
+      each.height = Math.round(height * density);
+    }
+    scene.size = { width, height };
+    const stacked = width < STACKED_BELOW;
+    const half = stacked ? { width, height: height / 2 } : { width: width / 2, height };
+    if (space) space.box = { x: 0, y: 0, ...half };
+    plane.setBox(stacked ? { x: 0, y: height / 2, ...half } : { x: width / 2, y: 0, ...half });
+    hands.place(space ? space.box : { x: 0, y: 0, ...half }, plane.box);
+    redraw();
+  }
+
+  const hands = new Hands(element, {
+    scene,
+    plane,
+    clock,
+    space: () => space,
+    send: options.send,
+    redraw,
+  });
+
+  function surface(header, arrays) {
+    const positions = arrays.positions;
+    const triangles = arrays.triangles;
+    const edges = [];
+    for (let t = 0; t < triangles.length; t += 3) {
+      for (let k = 0; k < 3; k++) {
+        const [i, j] = [triangles[t + k], triangles[t + ((k + 1) % 3)]];
+        // The other half of an inner edge runs the other way; the boundary is drawn as the outline.
+        if (i < j) edges.push(i, j);
+      }
+    }
+    painter.setSurface(positions, triangles, new Uint32Array(edges));
+    space = new SpaceView(positions);
+    Object.assign(scene, new Scene(), { size: scene.size, triangles, boundary: Array.from(arrays.boundary) });
+    let start = 0;
+    scene.loops = header.loops.map((length) => scene.boundary.slice(start, (start += length)));
+    hands.forget();
+    resize();
+  }
+
+  function map(header, arrays) {
+    if (!space) return;
+    scene.origin = header.origin;
+    scene.asked = arrays.asked ?? null;
+    scene.corners = header.corners;
+    scene.numbers = header.numbers;
+    scene.pins = header.pins;
+    if (arrays.places) {
+      scene.places = arrays.places;
+      scene.bad = arrays.bad;
+      scale = header.scale;
+      painter.setPlaces(arrays.places);
+      painter.setBad(arrays.bad);
+      clock.maps += 1;
+    }
+    if (header.fit) plane.fit(scene.places);
+    seq = header.seq;
+    hands.answered(header.seq);
+    redraw();
+  }
+
+  const observer = new ResizeObserver(resize);
+  observer.observe(element);
+  resize();
+
+  return {
+    scene,
+    clock,
+    hands,
+
+    /** Take in a frame: its buffer, or what `decodeFrame` has made of it. */
+    receive(frame) {
+      const { header, arrays } = frame.header ? frame : decodeFrame(frame);
+      if (header.kind === "surface") surface(header, arrays);
+      else if (header.kind === "map") map(header, arrays);
+      else if (header.kind === "obstructions") {
+        scene.obstruction = header.obstructions.length ? header.obstructions[0] : null;
+        redraw();
+      }
+    },
+
+    /** Mark one obstruction of those told, or none. */
+    point(obstruction) {
+      scene.obstruction = obstruction ?? NOTHING;
+      redraw();
+    },
+
+    /** Change the look: `colouring` ("checker" or "stretch"), `edges`, `squares` across the map, `reach` in doublings. */
+    set(changes) {
+      Object.assign(look, changes);
+      redraw();
+    },
+
+    /** Show all of surface and map. */
+    fit() {
+      if (scene.places) plane.fit(scene.places);
+      space?.reset();
+      redraw();
+    },
+
+    /** Show other places for the same surface, as one that has been kept. */
+    show(places, bad = new Uint32Array(0)) {
+      scene.places = places;
+      scene.bad = bad;
+      painter.setPlaces(places);
+      painter.setBad(bad);
+      redraw();
+    },
+
+    /** A canvas with the picture as it is now, on white. */
+    picture() {
+      paint();
+      const whole = document.createElement("canvas");
+      [whole.width, whole.height] = [canvas.width, canvas.height];
+      const flat = whole.getContext("2d");
+      flat.fillStyle = "#ffffff";
+      flat.fillRect(0, 0, whole.width, whole.height);
+      flat.drawImage(canvas, 0, 0);
+      flat.drawImage(over, 0, 0);
+      return whole;
+    },
+
+    dispose() {
+      observer.disconnect();
+      painter.dispose();
+      element.replaceChildren();
+    },
+  };
+}

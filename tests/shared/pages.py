@@ -1,0 +1,54 @@
+"""A page without a browser: what a visitor does, and what the page is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic import io
+from quasiharmonic.studio.protocol import Frame, decode, encode
+from quasiharmonic.studio.session import Session
+from quasiharmonic.studio.sheets import sheet_of
+from quasiharmonic.surfaces import cat
+
+
+class Visitor:
+    """Has a session, and keeps all that it tells."""
+
+    def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False):
+        self.told: list[Frame] = []
+        self.session = Session(self._hear, waiting)
+        V, F = cat(10) if V is None else (V, F)
+        self.session.open(sheet_of(io.MeshData(V, F, source=name), name))
+
+    def _hear(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        # By way of bytes, as a socket would have it.
+        self.told.append(decode(encode(header, arrays)))
+
+    def does(self, what: str, arrays: Mapping[str, np.ndarray] | None = None, **words: Any) -> list[Frame]:
+        """Send a message; what was told since."""
+        before = len(self.told)
+        self.session.handle(decode(encode({"do": what, **words}, arrays)))
+        return self.told[before:]
+
+    def drags(self, vertex: int, *places: tuple[float, float]) -> list[Frame]:
+        """Take hold of a vertex, lead it along places and let go; the maps shown meanwhile."""
+        self.does("grab", vertex=vertex)
+        shown = [self.does("drag", seq=i, to=list(place))[-1] for i, place in enumerate(places)]
+        self.does("drop")
+        return shown
+
+    def last(self, kind: str) -> Frame:
+        """The last frame of a kind."""
+        return next(frame for frame in reversed(self.told) if frame.header["kind"] == kind)
+
+    def place(self, vertex: int) -> np.ndarray:
+        """Where a vertex is in the map."""
+        return self.session.moment.result.uv[vertex]
+
+    def files(self) -> dict[str, bytes]:
+        """What is saved."""
+        frames = [frame for frame in self.does("save") if frame.header["kind"] == "file"]
+        return {frame.header["name"]: frame.arrays["content"].tobytes() for frame in frames}

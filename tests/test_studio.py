@@ -1,0 +1,337 @@
+"""The page's session: what a hand does to a map, what is certain about what is shown, and how it is made again."""
+
+from __future__ import annotations
+
+import contextlib
+import io as text_io
+
+import numpy as np
+import pytest
+
+from quasiharmonic import certify, io
+from quasiharmonic.cli import main
+from quasiharmonic.exact.certificate import is_injective
+from quasiharmonic.problem import Problem
+from quasiharmonic.search.solving import quasi_harmonic_map
+from quasiharmonic.studio.following import Follower
+from quasiharmonic.studio.grips import grip
+from quasiharmonic.studio.outlines import outline_by_hand, outline_drawn, outline_named
+from quasiharmonic.studio.protocol import ProtocolError, decode, encode
+from quasiharmonic.studio.sheets import MOST_TRIANGLES, sheet_of
+from quasiharmonic.surfaces import annulus, cat, grid, starfish
+from shared.pages import Visitor
+
+SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
+
+
+@pytest.fixture(scope="module")
+def visitor():
+    return Visitor()
+
+
+def test_first_map_is_certified_and_told_whole():
+    one = Visitor()
+    surface, shown = one.last("surface"), one.last("map")
+    assert surface.header["triangles"] == 600
+    assert surface.arrays["positions"].shape == (331, 3)
+    assert shown.header["injective"]
+    assert shown.header["bijective"]
+    assert shown.header["reached"]
+    places = shown.arrays["places"] + np.array(shown.header["origin"])
+    assert np.allclose(places, one.session.moment.result.uv, atol=1e-6)
+    assert certify(one.session.moment.problem.F, one.session.moment.result.uv).bijective
+
+
+def test_every_map_of_a_drag_is_positive_and_goes_where_the_hand_does():
+    one = Visitor()
+    corner = one.session.moment.corners[2]
+    places = [(1 + 0.04 * k, 1 - 0.05 * k) for k in range(1, 15)]
+    shown = one.drags(corner, *places)
+    F = one.last("surface").arrays["triangles"].astype(np.int64)
+    for frame, place in zip(shown, places, strict=True):
+        assert frame.header["seq"] == places.index(place)
+        assert frame.header["injective"]
+        assert frame.header["reached"]
+        assert frame.header["flips"] == 0
+        uv = frame.arrays["places"].astype(np.float64) + frame.header["origin"]
+        assert is_injective(F, uv)
+        assert np.allclose(uv[corner], place, atol=1e-6)
+    assert np.array_equal(one.place(corner), places[-1])
+    assert one.last("map").header["state"] == "settled"
+
+
+def test_a_map_that_follows_is_the_harmonic_map_of_the_last_tensors():
+    """Against the solver that maps are found by, on a triangle's own Beltrami coefficients."""
+    one = Visitor().session.moment
+    problem, uv = one.problem, one.result.uv
+    target = problem.target * (1.2, 0.9) + 0.1 * problem.target[:, ::-1]
+    followed = Follower(problem, uv, one.result.certificate).to(target)
+    mesh = problem.domain.mesh("equilateral")
+    d = mesh.derivatives(problem.frame.inward(uv))
+    expected = quasi_harmonic_map(problem.moved(target), d.q / d.p)
+    assert followed.reached
+    assert np.allclose(followed.uv, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("across", [(-0.6, 0.5), (-1.5, -1.5)], ids=["crossing", "turned over"])
+def test_what_cannot_be_reached_shows_a_certified_map_and_says_what_forbids_it(across, monkeypatch):
+    monkeypatch.setattr("quasiharmonic.studio.following.PATIENCE", 0.05)
+    one = Visitor()
+    corner = one.session.moment.corners[2]
+    # The corner across the far side: the outline crosses itself.
+    one.does("grab", vertex=corner)
+    frame = one.does("drag", seq=1, to=list(across))[-1]
+    assert not frame.header["reached"]
+    assert frame.header["injective"]
+    uv = frame.arrays["places"].astype(np.float64)
+    assert is_injective(one.last("surface").arrays["triangles"].astype(np.int64), uv)
+    assert frame.arrays["asked"].shape == (60, 2)
+    one.does("drop")
+    settled = one.last("map").header
+    assert not settled["bijective"]
+    told = one.last("obstructions").header["obstructions"]
+    assert told
+    assert all(one["message"] and one["advice"] and (one["edges"] or one["vertices"]) for one in told)
+    assert settled["injective"] == (one.last("map").arrays["bad"].size == 0)
+
+
+def test_pins_stay_to_the_bit_and_are_dragged():
+    one = Visitor()
+    one.does("pin", vertex=5)
+    held = one.place(5).copy()
+    assert one.last("map").header["pins"] == [5]
+    corner = one.session.moment.corners[0]
+    one.drags(corner, (-0.1, -0.05))
+    assert np.array_equal(one.place(5), held)
+    goal = held + 0.05
+    shown = one.drags(5, tuple(goal))
+    assert all(frame.header["injective"] for frame in shown)
+    assert np.array_equal(one.place(5), goal)
+    one.does("unpin", vertex=5)
+    assert one.last("map").header["pins"] == []
+
+
+def test_undo_and_redo_go_to_the_bit():
+    one = Visitor()
+    first = one.session.moment.result.uv
+    one.drags(one.session.moment.corners[1], (1.3, 0.1))
+    second = one.session.moment.result.uv
+    one.does("undo")
+    assert np.array_equal(one.session.moment.result.uv, first)
+    assert not one.last("map").header["undo"]
+    assert one.last("map").header["redo"]
+    one.does("redo")
+    assert np.array_equal(one.session.moment.result.uv, second)
+    one.does("undo")
+    one.does("pin", vertex=0)
+    assert not one.last("map").header["redo"]
+
+
+def test_a_corner_takes_straight_sides_along_and_a_side_bends_between_its_ends():
+    V, F = grid(8, 8)
+    problem = Problem(V, F, loop := boundary(V, F), V[loop])
+    corners = [0, 8, 80, 72]
+    share = dict(zip(loop.tolist(), grip(80, loop, V[loop], problem.domain.loops, corners), strict=True))
+    assert share[80] == 1
+    assert share[8] == share[72] == share[0] == 0
+    assert share[44] == pytest.approx(0.5)
+    assert share[76] == pytest.approx(0.5)
+    bent = dict(zip(loop.tolist(), grip(4, loop, V[loop], problem.domain.loops, corners), strict=True))
+    assert bent[4] == 1
+    assert bent[3] == bent[5] == pytest.approx((1 - (0.125 / 0.32) ** 2) ** 2)
+    assert bent[0] == bent[8] == 0
+    with pytest.raises(ValueError, match="pin it first"):
+        grip(40, loop, V[loop], problem.domain.loops, corners)
+
+
+def boundary(V, F):
+    from quasiharmonic.mesh.topology import boundary_loops
+
+    (loop,) = boundary_loops(F, len(V))
+    return loop
+
+
+def made_again(one, folder, monkeypatch):
+    """The maps that the page's command and its Python make of the files that it saves."""
+    for name, content in one.files().items():
+        (folder / name).write_bytes(content)
+    sheet = one.session.moment.recipe.sheet
+    if not (folder / sheet.name).exists():
+        io.write_obj(folder / sheet.name, sheet.mesh.with_map(sheet.mesh.V[:, :2]))
+    monkeypatch.chdir(folder)
+    shown = one.last("map").header
+    words = shown["command"].split()
+    with contextlib.redirect_stdout(text_io.StringIO()):
+        assert main(words[1:]) == 0
+        names = {}
+        exec(shown["python"], names)
+    return io.map_of(io.read_mesh(words[-1])), names["result"].uv
+
+
+@pytest.mark.parametrize(
+    "deed",
+    [
+        lambda one: one.does("outline", to="letter:L"),
+        lambda one: None,
+        lambda one: one.does("corner", vertex=300),
+        lambda one: one.does("corners"),
+        lambda one: one.does("drawing", {"content": np.frombuffer(SVG, np.uint8)}, name="an l.svg"),
+        lambda one: one.does("polygon", {"points": np.array([[0, 0], [2, 0], [2, 1], [1, 0.4], [0, 1.0]]).ravel()}),
+        lambda one: one.does("polish", energy="symmetric-dirichlet", slide=False),
+        lambda one: one.does("polish", energy="mips", slide=True),
+        lambda one: one.does("flatten"),
+    ],
+    ids=["letter", "as it is", "corner", "by angle", "svg", "polygon", "polish", "slide", "flatten"],
+)
+def test_the_command_and_the_python_make_the_same_map(deed, tmp_path, monkeypatch):
+    one = Visitor(*cat(8))
+    deed(one)
+    shown = one.last("map").header
+    assert shown["injective"]
+    assert shown["anew"]
+    uv = one.session.moment.result.uv
+    by_command, by_python = made_again(one, tmp_path, monkeypatch)
+    assert np.allclose(by_command, uv, atol=1e-12)
+    assert np.allclose(by_python, uv, atol=1e-12)
+
+
+def test_what_a_hand_has_moved_is_made_again_too(tmp_path, monkeypatch):
+    one = Visitor(*cat(8))
+    one.does("pin", vertex=3)
+    one.drags(one.session.moment.corners[2], (1.1, 0.8))
+    by_command, by_python = made_again(one, tmp_path, monkeypatch)
+    uv = one.session.moment.result.uv
+    assert np.allclose(by_command, uv, atol=1e-9)
+    assert np.allclose(by_python, uv, atol=1e-9)
+
+
+def test_holes_closed_surfaces_and_planes_are_taken():
+    ring = Visitor(*annulus(8))
+    assert ring.last("map").header["bijective"]
+    assert ring.last("surface").header["loops"] == [32, 16]
+    ring.does("outline", to="ring:0.5")
+    assert ring.last("map").header["bijective"]
+    assert ring.session.moment.recipe.outline.to == "ring:0.5"
+    star = sheet_of(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj")
+    assert star.flags == ("--cut",)
+    assert len(star.island.F) == 12 * 64
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("notes.txt", b"hello", "no mesh that is read here"),
+        ("a.obj", b"v 0 0 0\nf 1 2 3\n", "a.obj"),
+        ("a.obj", b"\x00\xff" * 50, "a.obj"),
+        ("a.ply", b"ply\nformat", "a.ply"),
+        ("a.glb", b"glTF", "a.glb"),
+        ("../../etc/passwd", b"", "passwd: no mesh"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a.obj"),
+    ],
+)
+def test_no_mesh_is_refused_in_words_about_the_visitors_file(name, content, says, visitor):
+    before = visitor.session.moment
+    text = visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=name)[0].header["text"]
+    assert says in text
+    assert "/tmp" not in text
+    assert "dropped" not in text
+    assert visitor.session.moment is before
+
+
+def test_too_many_triangles_and_pieces_are_refused():
+    V, F = grid(4, 4)
+    many = np.broadcast_to(F[:1], (MOST_TRIANGLES + 1, 3))
+    with pytest.raises(ValueError, match=r"1,000,001 triangles, and the page shows 1,000,000 at most"):
+        sheet_of(io.MeshData(V, many, source="big.obj"), "big.obj")
+    with pytest.raises(ValueError, match="in 2 pieces"):
+        sheet_of(io.MeshData(np.concatenate([V, V + 2]), np.concatenate([F, F + len(V)]), source="two.obj"), "two.obj")
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "rect:drawing.svg",
+        "/etc/passwd",
+        "outline.csv",
+        "letter:",
+        "word:a b",
+        "disk:1",
+        3,
+        None,
+        "ellipse:1x2x3",
+        "polygon:99999",
+        "rect:1e9x1",
+        "letter:RR",
+    ],
+)
+def test_an_outline_is_a_word_and_never_a_file(word):
+    with pytest.raises(ValueError, match="no outline; there are"):
+        outline_named(word)
+
+
+def test_drawings_are_read_from_their_bytes():
+    assert len(outline_drawn("../../x y.svg", SVG).contours[0]) == 6
+    assert outline_drawn("../../x y.svg", SVG).to == "x_y.svg"
+    with pytest.raises(ValueError, match=r"^ä.svg: ") as raised:
+        outline_drawn("ä.svg", b"<svg")
+    assert "/tmp" not in str(raised.value)
+    with pytest.raises(ValueError, match="3 to"):
+        outline_by_hand(np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"do": "grab", "vertex": -1},
+        {"do": "grab", "vertex": 10**9},
+        {"do": "grab", "vertex": "3"},
+        {"do": "grab", "vertex": True},
+        {"do": "drag", "seq": 1, "to": [0]},
+        {"do": "drag", "seq": 1, "to": ["a", 0]},
+        {"do": "drag", "seq": 1, "to": [1e300, 0]},
+        {"do": "pin"},
+        {"do": "polish", "energy": "none"},
+        {"do": "__init__"},
+        {"do": ["grab"]},
+        {},
+    ],
+)
+def test_messages_that_make_no_sense_are_told_and_change_nothing(words, visitor):
+    before = visitor.session.moment
+    what = words.get("do")
+    (note,) = visitor.does(what, **{k: v for k, v in words.items() if k != "do"})
+    assert note.header["kind"] == "note"
+    assert note.header["level"] == "error"
+    assert visitor.session.moment is before
+
+
+def test_frames_come_back_as_they_were():
+    arrays = {"a": np.arange(5, dtype=np.uint8), "b": np.ones((2, 3), np.float32), "c": np.array([[1.5]])}
+    frame = decode(encode({"kind": "x", "text": "ä"}, arrays))
+    assert frame.header == {"kind": "x", "text": "ä"}
+    for name, array in arrays.items():
+        assert frame.arrays[name].dtype == array.dtype
+        assert np.array_equal(frame.arrays[name], array)
+
+
+WHOLE = encode({"do": "x"}, {"a": np.arange(9.0)})
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(WHOLE[:cut] for cut in (0, 3, 7, 20, 60, len(WHOLE) - 1)),
+        b"\xff\xff\xff\x7f" + WHOLE[4:],
+        WHOLE.replace(b"[9]", b"[99]", 1).replace(b"}} ", b"}}", 1),
+        WHOLE.replace(b"[9]", b"[-9]", 1),
+        WHOLE.replace(b"f8", b"O8", 1),
+        WHOLE.replace(b", 0]", b",-8]", 1),
+        WHOLE.replace(b'"do"', b'{"do', 1),
+        (4).to_bytes(4, "little") + b"null",
+        (8).to_bytes(4, "little") + b"[1, 2, 3",
+        (200_000).to_bytes(4, "little") + b"[" * 200_000,
+    ],
+)
+def test_damaged_frames_are_refused(data):
+    with pytest.raises(ProtocolError):
+        decode(data)

@@ -1,0 +1,241 @@
+"""The page's server: who may ask it for what, and what one page can do to another."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import os
+import signal
+import sys
+import threading
+import time
+
+import pytest
+
+pytest.importorskip("websockets", reason="the extra studio is not installed")
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from quasiharmonic.cli import main
+from quasiharmonic.studio import server as served
+from quasiharmonic.studio.assets import assets, bundle
+from quasiharmonic.studio.protocol import decode, encode
+from quasiharmonic.surfaces import cat
+
+
+class Running:
+    """A server in a thread."""
+
+    def __init__(self, source):
+        self.source = source
+
+    def __enter__(self):
+        self.studio = served.Studio(self.source)
+        ready = threading.Event()
+        self.loop = asyncio.new_event_loop()
+        self.task = self.loop.create_task(self.studio.run(0, lambda address: ready.set()))
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+        assert ready.wait(30)
+        return self
+
+    def _run(self):
+        with contextlib.suppress(asyncio.CancelledError):
+            self.loop.run_until_complete(self.task)
+        self.loop.close()
+
+    def __exit__(self, *error):
+        self.loop.call_soon_threadsafe(self.task.cancel)
+        self.thread.join(30)
+
+    def get(self, path, **headers):
+        """Status, headers and content of an answer."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.studio.port, timeout=10)
+        connection.putrequest("GET", path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        content = answer.read()
+        connection.close()
+        return answer.status, dict(answer.getheaders()), content
+
+    def page(self, **options):
+        """A socket as the page's own script opens it."""
+        at = f"127.0.0.1:{self.studio.port}"
+        options = {"origin": f"http://{at}", "token": self.studio.token, "max_size": None, **options}
+        return connect(f"ws://{at}/{options.pop('token')}/socket", compression=None, **options)
+
+
+def hear(socket, kind, *, state=None, seconds=60):
+    """The next frame of a kind."""
+    until = time.monotonic() + seconds
+    while True:
+        frame = decode(socket.recv(timeout=until - time.monotonic()))
+        if frame.header["kind"] == kind and state in (None, frame.header.get("state")):
+            return frame
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A server of a small surface, which takes few bytes."""
+    source = tmp_path_factory.mktemp("studio") / "small.obj"
+    V, F = cat(8)
+    lines = [*(f"v {x!r} {y!r} {z!r}" for x, y, z in V.tolist()), *(f"f {a} {b} {c}" for a, b, c in (F + 1).tolist())]
+    source.write_text("\n".join(lines) + "\n")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(served, "MOST_BYTES", 4 << 20)
+        with Running(str(source)) as server:
+            yield server
+
+
+def test_files_are_served_to_those_with_the_token_and_to_nobody_else(running):
+    token = running.studio.token
+    status, headers, content = running.get(f"/{token}/")
+    assert status == 200
+    assert b"qhm studio" in content
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "Server" not in headers
+    for name in assets():
+        assert running.get(f"/{token}/{name}")[0] == 200
+    for path in ("/", "/index.html", f"/{token[:-1]}/", f"/{token}x/", f"/x/{token}/", f"//{token}/"):
+        status, _, content = running.get(path)
+        assert status == 403
+        assert b"token" in content
+        assert token.encode() not in content
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../server.py", "..%2fserver.py", "static/view.js", "%2e%2e/server.py", "/etc/passwd", "view.js%00", "x"],
+)
+def test_no_path_of_the_servers_is_readable(running, name):
+    assert running.get(f"/{running.studio.token}/{name}")[0] == 404
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1", ""])
+def test_a_foreign_host_is_refused(running, host):
+    status, _, content = running.get(f"/{running.studio.token}/", Host=host)
+    assert status == 421
+    assert b"studio" not in content
+
+
+@pytest.mark.parametrize(
+    "options", [{"origin": "http://evil.example"}, {"origin": None}, {"token": "wrong"}, {"origin": "null"}]
+)
+def test_a_socket_of_another_site_is_refused(running, options):
+    with pytest.raises(InvalidStatus) as refused, running.page(**options):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def test_pages_do_not_meet_and_one_that_crashes_takes_no_other(running):
+    with running.page() as one, running.page() as other:
+        for socket in (one, other):
+            hear(socket, "map", state="settled")
+        one.send(encode({"do": "outline", "to": "disk"}))
+        assert hear(one, "map", state="settled").header["outline"] == "disk"
+        other.send(encode({"do": "undo"}))
+        assert hear(other, "map", state="settled").header["outline"] == "rect:1x1"
+        first = min(children(), key=lambda pid: os.stat(f"/proc/{pid}").st_ctime)
+        os.kill(first, signal.SIGKILL)
+        assert "ended by itself" in hear(one, "note").header["text"]
+        with pytest.raises(ConnectionClosed):
+            hear(one, "map")
+        other.send(encode({"do": "outline", "to": "disk"}))
+        assert hear(other, "map", state="settled").header["injective"]
+    nobody_is_left()
+
+
+def children():
+    """Processes of pages."""
+    found = []
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        with contextlib.suppress(OSError), open(f"/proc/{pid}/cmdline", "rb") as file:
+            if b"quasiharmonic.studio.worker" in file.read() and parent(pid) == os.getpid():
+                found.append(int(pid))
+    return found
+
+
+def nobody_is_left():
+    """Whoever has gone leaves no process."""
+    until = time.monotonic() + 20
+    while children() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert children() == []
+
+
+def parent(pid):
+    with open(f"/proc/{pid}/stat") as file:
+        return int(file.read().rpartition(")")[2].split()[1])
+
+
+def test_a_socket_cut_in_mid_drag_leaves_no_process(running):
+    with running.page() as page:
+        shown = hear(page, "map", state="settled").header
+        page.send(encode({"do": "grab", "vertex": shown["corners"][0]}))
+        for seq in range(20):
+            page.send(encode({"do": "drag", "seq": seq, "to": [-0.01 * seq, 0.0]}))
+        page.socket.close()
+    nobody_is_left()
+
+
+def test_what_is_too_large_or_no_message_closes_that_page_alone(running):
+    with running.page() as other:
+        hear(other, "map", state="settled")
+        with running.page() as page:
+            page.send("words")
+            with pytest.raises(ConnectionClosed) as closed:
+                hear(page, "never")
+            assert closed.value.rcvd.code == 1003
+        with running.page() as page:
+            page.send(b"\xff" * 40)
+            with pytest.raises(ConnectionClosed) as closed:
+                hear(page, "never")
+            assert closed.value.rcvd.code == 1007
+        with running.page() as page:
+            with contextlib.suppress(ConnectionClosed):
+                page.send(bytes(served.MOST_BYTES + (2 << 20)))
+            with pytest.raises(ConnectionClosed) as closed:
+                hear(page, "never")
+            assert closed.value.rcvd.code == 1009
+        other.send(encode({"do": "undo"}))
+        assert hear(other, "map").header["injective"]
+
+
+def test_so_many_pages_and_no_more(running, monkeypatch):
+    nobody_is_left()
+    time.sleep(0.2)
+    monkeypatch.setattr(served, "MOST_PAGES", 1)
+    with running.page() as page:
+        hear(page, "hello")
+        time.sleep(0.2)
+        with pytest.raises(InvalidStatus) as refused, running.page():
+            pass
+        assert refused.value.response.status_code == 503
+
+
+def test_the_view_is_to_be_had_as_one_module():
+    text = bundle("view")
+    assert 'from "./' not in text
+    assert text.rstrip().endswith("export const { createView } = qhm_view;")
+    for name in ("frames", "hands", "overlay", "plane", "shaders", "space"):
+        assert text.count(f"const qhm_{name} = ") == 1
+    with pytest.raises(KeyError):
+        bundle("nothing")
+
+
+def test_without_websockets_the_command_says_how_to_get_them(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    monkeypatch.delitem(sys.modules, "quasiharmonic.studio.server")
+    assert main(["studio", "--no-browser"]) == 2
+    assert "pip install 'quasiharmonic[studio]'" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_mesh_is_refused_before_anything_is_served(tmp_path, capsys):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nf 1 2 3\n")
+    assert main(["studio", str(tmp_path / "a.obj"), "--no-browser"]) == 2
+    assert "a.obj" in capsys.readouterr().err
