@@ -13,6 +13,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from quasiharmonic.animation.animated import animate
+    from quasiharmonic.animation.frames import Animation, FrameStep
     from quasiharmonic.apply.airmesh import AirMesh, Moment
     from quasiharmonic.apply.cutting import Opened, cut_open
     from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
@@ -47,12 +49,14 @@ __version__ = "0.1.0"
 
 _HOME = {
     "AirMesh": "apply.airmesh",
+    "Animation": "animation.frames",
     "Certificate": "exact.certificate",
     "Derivative": "gradients.derivative",
     "Descent": "descent",
     "Diagnosis": "exact.diagnosis",
     "Distortion": "energy.measures",
     "Energy": "energy.energies",
+    "FrameStep": "animation.frames",
     "InverseMap": "apply.inverse",
     "MapResult": "result",
     "Moment": "apply.airmesh",
@@ -71,6 +75,7 @@ _HOME = {
     "SurfaceMap": "apply.transfer",
     "SurfacePoints": "apply.inverse",
     "Warped": "apply.warping",
+    "animate": "animation.animated",
     "certify": "exact.certificate",
     "cut_open": "apply.cutting",
     "diagnose": "exact.diagnosis",
@@ -100,12 +105,14 @@ _HOME = {
 
 __all__ = [
     "AirMesh",
+    "Animation",
     "Certificate",
     "Derivative",
     "Descent",
     "Diagnosis",
     "Distortion",
     "Energy",
+    "FrameStep",
     "InverseMap",
     "MapResult",
     "Moment",
@@ -124,6 +131,7 @@ __all__ = [
     "SurfaceMap",
     "SurfacePoints",
     "Warped",
+    "animate",
     "certify",
     "cut_open",
     "diagnose",

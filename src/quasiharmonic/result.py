@@ -52,6 +52,10 @@ class Status(Enum):
         "Every triangle is strictly positive, decided exactly. The distortion falls no further because triangles "
         "are as small as double precision can resolve: an energy that minds their size would open them up."
     )
+    NEARBY = (
+        "Every triangle is strictly positive, decided exactly, and the distortion is as low as the frames before and "
+        "after allow, to which it keeps near."
+    )
     UNIMPROVED = (
         "Every triangle is strictly positive, decided exactly, but this is the map that was given: no injective map of "
         "less distortion was found. A smaller eta may help."

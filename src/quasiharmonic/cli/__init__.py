@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 
 from quasiharmonic.cli import (
+    animate,
     batch,
     batch_report,
     check,
@@ -38,6 +39,7 @@ COMMANDS = (
     map,
     flatten,
     morph,
+    animate,
     repair,
     polish,
     harmonise,

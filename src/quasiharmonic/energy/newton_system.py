@@ -53,14 +53,15 @@ class NewtonSystem:
         size = self.free.size
         place = np.full(n, -1, dtype=np.int64)
         place[self.free] = np.arange(size)
-        corner = place[F.T]
-        self._pairs(g, corner)
+        self._corner = corner = place[F.T]
+        self.take_gradients(g)
         self._pattern(corner, size)
         self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
 
-    def _pairs(self, g: ComplexArray, corner: IntArray) -> None:
-        """Products of gradients over the sides, from lower to higher free vertex, and at the corners."""
-        first, second = corner, corner[(1, 2, 0), :]
+    def take_gradients(self, g: ComplexArray) -> None:
+        """Have other gradients (3, f) of the hat functions on the same triangles, as another scale gives them."""
+        # Their products over the sides, from lower to higher free vertex, and at the corners.
+        first, second = self._corner, self._corner[(1, 2, 0), :]
         g1, g2 = g, g[(1, 2, 0), :]
         upward = first <= second
         low, high = np.where(upward, g1, g2), np.where(upward, g2, g1)

@@ -1,0 +1,209 @@
+"""``qhm animate``: a mesh and where its boundary goes, frame by frame → a sequence of maps, a moving picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.animation.frames import Animation, FrameStep
+    from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.io import MeshData
+    from quasiharmonic.problem import Problem
+
+PICTURES = ".gif", ".mp4"
+_MESHES = ".obj", ".ply", ".off", ".glb", ".gltf"
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.cli import arguments
+
+    parser = commands.add_parser(
+        "animate",
+        help="map a surface to a sequence of targets, each frame certified, none leaping",
+        description="Map a surface to a sequence of targets, each frame from the one before it. With --polish every "
+        "frame has little distortion, and vertices do not leap from one to the next.",
+        epilog="Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input "
+        "or call, nothing written; 3 written, but not what should be told about it. Ctrl-C writes the frames so far.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file: the surface")
+    parser.add_argument(
+        "targets",
+        type=Path,
+        nargs="+",
+        metavar="FRAMES",
+        help="where fixed vertices go: meshes with the same vertices and a map (vt), in their order; or a folder of "
+        "them, by name; or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed lists",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        action="append",
+        help="folder to write the frames to as 0000.obj, 0001.obj, …, or a moving picture, .gif or .mp4; repeatable",
+    )
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+    )
+    parser.add_argument("--polish", choices=arguments.ENERGIES, help="lower this distortion energy in every frame")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        metavar="TIMES",
+        help="for --polish: no vertex moves more than so many times as far as the boundary does (default: 3)",
+    )
+    parser.add_argument(
+        "--bridge", action="store_true", help="go past frames that allow no map halfway between those around them"
+    )
+    parser.add_argument(
+        "--frames-per-second", type=arguments.count, metavar="N", help="of a moving picture (default: 24)"
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, animate, write, read back, judge, report."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.animation.animated import animate
+    from quasiharmonic.cli import arguments, progress, report
+    from quasiharmonic.mesh.topology import boundary_edges
+    from quasiharmonic.problem import Problem
+
+    arguments.settle(options, "limit", 3.0, asked=options.polish is not None, belongs="--polish")
+    drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
+    arguments.settle(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
+    targets = _files(options.targets)
+    inputs = (options.input, options.fixed, *targets)
+    report.check_new({f"-o {path}": path for path in drawn}, options.json, inputs=inputs)
+    folders = [_checked_folder(path, inputs) for path in options.output if path not in drawn]
+    mesh = io.read_mesh(options.input)
+    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
+    with report.about(options.input):
+        held = np.unique(boundary_edges(mesh.F, len(mesh.V))) if fixed is None else fixed
+        places = _targets(targets, mesh, held)
+        problem = Problem(mesh.V, mesh.F, held, places[0])
+    with report.about(options.input), progress.line(_words) as show:
+        animation = animate(
+            problem,
+            places,
+            polish=options.polish,
+            limit=options.limit,
+            bridge=options.bridge,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+    certified = [_write_frames(folder, mesh, animation) for folder in folders]
+    with report.after_writing(options.output[0]):
+        for path in drawn:
+            _draw(path, problem, animation, options.frames_per_second)
+        complete = len(animation.frames) == len(places)
+        facts: dict[str, Any] = {
+            **animation.to_dict(),
+            "asked": len(places),
+            "input": str(options.input),
+            "outputs": [str(path) for path in options.output],
+        }
+        lines = [f"wrote {', '.join(map(str, options.output))}", animation.summary()]
+        if not complete:
+            lines.append(f"interrupted: {len(places) - len(animation.frames)} further frames were asked for")
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0 if complete and all(certified) and animation.found.all() else 1
+
+
+def _files(given: list[Path]) -> list[Path]:
+    """The files that are named, or are in the folder that is."""
+    if len(given) == 1 and given[0].is_dir():
+        found = sorted(path for path in given[0].iterdir() if path.suffix.lower() in _MESHES)
+        if not found:
+            raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(_MESHES)})")
+        return found
+    if len(given) > 1 and any(path.suffix.lower() == ".npy" for path in given):
+        raise ValueError("an array .npy has all frames: name no other file beside it")
+    return given
+
+
+def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
+    """A folder that can be written to, with none of the inputs in it."""
+    if path.suffix and not path.is_dir():
+        raise ValueError(f"-o {path}: neither a moving picture ({', '.join(PICTURES)}) nor the name of a folder")
+    if any(source is not None and source.resolve().parent == path.resolve() for source in inputs):
+        raise ValueError(f"-o {path}: frames are not written where the input is")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Where the held vertices go in every frame; (t, k, 2)."""
+    import numpy as np
+
+    from quasiharmonic import io
+
+    if files[0].suffix.lower() == ".npy":
+        return _array(files[0], len(mesh.V), held)
+    places = []
+    for path in files:
+        frame = io.read_mesh(path)
+        if len(frame.V) != len(mesh.V):
+            raise ValueError(f"{path}: {len(frame.V)} vertices, where the surface has {len(mesh.V)}")
+        mapped = io.mapped(frame)
+        if mapped.uv is None or not mapped.seamless:
+            raise ValueError(f"{path}: its map has seams, and frames are of a surface without")
+        uv = np.full((len(mesh.V), 2), np.nan)
+        uv[mapped.F] = mapped.uv[mapped.FT]
+        places.append(uv[held])
+    return np.stack(places)
+
+
+def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
+    import numpy as np
+
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: no array of numbers in NumPy's format: {error}") from error
+    if array.ndim != 3 or array.shape[2] != 2 or array.shape[1] not in (n, held.size) or array.dtype.kind not in "iuf":
+        raise ValueError(
+            f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {held.size}, 2) for fixed vertices "
+            f"only, not {array.dtype} {array.shape}"
+        )
+    return np.asarray(array if array.shape[1] == held.size else array[:, held], dtype=np.float64)
+
+
+def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> bool:
+    """Write every frame that has a map, and say whether all are certified as a reader gets them."""
+    from quasiharmonic import io
+    from quasiharmonic.exact.certificate import certify
+
+    certified = True
+    digits = max(4, len(str(len(animation.frames) - 1)))
+    for t, frame in enumerate(animation.frames):
+        if frame.injective:
+            path = folder / f"{t:0{digits}}.obj"
+            io.write_mapped(path, mesh.with_map(frame.uv))
+            written = io.cut_at_seams(io.read_mesh(path))
+            certified &= certify(written[1], written[2]).injective
+    return certified
+
+
+def _draw(path: Path, problem: Problem, animation: Animation, rate: int) -> None:
+    from quasiharmonic.plot.animation import save_animation
+
+    named = ((f"frame {t}", frame.uv) for t, frame in enumerate(animation.frames))
+    save_animation(path, problem.V, problem.F, named, fixed=problem.fixed, frames_per_second=rate)
+
+
+def _words(step: FrameStep) -> str:
+    sweep = f", sweep {step.sweep}" if step.sweep else ""
+    return f"frame {step.frame + 1} of {step.frames}{sweep}   largest move {step.move:.3g}"

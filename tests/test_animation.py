@@ -1,0 +1,257 @@
+"""Sequences of maps: certified, near to each other, and what happens where a frame has none."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Problem, Status, animate, certify, io, polish
+from quasiharmonic.animation.frames import FrameStep
+from quasiharmonic.cli import main
+from quasiharmonic.energy.nearness import Nearness
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import cat, disk
+
+
+@pytest.fixture(scope="module")
+def head():
+    """A cat's head and its boundary."""
+    V, F = cat(10)
+    return V, F, boundary_loops(F, len(V))[0]
+
+
+def turning_stars(count, frames, depth=0.7):
+    """Targets (frames, count, 2) that begin and end as a circle, and are a star that turns between."""
+    angle = 2 * np.pi * np.arange(count) / count
+    outlines = []
+    for t in np.linspace(0, 1, frames):
+        here = angle + 0.18 * np.sin(np.pi * t) * np.cos(3 * angle)
+        radius = 1 + depth * np.sin(np.pi * t) ** 2 * np.cos(5 * angle + 2 * np.pi * t)
+        outlines.append(np.stack([radius * np.cos(here), radius * np.sin(here)], axis=1))
+    return np.array(outlines)
+
+
+def test_nearness_against_differences():
+    rng = np.random.default_rng(0)
+    near = Nearness(3.0, 0.7)
+    away = rng.normal(size=40) + 1j * rng.normal(size=40)
+    away[0] = 0
+    h = 1e-6
+    gradient, (xx, xy, yy) = near.gradient(away), near.blocks(away)
+    assert (np.abs(away) < 0.7).any()
+    assert (np.abs(away) > 0.7).any()
+    for v in range(away.size):
+        for step, first, second in ((h, gradient.real, xx + 1j * xy), (1j * h, gradient.imag, xy + 1j * yy)):
+            there, back = away.copy(), away.copy()
+            there[v] += step
+            back[v] -= step
+            assert first[v] == pytest.approx((near.value(there) - near.value(back)) / (2 * h), abs=1e-8)
+            slope = (near.gradient(there)[v] - near.gradient(back)[v]) / (2 * h)
+            assert second[v] == pytest.approx(slope, abs=1e-7)
+
+
+def test_frames_are_certified_and_follow(head):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 24)
+    animation = animate(Problem(V, F, loop, targets[0]), targets)
+    assert animation.found.all()
+    assert animation.uv.shape == (24, len(V), 2)
+    for uv, target in zip(animation.uv, targets, strict=True):
+        assert certify(F, uv).injective
+        assert np.array_equal(uv[loop], target)
+    assert np.isnan(animation.energies).all()
+    assert animation.moves.shape == (23,)
+
+
+def test_polished_frames_do_not_leap(head):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 24)
+    problem = Problem(V, F, loop, targets[0])
+    animation = animate(problem, targets, polish="symmetric-dirichlet")
+    assert animation.found.all()
+    assert animation.largest_move <= 3
+    alone = [polish(V, F, uv, fixed=loop).history[-1].energy for uv in animate(problem, targets).uv]
+    assert animation.energies.mean() <= 1.1 * np.mean(alone)
+
+
+def test_the_sweeps_are_what_shortens_leaps(head):
+    """With a limit that cannot be met on the way forward alone."""
+    V, F, loop = head
+    targets = turning_stars(len(loop), 12, depth=0.85)
+    problem = Problem(V, F, loop, targets[0])
+    swept = []
+    tight = animate(problem, targets, polish="symmetric-dirichlet", limit=1.2, callback=lambda s: swept.append(s.sweep))
+    loose = animate(problem, targets, polish="symmetric-dirichlet", limit=1000)
+    assert max(swept) >= 1
+    assert tight.largest_move < loose.largest_move
+    assert loose.energies.mean() < tight.energies.mean()
+
+
+def test_a_boundary_that_rests(head):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 8)[[0, 0, 1, 2, 2, 2, 3]]
+    animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips")
+    assert np.array_equal(animation.uv[0], animation.uv[1])
+    assert np.array_equal(animation.uv[3], animation.uv[5])
+    assert np.isnan(animation.moves[[0, 3, 4]]).all()
+    assert np.isfinite(animation.moves[[1, 2, 5]]).all()
+
+
+@pytest.fixture
+def backwards(head):
+    """Frames of which the fifth winds the other way."""
+    V, F, loop = head
+    targets = turning_stars(len(loop), 9, depth=0.4)
+    targets[4] = targets[4, ::-1]
+    return Problem(V, F, loop, targets[0]), targets
+
+
+@pytest.mark.parametrize("energy", [None, "symmetric-dirichlet"])
+def test_an_impossible_frame_is_told_with_its_reason(backwards, energy):
+    problem, targets = backwards
+    animation = animate(problem, targets, polish=energy)
+    assert np.flatnonzero(~animation.found).tolist() == [4]
+    assert animation.frames[4].status is Status.IMPOSSIBLE
+    assert animation.frames[4].diagnosis.forbids_injective
+    assert "frame 4: " in animation.summary()
+    assert animation.to_dict()["missing"] == [4]
+    # Found as soon as it is clear that more work would be in vain.
+    assert animation.frames[4].iterations <= 10
+    json.dumps(animation.to_dict(), allow_nan=False)
+
+
+def test_a_frame_that_crosses_itself_is_told(head):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 5, depth=0.4)
+    targets[2, :3] = targets[2, [2, 1, 0]]
+    animation = animate(Problem(V, F, loop, targets[0]), targets)
+    assert np.flatnonzero(~animation.bijective).tolist() == [2]
+    assert "frame 2" in animation.summary()
+
+
+def test_an_impossible_frame_is_bridged(backwards):
+    problem, targets = backwards
+    animation = animate(problem, targets, bridge=True)
+    assert animation.found.all()
+    assert np.flatnonzero(animation.bridged).tolist() == [4]
+    assert np.allclose(animation.uv[4][problem.fixed], (targets[3] + targets[5]) / 2)
+    assert "between their neighbours: frame 4" in animation.summary()
+
+
+def test_the_first_frame_has_none_before_it(backwards):
+    problem, targets = backwards
+    animation = animate(problem, targets[4:], bridge=True)
+    assert np.flatnonzero(~animation.found).tolist() == [0]
+    assert not animation.bridged.any()
+
+
+def test_wrong_targets_are_named(head):
+    V, F, loop = head
+    targets = list(turning_stars(len(loop), 60))
+    problem = Problem(V, F, loop, targets[0])
+    targets[57] = targets[57].copy()
+    targets[57][[3, 8]] = np.nan
+    with pytest.raises(ValueError, match="frame 57 has no finite place in rows 3, 8"):
+        animate(problem, targets)
+    targets[31] = targets[31][1:]
+    with pytest.raises(ValueError, match=rf"frame 31 must have shape \({len(loop)}, 2\)"):
+        animate(problem, targets)
+    with pytest.raises(ValueError, match="no frame"):
+        animate(problem, [])
+    with pytest.raises(ValueError, match="limit must be at least 1"):
+        animate(problem, targets[:2], polish="mips", limit=0.5)
+
+
+@pytest.mark.parametrize("sweep", [0, 1])
+def test_interrupted_with_what_is_there(head, sweep):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 12, depth=0.85)
+
+    def stop(step: FrameStep) -> None:
+        if step.sweep == sweep and step.frame >= 5:
+            raise KeyboardInterrupt
+
+    animation = animate(
+        Problem(V, F, loop, targets[0]), targets, polish="symmetric-dirichlet", limit=1.2, callback=stop
+    )
+    assert len(animation.frames) == (6 if sweep == 0 else 12)
+    assert animation.found.all()
+
+
+def test_one_frame():
+    V, F = disk(4)
+    (loop,) = boundary_loops(F, len(V))
+    animation = animate(Problem(V, F, loop, V[loop]), [V[loop]], polish="symmetric-dirichlet")
+    assert animation.found.all()
+    assert animation.moves.shape == (0,)
+    assert animation.largest_move == 0
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def test_the_command(head, tmp_path, capsys):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 5)
+    animation = animate(Problem(V, F, loop, targets[0]), targets)
+    surface = tmp_path / "head.obj"
+    io.write_obj(surface, io.MeshData(V, F))
+    (tmp_path / "in").mkdir()
+    for t, uv in enumerate(animation.uv):
+        io.write_obj(tmp_path / "in" / f"f{t}.obj", io.MeshData(V, F).with_map(uv))
+    np.save(tmp_path / "frames.npy", animation.uv)
+    out, movie, report = tmp_path / "out", tmp_path / "movie.gif", tmp_path / "report.json"
+    assert run("animate", surface, tmp_path / "in", "-o", out, "-o", movie, "--json", report) == 0
+    assert "5 frames: 5 with every triangle strictly positive" in capsys.readouterr().out
+    written = sorted(out.iterdir())
+    assert [path.name for path in written] == [f"{t:04}.obj" for t in range(5)]
+    for path, target in zip(written, targets, strict=True):
+        again = io.mapped(io.read_mesh(path))
+        assert certify(F, again.opened().uv).injective
+        assert np.array_equal(again.opened().uv[loop], target)
+    from PIL import Image
+
+    with Image.open(movie) as picture:
+        assert picture.n_frames == 5
+    assert json.loads(report.read_text())["certified"] == 5
+    second = tmp_path / "second"
+    assert run("animate", surface, tmp_path / "frames.npy", "-o", second, "--polish", "mips") == 0
+    assert len(list(second.iterdir())) == 5
+
+
+def test_what_the_command_refuses(head, tmp_path, capsys):
+    V, F, _ = head
+    surface = tmp_path / "head.obj"
+    io.write_obj(surface, io.MeshData(V, F))
+    np.save(tmp_path / "short.npy", np.zeros((3, 7, 2)))
+    (tmp_path / "no.npy").write_bytes(b"nothing")
+    (tmp_path / "empty").mkdir()
+    for frames, options, words in (
+        ("short.npy", [], "must be real numbers of shape"),
+        ("no.npy", [], "no array of numbers"),
+        ("empty", [], "no mesh in this folder"),
+        ("short.npy", ["--limit", 2], "--limit belongs to --polish"),
+        ("short.npy", ["--frames-per-second", 2], "belongs to a moving picture"),
+    ):
+        assert run("animate", surface, tmp_path / frames, "-o", tmp_path / "out", *options) == 2
+        assert words in capsys.readouterr().err
+    assert run("animate", surface, tmp_path / "short.npy", "-o", tmp_path / "out.avi") == 2
+    assert "neither a moving picture" in capsys.readouterr().err
+
+
+def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys):
+    problem, targets = backwards
+    V, F, _ = head
+    surface = tmp_path / "head.obj"
+    io.write_obj(surface, io.MeshData(V, F))
+    (tmp_path / "held.txt").write_text("\n".join(map(str, problem.fixed)))
+    np.save(tmp_path / "frames.npy", targets)
+    frames = [tmp_path / "frames.npy", "--fixed", tmp_path / "held.txt"]
+    assert run("animate", surface, *frames, "-o", tmp_path / "out") == 1
+    assert "frame 4: " in capsys.readouterr().out
+    assert len(list((tmp_path / "out").iterdir())) == len(targets) - 1
+    assert run("animate", surface, *frames, "-o", tmp_path / "out", "--bridge") == 0
+    assert len(list((tmp_path / "out").iterdir())) == len(targets)
