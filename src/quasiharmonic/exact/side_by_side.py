@@ -46,14 +46,16 @@ def certify_each(
     if alone.size:
         rims = [loops[k][0] + vertices[k] for k in alone.tolist()]
         good[alone] = simple_loops(rims, places)
-    return [_bijective(len(F[k]), loops[k]) if good[k] else certify(F[k], uv[k], loops=loops[k]) for k in range(len(F))]
+    return [
+        _bijective(F[k], uv[k], loops[k]) if good[k] else certify(F[k], uv[k], loops=loops[k]) for k in range(len(F))
+    ]
 
 
-def _bijective(triangles: int, loops: Sequence[IntArray]) -> Certificate:
+def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certificate:
     """The verdict on a map of which nothing bad is to be said."""
     none = np.empty(0, dtype=np.int64)
     return Certificate(
-        triangles=triangles,
+        triangles=len(F),
         flipped=none,
         degenerate=none.copy(),
         nonfinite=none.copy(),
@@ -62,4 +64,7 @@ def _bijective(triangles: int, loops: Sequence[IntArray]) -> Certificate:
         loops=tuple(loops),
         crossings=np.empty((0, 4), dtype=np.int64),
         overwound=none.copy(),
+        # As in `certify`: what somebody could change is copied.
+        F=F if not F.flags.writeable else F.copy(),
+        uv=uv.copy(),
     )
