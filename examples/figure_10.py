@@ -2,16 +2,16 @@
 ===========================================================
 
 In the paper L-BFGS with si-log finds injective maps of thirty shapes onto letters from V₃, V₄ and V₁ alike. That comes
-out here for V₃, but for a few of the thirty, and not for the others. Solved of 30, at most 600 evaluations, no help from
-any other method, and the most iterations that a solved one took; *small* are 1,258 to 2,820 triangles, *large* 9,198 to
-21,212, the *scans* 31,996 to 40,006, which are not shipped:
+out here for V₃, but for a few of the thirty, and not for the others. Solved of 30, at most 600 evaluations, no help
+from any other method, and the most iterations that a solved one took; *small* are 1,258 to 2,820 triangles, *large*
+9,198 to 21,212, the *scans* 31,996 to 40,006, which are not shipped:
 
 ====================== ========= ========= =========
 functional             small     large     scans
 ====================== ========= ========= =========
 V₃, tanh               30 (413)  29 (151)  27 (515)
 V₃, si-log             26 (554)  28 (477)
-V₃, si-log, rest pose  0
+V₃, si-log, rest pose  6 (372)
 V₁, tanh               11 (554)
 V₁, si-log             15 (254)
 V₄, tanh               0
@@ -19,12 +19,13 @@ V₄, si-log             1 (4)
 ====================== ========= ========= =========
 
 All are in equilateral triangles but the third row's, which are those of the surface, as the paper's are: where limbs
-shrink to nothing there, what is inverted in them is too small to be seen by V₃. V₁ leaves 1 to 9 triangles. V₄ in linear
-elements goes below zero; in Crouzeix and Raviart's it does as V₃ does (`edge_elements`).
+shrink to nothing there, what is inverted in them is too small to be seen by V₃. V₁ leaves 1 to 9 triangles. V₄ in
+linear elements goes below zero; in Crouzeix and Raviart's it does as V₃ does (`edge_elements`).
 
 The maps drawn are those of V₃ with tanh. It leaves three triangles of the rabbit onto H, at the concave corners of the
-bar, each with a ten-millionth of the area; after 4,000 evaluations one. Those of the three scans are like these, 4 to 8.
-`speed` takes 17 iterations, on a coarse mesh. ``benchmarks/letters_alone.py`` has all runs, one by one.
+bar, each with a ten-millionth of the area; after 4,000 evaluations one. Three scans are left with 4 to 8, bunny onto G
+and David and gargoyle onto H. `speed` takes 17 iterations for the rabbit, on a coarse mesh.
+``benchmarks/letters_alone.py`` has all runs, one by one.
 """
 
 from __future__ import annotations
