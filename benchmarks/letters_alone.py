@@ -136,7 +136,7 @@ def main() -> None:
         done = {(run.surface, run.triangles, run.letter, run.column) for run in runs}
         surfaces = [*(scanned(options.scans) if options.scans else made(options.size))]
         with options.table.open("a", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
+            table = csv.writer(file, lineterminator="\n")
             if not runs:
                 table.writerow(Run._fields)
             for column in options.columns:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import campaign
+import letters_alone
 import problems
 import speed
 from quasiharmonic import Problem, certify, solve
@@ -269,3 +270,17 @@ def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
     text = (tmp_path / "speed.md").read_text()
     assert "| cat on C | 294 |  | 0.5 × |  |" in text
     assert (tmp_path / "speed.png").stat().st_size > 0
+
+
+def test_letters_alone(tmp_path):
+    """A row comes back as it was written; what is recorded is all of it there."""
+    (V, F) = next((V, F) for name, V, F in letters_alone.made(24) if name == "hand")
+    run = letters_alone.measure("hand", V, F, "A", "V₃ tanh", 100)
+    assert run.flips == 0
+    table = tmp_path / "table.csv"
+    table.write_text(",".join(run._fields) + "\n" + ",".join(map(str, run)) + "\n", encoding="utf-8")
+    assert letters_alone.read(table) == [run]
+    assert letters_alone.read(tmp_path / "none.csv") == []
+    recorded = letters_alone.read(letters_alone.RECORDS)
+    assert len({(run.surface, run.triangles, run.letter, run.column) for run in recorded}) == len(recorded)
+    assert {row["of"] for row in letters_alone.by_kind(recorded)["gallery"].values()} == {30}
