@@ -89,8 +89,8 @@ def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
     brought = re.search(r"\[(.*)\]", extras["test"][0]).group(1).split(",")
     installed = " ".join(project["dependencies"] + [line for name in ("test", *brought) for line in extras[name]])
     optional = (ROOT / ".ci" / "optional").read_text(encoding="utf-8")
-    by_itself = re.search(r"'\.\[test,view,cortex\]' (gmsh vtk.*)", optional).group(1).split()
+    by_itself = re.search(r"'\.\[test,view,cortex,notebook\]' (gmsh vtk.*)", optional).group(1).split()
     assert "scikit-sparse" in optional
     assert {"shapely", "polyscope"} <= wanted
-    known = f"{installed} {' '.join(extras['view'] + extras['cortex'] + by_itself)}"
+    known = f"{installed} {' '.join(extras['view'] + extras['cortex'] + extras['notebook'] + by_itself)}"
     assert not [name for name in wanted if name not in sys.stdlib_module_names and name not in known]

@@ -161,7 +161,7 @@ __all__ = [
 
 
 # Modules that are part of what is public; they too are imported when they are first used.
-_MODULES = ("atlas", "batch", "curves", "io", "linsolve", "plot", "surfaces", "targets")
+_MODULES = ("atlas", "batch", "curves", "io", "linsolve", "notebook", "plot", "surfaces", "targets")
 
 
 def __getattr__(name: str) -> Any:

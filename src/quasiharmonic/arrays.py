@@ -217,7 +217,7 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
 def _withheld(name: str, values: Any, error: Exception) -> str:
     """Why an array of another library does not give its numbers away, and what to do."""
     if getattr(values, "requires_grad", False):
-        return f"that requires grad, which would be lost here: hand over {name}.detach()"
+        return f"that requires grad, which would be lost here: hand over {name}.detach(), or see quasiharmonic.torch"
     device = getattr(values, "device", "cpu")
     if not str(device).startswith("cpu"):
         return f"on {device}: hand over {name}.{'cpu' if hasattr(values, 'cpu') else 'get'}()"

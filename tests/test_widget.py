@@ -1,0 +1,166 @@
+"""The widget without a browser: messages in; frames, the map and its result out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Problem, certify, injective_map, notebook, solve
+from quasiharmonic.io import MeshData, write_map
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.studio.assets import bundle
+from quasiharmonic.studio.protocol import decode, encode
+from quasiharmonic.surfaces import disk
+
+V, F = disk(5)
+(LOOP,) = boundary_loops(F, len(V))
+PROBLEM = Problem(V, F, LOOP, V[LOOP] * (1 + 0.3 * V[LOOP, :1]))
+
+
+class Cell:
+    """Where the widget is shown: keeps what it sends, and hands a view's messages over as the kernel does."""
+
+    def __init__(self, monkeypatch):
+        pytest.importorskip("anywidget")
+        self.frames, self._listeners = [], []
+        monkeypatch.setattr(
+            notebook.MapWidget, "send", lambda _, content, buffers: self.frames.append((content, *buffers))
+        )
+        monkeypatch.setattr(notebook.MapWidget, "on_msg", lambda _, listener: self._listeners.append(listener))
+
+    def show(self, *surface):
+        self.widget = notebook.MapWidget(*surface)
+        return self.widget
+
+    def hear(self, *buffers):
+        """What a view's message is answered by: the frames."""
+        self.frames.clear()
+        self._listeners[-1](self.widget, {}, list(buffers))
+        return [(content, decode(data)) for content, data in self.frames]
+
+    def does(self, what, **words):
+        return self.hear(memoryview(encode({"do": what, **words})))
+
+
+@pytest.fixture
+def cell(monkeypatch):
+    return Cell(monkeypatch)
+
+
+def test_a_problem_is_shown_solved(cell):
+    widget = cell.show(PROBLEM)
+    assert widget.result.injective
+    np.testing.assert_array_equal(widget.vertices, np.arange(len(V)))
+    np.testing.assert_array_equal(widget.result.uv[LOOP], PROBLEM.target)
+    np.testing.assert_array_equal(widget.result.V[:, :2], V)
+    np.testing.assert_array_equal(widget.problem.target, widget.result.uv[widget.problem.fixed])
+    assert "<img" in widget.result._repr_html_()
+
+
+def test_a_view_that_comes_later_is_told_all(cell):
+    cell.show(PROBLEM)
+    for _ in range(2):
+        answered = cell.does("show")
+        assert [content for content, _ in answered] == [
+            {"kind": kind, "first": True} for kind in ("surface", "map", "obstructions")
+        ]
+        (_, surface), (_, shown), _ = answered
+        np.testing.assert_array_equal(surface.arrays["triangles"], F)
+        places = shown.arrays["places"] + np.array(shown.header["origin"])
+        np.testing.assert_allclose(places, cell.widget.result.uv, atol=1e-6)
+
+
+def test_the_map_follows_the_hand(cell):
+    widget = cell.show(PROBLEM)
+    before, vertex = widget.result, int(LOOP[4])
+    start = before.uv[vertex]
+    cell.does("grab", vertex=vertex)
+    for seq in range(1, 6):
+        to = start * (1 + 0.04 * seq)
+        (_, frame), *_ = cell.does("drag", vertex=vertex, to=to.tolist(), seq=seq)
+        assert frame.header["seq"] == seq
+        uv = frame.arrays["places"].astype(float)
+        assert frame.header["injective"]
+        assert certify(F, uv).injective
+        np.testing.assert_allclose(uv[vertex] + frame.header["origin"], to, atol=1e-6)
+    # While the hand moves, the result is the last map at rest.
+    np.testing.assert_array_equal(widget.result.uv, before.uv)
+    cell.does("drop")
+    assert widget.result.certificate.bijective
+    np.testing.assert_allclose(widget.result.uv[vertex], to, atol=1e-12)
+    # What is at hand is what anybody else finds.
+    np.testing.assert_array_equal(widget.problem.target, widget.result.uv[widget.problem.fixed])
+    assert solve(widget.problem).injective
+    widget.undo()
+    np.testing.assert_array_equal(widget.result.uv, before.uv)
+    widget.redo()
+    np.testing.assert_allclose(widget.result.uv[vertex], to, atol=1e-12)
+
+
+def test_what_the_kernel_asks_for(cell):
+    widget = cell.show(V, F)
+    first = widget.result
+    np.testing.assert_allclose(np.ptp(first.uv, axis=0), 1, atol=1e-12)
+    widget.outline("rect:2x1")
+    np.testing.assert_allclose(np.ptp(widget.result.uv, axis=0), (2, 1), atol=1e-12)
+    widget.polish("mips")
+    assert widget.result.injective
+    with pytest.raises(ValueError, match="'nonsense' is no outline"):
+        widget.outline("nonsense")
+    with pytest.raises(ValueError, match="'heat' is no energy"):
+        widget.polish("heat")
+    assert widget.result.injective, "as it was"
+
+
+def test_what_no_view_would_say(cell):
+    cell.show(PROBLEM)
+    for buffers in ((), (b"nothing",), (b"\xff" * 40,)):
+        ((content, frame),) = cell.hear(*buffers)
+        assert content == {"kind": "note"}
+        assert "a message" in frame.header["text"]
+    ((_, frame),) = cell.does("explode")
+    assert "nothing that is done here" in frame.header["text"]
+
+
+def test_every_kind_of_surface(cell, tmp_path):
+    result = injective_map(V, F, LOOP, PROBLEM.target)
+    write_map(tmp_path / "map.obj", MeshData(V, F), result.uv)
+    for surface in ((result,), (tmp_path / "map.obj",), (str(tmp_path / "map.obj"),)):
+        np.testing.assert_array_equal(cell.show(*surface).result.uv[LOOP], PROBLEM.target)
+    assert cell.show({"vertices": V, "faces": F}).result.injective
+    assert cell.show(V.tolist(), F.tolist()).result.injective
+    pins = Problem(V, F, [*LOOP, 0], [*PROBLEM.target, [0.1, 0.1]])
+    assert cell.show(pins).result.uv[0].tolist() == [0.1, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("surface", "message"),
+    [
+        (([1, 2, 3],), "a list is no surface: hand over V and F"),
+        ((3,), "3 is no surface"),
+        (("nowhere.obj",), "nowhere.obj"),
+        ((V, F[:0]), "no triangles"),
+        ((np.concatenate([V, V + 9]), np.concatenate([F, F + len(V)])), "2 pieces"),
+    ],
+)
+def test_what_is_no_surface(cell, surface, message):
+    with pytest.raises((ValueError, OSError), match=message):
+        cell.show(*surface)
+
+
+def test_one_module_with_all_of_the_view_in_it():
+    code = bundle("widget")
+    assert "import " not in code.replace("// ", "")
+    assert code.count("export") == 1
+    assert "render" in code.rpartition("export")[2]
+
+
+def test_without_anywidget(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "anywidget", None)
+    monkeypatch.delitem(sys.modules, "quasiharmonic.notebook.widget", raising=False)
+    with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[notebook\]'"):
+        notebook.MapWidget  # noqa: B018
+    with pytest.raises(AttributeError):
+        notebook.View  # noqa: B018
