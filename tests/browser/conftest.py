@@ -7,12 +7,10 @@ import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent.parent
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
 # WebGL is drawn by the processor, and nothing is asked of the net.
 ARGUMENTS = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
@@ -34,7 +32,10 @@ def served(*arguments):
 
 @pytest.fixture(scope="session")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (.ci/browser does it)")
+    try:
+        from playwright import sync_api as playwright
+    except ModuleNotFoundError:
+        pytest.skip("Playwright is not installed (.ci/browser does it)")
     if CHROMIUM is None:
         pytest.skip("there is no chromium (.ci/browser installs it)")
     with playwright.sync_playwright() as play:

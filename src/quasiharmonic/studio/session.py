@@ -77,6 +77,7 @@ class Session:
         self._moments: list[Moment] = []
         self._at = -1
         self._hand: _Hand | None = None
+        self._after = -1
 
     @property
     def moment(self) -> Moment:
@@ -93,7 +94,7 @@ class Session:
         """
         sheet = first_sheet() if sheet is None else sheet
         first = first_moment(sheet)
-        self._sheet, self._hand = sheet, None
+        self._sheet, self._hand, self._after = sheet, None, -1
         self._origin = first.problem.target.mean(axis=0)
         V = np.zeros((first.problem.n, 3), dtype=np.float64)
         V[:, : first.problem.V.shape[1]] = first.problem.V
@@ -192,6 +193,7 @@ class Session:
         if hand is None:
             # What could not be held; the page waits for an answer all the same.
             return self._tell_map({}, seq=seq)
+        self._after = seq
         hand.goal = self.moment.problem.target + hand.share[:, None] * (to - hand.place)
         if hand.follower is None:
             return self._tell_map({}, seq=seq, asked=hand.goal)
@@ -311,6 +313,7 @@ class Session:
         header = {
             "kind": "map",
             "seq": seq,
+            "after": self._after,
             "fit": False,
             "origin": self._origin.tolist(),
             "corners": list(moment.corners),

@@ -13,6 +13,7 @@ export class Hands {
     this.inFlight = false;
     this.next = null;
     this.held = -1;
+    this.aimed = -1;
     this.panes = [
       this.#pane(element, "surface", "The surface. Arrow keys turn it, plus and minus enlarge it."),
       this.#pane(
@@ -67,6 +68,7 @@ export class Hands {
   /** There is a new surface: nothing is held any more. */
   forget() {
     this.held = -1;
+    this.aimed = -1;
     this.inFlight = false;
     this.next = null;
     this.seq = 0;
@@ -202,7 +204,9 @@ export class Hands {
 
   #grab(vertex) {
     this.held = vertex;
-    this.aim = this.scene.placeOf(vertex);
+    // Of what was let go of a moment ago the map may be on its way.
+    if (this.aimed !== vertex) this.aim = this.scene.placeOf(vertex);
+    this.aimed = vertex;
     this.next = null;
     this.inFlight = false;
     this.send({ do: "grab", vertex });
@@ -224,9 +228,12 @@ export class Hands {
     this.next = null;
   }
 
-  /** A map has come; the hand may be farther already. */
-  answered(seq) {
-    if (seq < 0) return;
+  /** A map has come, of the hand or at rest, after a movement; the hand may be farther already. */
+  answered(seq, after) {
+    if (seq < 0) {
+      if (after >= this.seq && this.held < 0) this.aimed = -1;
+      return;
+    }
     this.inFlight = false;
     this.#ask();
   }

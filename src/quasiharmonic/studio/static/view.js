@@ -184,7 +184,7 @@ export function createView(element, options = {}) {
     }
     if (header.fit) plane.fit(scene.places);
     seq = header.seq;
-    hands.answered(header.seq);
+    hands.answered(header.seq, header.after);
     redraw();
   }
 
