@@ -62,8 +62,8 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
     Parameters
     ----------
     path : path
-        Ends in ``.gif``, or in ``.mp4`` when the program ffmpeg is installed. Replaced as a whole once the
-        animation is complete.
+        Ends in ``.gif``, or in ``.mp4`` where the program ffmpeg or the extra ``video`` is installed. Replaced as a
+        whole once the animation is complete.
     figures : iterable of matplotlib Figure
         Of one size. They are drawn one after another, so a generator will do.
     frames_per_second : int
@@ -74,7 +74,7 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
     ValueError
         When there are no figures, the suffix is another, or the rate is less than 1.
     ImportError
-        When the suffix is ``.mp4`` and ffmpeg is missing.
+        When the suffix is ``.mp4`` and neither is there.
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
@@ -85,8 +85,8 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
         raise ValueError(f"{path}: animations are written as .gif or .mp4")
     if frames_per_second < 1:
         raise ValueError(f"frames_per_second must be at least 1, not {frames_per_second}")
-    if suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise ImportError("an .mp4 needs the program ffmpeg (https://ffmpeg.org): install it, or write a .gif")
+    if suffix == ".mp4":
+        _ffmpeg()
     check_writable(path)
     pictures = [_picture(figure) for figure in figures]
     if not pictures:
@@ -136,7 +136,21 @@ def _gif(pictures: list[NDArray[np.uint8]], rate: int) -> bytes:
     return file.getvalue()
 
 
+def _ffmpeg() -> str:
+    """Where the program ffmpeg is, on the path or in the extra ``video``."""
+    if (found := shutil.which("ffmpeg")) is not None:
+        return found
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError:
+        raise ImportError(
+            "an .mp4 needs the program ffmpeg: pip install 'quasiharmonic[video]' brings it, or write a .gif"
+        ) from None
+    return str(get_ffmpeg_exe())
+
+
 def _mp4(pictures: list[NDArray[np.uint8]], rate: int) -> bytes:
+    from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
 
     height, width = (side - side % 2 for side in pictures[0].shape[:2])  # of which the codec wants even ones
@@ -148,7 +162,7 @@ def _mp4(pictures: list[NDArray[np.uint8]], rate: int) -> bytes:
         target = Path(folder) / "animation.mp4"
         # yuv420p is what browsers and phones play.
         writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p"])
-        with writer.saving(figure, str(target), dpi=100):
+        with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, str(target), dpi=100):
             for picture in pictures:
                 shown.set_data(picture)
                 writer.grab_frame()
