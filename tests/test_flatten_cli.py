@@ -137,7 +137,7 @@ def test_rings_of_what_is_not_measured_are_refused(head, capsys):
 def test_bad_weights_are_named(head, tmp_path, capsys):
     (tmp_path / "weights.txt").write_text("1\nheavy\n")
     assert run("flatten", head, "-o", tmp_path / "flat.obj", "--weights", tmp_path / "weights.txt") == 2
-    assert "line 2: 'heavy' is not a number" in capsys.readouterr().err
+    assert "'heavy' is not a finite number at line 2" in capsys.readouterr().err
 
 
 def test_distances(head, tmp_path, capsys):

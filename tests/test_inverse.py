@@ -339,6 +339,40 @@ def test_images_that_differ_are_not_onto():
     assert np.isfinite(back).any()
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
+def test_outside_the_nearest_point_of_the_rim(rng, scale):
+    """Against the distance to every boundary edge, sampled."""
+    uv, F = disk(5)
+    inverse = InverseMap(lift(uv), F, scale * uv)
+    places = rng.uniform(-2, 2, (60, 2))
+    places = places[np.abs(places).max(axis=1) > 1]
+    near = inverse.nearest(scale * places)
+    assert near.found.all()
+    np.testing.assert_allclose(near.barycentric.sum(axis=1), 1)
+    assert (near.barycentric == 0).any(axis=1).all()
+    (rim,) = boundary_loops(F, len(uv))
+    t = np.linspace(0, 1, 400)[:, None, None]
+    samples = ((1 - t) * uv[rim] + t * uv[np.roll(rim, -1)]).reshape(-1, 2)
+    least = np.linalg.norm(places[:, None] - samples, axis=2).min(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(inverse.plane(near) / scale - places, axis=1), least, atol=1e-4)
+    # What is inside, or nowhere, is as ever.
+    inside = np.array([[0.1 * scale, 0.2 * scale], [np.nan, 0]])
+    assert inverse.nearest(inside).triangle.tolist() == [inverse.locate(inside).triangle[0], -1]
+
+
+def test_transfer_leaves_no_hole_at_the_rim():
+    V, F = disk(8)
+    finer, finer_faces = disk(11)
+    source, target = InverseMap(V, F, V), InverseMap(finer, finer_faces, finer)
+    partners = SurfaceMap(target, source)
+    heights = V @ [1.0, 2.0]
+    assert np.isnan(partners.transfer(heights)).any()
+    whole = partners.transfer(heights, outside="nearest")
+    np.testing.assert_allclose(whole, finer @ [1, 2], atol=0.02)
+    with pytest.raises(ValueError, match="outside must be one of"):
+        partners.transfer(heights, outside="zero")
+
+
 def test_twice_area_is_accurate(rng):
     """Corners in line but for a rounding, against fractions."""
     a, b = rng.uniform(-1, 1, (2, 400, 2))

@@ -1,6 +1,7 @@
 import math
 import os
 import pickle
+import re
 import signal
 import stat
 import subprocess
@@ -18,6 +19,7 @@ from hypothesis.extra.numpy import arrays
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
 from quasiharmonic.io.meshdata import is_planar
+from quasiharmonic.io.numbers import read_rows
 from quasiharmonic.io.obj import read_regular
 from quasiharmonic.io.objlines import read_obj_lines
 from quasiharmonic.io.textual import read_text
@@ -822,3 +824,44 @@ def test_problems_written_and_read_in_every_way(tmp_path):
     again = io.read_mesh(out)
     assert bits(again.V) == bits(found.V) == bits(V)
     assert bits(io.map_of(again)) == bits(moved)
+
+
+@pytest.mark.parametrize(
+    ("text", "rows"),
+    [
+        ("1,2.5,-3e-2\n", [[1, 2.5, -0.03]]),
+        ("1 2.5\t-.03\r\n2 1. +4\n", [[1, 2.5, -0.03], [2, 1, 4]]),
+        ("1;2,5;-0,03\n", [[1, 2.5, -0.03]]),
+        ("vertex,x,y\n# a comment\n\n1,2.5D0,-3d-02 # another\n", [[1, 2.5, -0.03]]),
+        ("\ufeffvertex;x;y\n1; 2,5; -3,0E-2\n", [[1, 2.5, -0.03]]),
+    ],
+)
+def test_rows_of_numbers_in_any_usual_notation(tmp_path, text, rows):
+    path = tmp_path / "rows.csv"
+    path.write_text(text, encoding="utf-8", newline="")
+    assert [values for _, values in read_rows(path, 3)] == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1,2\n", "not 3 numbers: '1,2' at line 1"),
+        ("1,2,3\n1,2,3,4\n", "not 3 numbers: '1,2,3,4' at line 2"),
+        ("1,2,nan\n", "'nan' is not a finite number"),
+        ("1,2,3\nx,y,z\n", "'x' is not a finite number at line 2"),
+        ("1,2,1_0\n", "'1_0' is not a finite number"),
+        ("1,2,3d\n", "'3d' is not a finite number"),
+        ("1;2.5;3;\n", "not 3 numbers"),
+    ],
+)
+def test_rows_of_something_else(tmp_path, text, words):
+    path = tmp_path / "rows.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(MeshFileError, match=re.escape(words)):
+        read_rows(path, 3)
+
+
+def test_exponents_of_fortran_in_a_mesh(tmp_path):
+    path = tmp_path / "m.obj"
+    path.write_text("v 0 0 0\nv 1.0D+00 0 0\nv 0 5d-1 0\nf 1 2 3\n")
+    assert io.read_mesh(path).V.tolist() == [[0, 0, 0], [1, 0, 0], [0, 0.5, 0]]

@@ -23,9 +23,10 @@ from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.exact.point_location import PointLocator
 from quasiharmonic.given.objects import MeshLike
 from quasiharmonic.given.taking import made_of_mesh
+from quasiharmonic.mesh.topology import boundary_edges
 
-# Points handled at a time: what is in work stays in the cache.
-_POINTS = 1 << 14
+# Points handled at a time: what is in work stays in the cache. And pairs of a point and an edge.
+_POINTS, _PAIRS = 1 << 14, 1 << 20
 
 #: What values on a surface can be given for.
 Per = Literal["vertex", "corner", "triangle"]
@@ -159,6 +160,52 @@ class InverseMap(ReadOnly):
         barycentric[found] = self._locator.barycentric(rows[found], triangle[found])
         shape = places.shape[:-1]
         return SurfacePoints(triangle.reshape(shape), barycentric.reshape(*shape, 3))
+
+    def nearest(self, points: ArrayLike, at: SurfacePoints | None = None) -> SurfacePoints:
+        """The points of the surface that lie nearest to places of the plane.
+
+        Parameters
+        ----------
+        points : (..., 2) array
+            Places, in the map's image or not.
+        at : SurfacePoints, optional
+            What `locate` says of them, if it has been asked.
+
+        Returns
+        -------
+        SurfacePoints
+            Those of `locate` where it finds one, and else the nearest point of the image's boundary, up to rounding;
+            triangle -1 only for places that are not finite.
+
+        Raises
+        ------
+        ValueError
+            When the last axis is not of length 2.
+        """
+        at = self.locate(points) if at is None else at
+        places = np.asarray(points, dtype=np.float64)
+        lost = np.flatnonzero(~at.found.ravel() & np.isfinite(places).all(axis=-1).ravel())
+        if not lost.size:
+            return at
+        edges = boundary_edges(self.F, len(self.uv))
+        # Squares of lengths must not leave the numbers' range.
+        size = np.abs(self.uv[edges]).max()
+        row, share = _nearest_on(places.reshape(-1, 2)[lost] / size, *(self.uv[edges] / size).swapaxes(0, 1))
+        triangle, barycentric = at.triangle.copy().ravel(), at.barycentric.copy().reshape(-1, 3)
+        which, corner = self._edge_triangles(edges)
+        triangle[lost] = which[row]
+        barycentric[lost] = 0
+        barycentric[lost, corner[row]] = 1 - share
+        barycentric[lost, (corner[row] + 1) % 3] = share
+        return SurfacePoints(triangle.reshape(at.triangle.shape), barycentric.reshape(at.barycentric.shape))
+
+    def _edge_triangles(self, edges: IntArray) -> tuple[IntArray, IntArray]:
+        """The triangle of each boundary edge, and the corner that the edge leaves."""
+        n = len(self.uv)
+        keys = (self.F * n + self.F[:, (1, 2, 0)]).ravel()
+        order = np.argsort(keys)
+        found = order[np.searchsorted(keys[order], edges[:, 0] * n + edges[:, 1])]
+        return found // 3, found % 3
 
     def vertices(self) -> SurfacePoints:
         """The vertices of the surface, as points of it; none for a vertex of no triangle."""
@@ -322,6 +369,22 @@ class InverseMap(ReadOnly):
         normal = np.cross(b - a, c - a)
         with np.errstate(invalid="ignore"):
             return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _nearest_on(points: FloatArray, a: FloatArray, b: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Which of the segments from ``a`` to ``b`` (k, 2) is nearest to each point (m, 2), and how far along, 0 to 1."""
+    row, share = np.empty(len(points), dtype=np.int64), np.empty(len(points))
+    side = b - a
+    length = np.einsum("ki,ki->k", side, side)
+    size = max(1, _PAIRS // len(a))
+    for start in range(0, len(points), size):
+        here = points[start : start + size, None] - a
+        along = np.clip(np.einsum("mki,ki->mk", here, side) / length, 0, 1)
+        away = here - along[..., None] * side
+        best = np.einsum("mki,mki->mk", away, away).argmin(axis=1)
+        row[start : start + size] = best
+        share[start : start + size] = along[np.arange(best.size), best]
+    return row, share
 
 
 def _check(certificate: Certificate, overlapping: bool) -> None:

@@ -7,12 +7,17 @@ have nothing in common.
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apply.inverse import InverseMap, Per, SurfacePoints
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import FloatArray, check_choice
 from quasiharmonic.exact.predicates import orientation
+
+#: What becomes of vertices without a partner.
+Outside = Literal["nan", "nearest"]
 
 
 class SurfaceMap:
@@ -77,7 +82,7 @@ class SurfaceMap:
         """The map φ⁻¹∘ψ from the target to the source."""
         return SurfaceMap(self.target, self.source)
 
-    def transfer(self, values: ArrayLike, *, per: Per = "vertex") -> FloatArray:
+    def transfer(self, values: ArrayLike, *, per: Per = "vertex", outside: Outside = "nan") -> FloatArray:
         """Bring values from the target to the vertices of the source.
 
         Parameters
@@ -85,13 +90,26 @@ class SurfaceMap:
         values : array
             Values on the target; see `InverseMap.values`.
         per : {"vertex", "corner", "triangle"}
+        outside : {"nan", "nearest"}
+            What vertices without a partner get, as rounding and other boundary vertices leave some at the rim: NaN, or
+            the value at the point of the target's image that is nearest in the plane. Vertices of no triangle, whose
+            places are not finite, have none.
 
         Returns
         -------
         (n, ...) float64
-            The target's value at the partner of each of the source's vertices; NaN where there is none.
+            The target's value at the partner of each of the source's vertices.
+
+        Raises
+        ------
+        ValueError
+            When the shape of the values does not fit, or an option has no such value.
         """
-        return self.target.values(self.target.locate(self.source.uv), values, per=per)
+        check_choice("outside", outside, get_args(Outside))
+        at = self.target.locate(self.source.uv)
+        if outside == "nearest":
+            at = self.target.nearest(self.source.uv, at)
+        return self.target.values(at, values, per=per)
 
 
 def _outline(mapped: InverseMap) -> set[tuple[tuple[float, float], ...]]:

@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
     if options.fixed is not None:
         given["fixed"] = io.read_handles(options.fixed, len(mesh.V))
     if options.weights is not None:
-        given["weights"] = _numbers(options.weights)
+        given["weights"] = _weights(options.weights)
     found = seams.surface(options, mesh, disks_too=True)
     with report.about(options.input), progress.line() as show:
         mapped = atlas.flatten(
@@ -174,16 +174,14 @@ def _mean_energy(mapped: MappedAtlas) -> float | None:
     return energy if isfinite(energy) else None
 
 
-def _numbers(path: Path) -> list[float]:
-    """One number on each line."""
+def _weights(path: Path) -> list[float]:
+    """One positive number on each line."""
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.numbers import read_rows
+
     values = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        text = line.split("#")[0].strip()
-        if text:
-            try:
-                values.append(float(text))
-            except ValueError:
-                raise ValueError(f"{path}, line {number}: {text[:40]!r} is not a number") from None
-            if not values[-1] > 0:
-                raise ValueError(f"{path}, line {number}: a weight must be positive, not {text[:40]}")
+    for line, (value,) in read_rows(path, 1):
+        if not value > 0:
+            raise MeshFileError(path, f"a weight must be positive, not {value:g}", line)
+        values.append(value)
     return values

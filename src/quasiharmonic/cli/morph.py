@@ -134,30 +134,15 @@ def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float6
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.numbers import read_rows
 
-    places: dict[int, tuple[float, float]] = {}
-    try:
-        # Spreadsheets put a mark before the first line, and semicolons where a comma is the decimal point.
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise MeshFileError(path, "is not a text file") from error
-    except OSError as error:
-        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
-    for number, line in enumerate(lines, start=1):
-        words = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
-        if not words or (number == 1 and words[0].lower() == "vertex"):
-            continue
-        try:
-            vertex, place = int(words[0]), (float(words[1]), float(words[2]))
-        except (ValueError, IndexError):
-            vertex, place, words = -1, (0.0, 0.0), []
-        if len(words) != 3 or not 0 <= vertex < n or not np.isfinite(place).all():
-            raise MeshFileError(
-                path, f"line {number} is not 'vertex,x,y' with a vertex from 0 to {n - 1}: {line[:60]!r}"
-            )
-        if vertex in places:
-            raise MeshFileError(path, f"names vertex {vertex} a second time", number)
-        places[vertex] = place
+    places: dict[int, list[float]] = {}
+    for line, (vertex, *place) in read_rows(path, 3):
+        if not (0 <= vertex < n and vertex.is_integer()):
+            raise MeshFileError(path, f"{vertex:g} is not a vertex from 0 to {n - 1}", line, "lines are 'vertex,x,y'")
+        if int(vertex) in places:
+            raise MeshFileError(path, f"names vertex {int(vertex)} a second time", line)
+        places[int(vertex)] = place
     if not places:
         raise MeshFileError(path, "moves no vertex")
     return np.array(list(places), dtype=np.int64), np.array(list(places.values()))

@@ -23,6 +23,8 @@ _FOREIGN = {
     b"\xfd7zXZ": ("is compressed by xz", "unpack it first"),
 }
 _NUMERIC = b"0123456789.eE+-"
+# An exponent as Fortran writes it.
+_FORTRAN = re.compile(rb"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 _INTEGER = re.compile(rb"[+-]?[0-9]+")
 
 
@@ -89,7 +91,7 @@ def number(token: bytes) -> float:
     """Turn decimal text into the nearest double; `ValueError` with a clear text for anything else."""
     try:
         # Python reads more than files mean: 1_000, or words for infinity.
-        value = math.nan if b"_" in token else float(token)
+        value = math.nan if b"_" in token else float(_FORTRAN.sub(b"e", token))
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
