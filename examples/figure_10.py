@@ -27,7 +27,9 @@ triangles. V₄ in linear elements goes below zero; in Crouzeix and Raviart's it
 The maps drawn are those of V₃ with tanh. It leaves three triangles of the rabbit onto H, at the concave corners of the
 bar, each with a ten-millionth of the area, and after 4,000 evaluations one; `speed` takes 17 iterations, on a coarse
 mesh. Three scans are left with 4 to 8 triangles. With more evaluations two of these are solved, David onto H by 1,623
-and the gargoyle onto H by 1,472. ``benchmarks/letters_alone.py`` has all runs, one by one.
+and the gargoyle onto H by 1,472; the bunny onto G is not by 3,000.
+
+``benchmarks/letters_alone.py`` has all runs, one by one.
 """
 
 from __future__ import annotations

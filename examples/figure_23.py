@@ -1,10 +1,10 @@
 """Figure 23: three energies that do not mind inversions, alone and quasi-harmonised
 ===================================================================================
 
-Upper rows: the map of least energy, found by L-BFGS on its vertices from the first injective map. From 2 to over 1,600
+Upper rows: the map of least energy, found by L-BFGS on its vertices from the first injective map. From 3 to over 1,600
 triangles end up inverted: those behind the boundary's concave corners, and folds wherever a fold costs less than
 squeezing, for springs wherever the surface stands up. Lower rows: the same energies with V₃, as `harmonise` descends
-them. None inverted. ARAP is 42 to 61 % higher for it on A, P and H and springs 22 to 46 %; on R, where the energies
+them. None inverted. ARAP is 42 to 61 % higher for it on A, P and H and springs 22 to 45 %; on R, where the energies
 alone leave through the gap between the legs, 2.7 and 3.1 times as high. For areas it is lower on A, P and H: the folds
 of the energy alone are local minima.
 
