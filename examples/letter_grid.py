@@ -2,13 +2,12 @@
 ==========================================================================
 
 A cat's head is mapped onto a letter, and some of its vertices are marked. Where they come to lie is what the letter's
-outline makes of them; here the outline is what gives way. How far the marks are from the nodes of a grid is a function of
-the polished map, its gradient by all of the outline's vertices is one solve (``polish_derivative(…).vjp``), and a
+outline makes of them; here the outline is what gives way. How far the marks are from the nodes of a grid is a function
+of the polished map, its gradient by all of the outline's vertices is one solve (``polish_derivative(…).vjp``), and a
 quasi-Newton method lowers it, along with how much the outline is bent. The map stays injective at every step.
 
-At the default size the marks begin 0.036 of the letter's height from their nodes (root of the mean square) and end
-0.0007 from them after 40 steps. The outline has moved by 0.06 at most. Left: the letter; middle: fitted; right: both
-outlines.
+At the default size 27 marks begin 0.020 from their nodes (root of the mean square; the letter is 0.73 high) and end
+0.006 from them, after 22 maps. The outline has moved by 0.05 at most. Left: the letter; middle: fitted; right: both.
 """
 
 from __future__ import annotations
