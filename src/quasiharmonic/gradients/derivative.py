@@ -263,7 +263,8 @@ class Derivative:
             by_places += on_scale * self._scale.by_places
         if self._gauge is not None and self._gauge.pin is not None:
             by_places[self._gauge.pin] += on_pin
-        by_held: ComplexArray = np.where(self._follows, by_places[self._fixed], 0j) / self._unit
+        by_held = by_places[self._fixed] / self._unit
+        by_held[~self._follows] = 0
         return as_rows(by_held)
 
     def _by_rest(self, felt: Felt, on_scale: float) -> FloatArray:
