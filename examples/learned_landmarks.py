@@ -90,7 +90,7 @@ def main(output: Path, size: int = 8, steps: int = 150) -> dict[str, Any]:
     def landmarks(uv: torch.Tensor, marks: NDArray[np.int64]) -> torch.Tensor:
         return uv[torch.arange(len(uv))[:, None], torch.tensor(marks)]
 
-    (shapes, marks), (others, others_marks) = faces(V, 60, 1), faces(V, 12, 2)
+    (shapes, marks), (others, others_marks) = faces(V, 24, 1), faces(V, 12, 2)
     seen, others_seen = (torch.tensor(features(*x)) for x in ((shapes, F, marks), (others, F, others_marks)))
     with torch.no_grad():
         plain = quasi_harmonic_map(problem, reference="rest")

@@ -47,22 +47,25 @@ def main(output: Path, size: int = 26, steps: int = 40) -> dict[str, Any]:
     nodes = np.array([(x, y) for x in (0.14, 0.23, 0.605, 0.695) for y in stems] + bar)
     bent = nodes + 0.02 * np.sin([9, 14] * nodes[:, ::-1] + [0.5, 0.3])
     marks = np.array([np.argmin(np.linalg.norm(first.uv - place, axis=1)) for place in bent])
-    start = first.uv
+    # A map that a step too long has led to may lie in another valley: each search starts at the best one so far.
+    start, lowest = first.uv, np.inf
 
     def value(bends: Array) -> tuple[float, Array]:
-        nonlocal start
+        nonlocal start, lowest
         bends = bends.reshape(-1, 2)
         moved = problem.moved(drawn + smoothed(bends, WIDTH))
         found = solve(moved, polish="symmetric-dirichlet", start=start)
         if not found.injective:
             return 1e3, np.zeros(bends.size)
         derivative = polish_derivative(V, F, found.uv, fixed=fixed)
-        start = derivative.uv
         off = derivative.uv[marks] - nodes
         cotangent = np.zeros((len(V), 2))
         cotangent[marks] = off
         slope = smoothed(derivative.vjp(cotangent).target, WIDTH) + PRICE * bends
-        return 0.5 * float((off**2).sum() + PRICE * (bends**2).sum()), slope.ravel()
+        height = 0.5 * float((off**2).sum() + PRICE * (bends**2).sum())
+        if height < lowest:
+            start, lowest = derivative.uv, height
+        return height, slope.ravel()
 
     best = minimize(value, np.zeros(drawn.size), jac=True, method="L-BFGS-B", options={"maxiter": steps})
     fitted = problem.moved(drawn + smoothed(best.x.reshape(-1, 2), WIDTH))
