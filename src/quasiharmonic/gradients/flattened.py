@@ -14,6 +14,7 @@ from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.loops import judge_loops
 from quasiharmonic.given.taking import takes_mesh
+from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.gradients.derivative import Derivative, Doubt, Scale, as_rows
 from quasiharmonic.gradients.freedom import Freedom
 from quasiharmonic.gradients.gauge import Gauge
@@ -25,6 +26,7 @@ from quasiharmonic.problem import Domain
 _SAME = 1e-6
 
 
+@takes_mesh
 @takes_mesh
 def flatten_derivative(
     V: ArrayLike,
