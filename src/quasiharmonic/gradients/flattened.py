@@ -14,7 +14,6 @@ from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.loops import judge_loops
 from quasiharmonic.given.taking import takes_mesh
-from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.gradients.derivative import Derivative, Doubt, Scale, as_rows
 from quasiharmonic.gradients.freedom import Freedom
 from quasiharmonic.gradients.gauge import Gauge

@@ -14,7 +14,6 @@ from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.energy.sliding import lay_boundary
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.given.taking import takes_mesh
-from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.gradients.derivative import Derivative, Scale, as_rows
 from quasiharmonic.gradients.freedom import Freedom, OnCurves
 from quasiharmonic.gradients.gauge import log_size
