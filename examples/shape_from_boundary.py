@@ -8,8 +8,9 @@ adjoint solve; and its gradient by the outline is that of the map which carries 
 ``polish_derivative(…).vjp``, one more solve. A quasi-Newton method then moves the 13 numbers of the outline.
 
 The usual way to let a mesh follow is linear elasticity, which is shown for the same outlines. At the default size the
-misfit falls by four orders of magnitude in 60 steps. The elastic mesh has inverted triangles from the 5th of them on, and
-from there on its misfit and gradient mean nothing; ours never has. The measured potentials come from another mesh.
+misfit falls to a 2,700th in 60 steps, and the outline, which began up to 0.72 away from the hidden one, ends within
+0.08 of it. The elastic mesh has inverted triangles from the 9th step on, and from there on its misfit and gradient mean
+nothing; ours never has. The potentials that are measured come from another mesh, half as coarse again.
 
 ``pip install scikit-fem``; the library itself does not need it.
 """

@@ -17,6 +17,7 @@ PAGES = (
     FOLDER / "docs" / "existence.md",
     FOLDER / "docs" / "files.md",
     FOLDER / "docs" / "flatten.md",
+    FOLDER / "docs" / "gradients.md",
     FOLDER / "docs" / "howto.md",
     FOLDER / "docs" / "method.md",
     FOLDER / "docs" / "notebook.md",

@@ -447,3 +447,25 @@ def test_looks_in_a_window(example, tmp_path):
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["window"] == [1280, 720]
     assert imread(tmp_path / "looks_window.png")[..., :3].std() > 0.05
+
+
+def test_shape_from_boundary(example):
+    pytest.importorskip("skfem")
+    numbers = example("shape_from_boundary", size=14, steps=25)
+    assert numbers["misfit"] < 0.02 * numbers["misfit at first"]
+    assert numbers["outline off by"] < 0.5 * numbers["outline off by at first"]
+    assert numbers["inverted, ours"] == 0
+    assert numbers["elastic, inverted in the end"] > 0
+
+
+def test_learned_landmarks(example):
+    pytest.importorskip("torch")
+    numbers = example("learned_landmarks", size=5, steps=40)
+    assert numbers["loss"][1] < 0.8 * numbers["loss"][0]
+    assert numbers["apart"] < 0.9 * numbers["apart before"]
+
+
+def test_letter_grid(example):
+    numbers = example("letter_grid", size=14, steps=8)
+    assert numbers["off"] < 0.7 * numbers["off at first"]
+    assert numbers["inverted"] == 0

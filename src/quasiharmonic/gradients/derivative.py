@@ -31,7 +31,7 @@ from quasiharmonic.arrays import (
     real_array,
     work,
 )
-from quasiharmonic.gradients.forces import Forces
+from quasiharmonic.gradients.forces import Felt, Forces
 from quasiharmonic.gradients.gauge import Gauge
 from quasiharmonic.gradients.strain import Strain
 from quasiharmonic.gradients.tensor_forces import TensorForces
@@ -243,12 +243,13 @@ class Derivative:
         if self._gauge is not None:
             pull, on_pin, on_scale = self._gauge.pulled(pull)
         response = self._inverse.solve(pull)
+        felt = self._forces.felt(response)
         if self._scaled:
             on_scale -= work(self._forces.by_scale, response)
         return Gradients(
-            partial(self._by_target, pull, response, on_pin, on_scale),
-            partial(self._by_rest, response, on_scale),
-            partial(self._by_mu, response),
+            partial(self._by_target, pull, felt, on_pin, on_scale),
+            partial(self._by_rest, felt, on_scale),
+            partial(self._by_mu, felt),
         )
 
     @property
@@ -256,25 +257,26 @@ class Derivative:
         """Whether the forces depend on the scale between map and surface."""
         return self._scale is not None and self._gauge is None
 
-    def _by_target(self, pull: ComplexArray, response: ComplexArray, on_pin: complex, on_scale: float) -> FloatArray:
-        by_places = pull - self._forces.by_places(response)
+    def _by_target(self, pull: ComplexArray, felt: Felt, on_pin: complex, on_scale: float) -> FloatArray:
+        by_places = pull - self._forces.gathered(felt.hp, felt.hq)
         if self._scale is not None:
             by_places += on_scale * self._scale.by_places
         if self._gauge is not None and self._gauge.pin is not None:
             by_places[self._gauge.pin] += on_pin
-        by_held: ComplexArray = np.where(self._follows, by_places[self._fixed], 0j) / self._unit
+        by_held = by_places[self._fixed] / self._unit
+        by_held[~self._follows] = 0
         return as_rows(by_held)
 
-    def _by_rest(self, response: ComplexArray, on_scale: float) -> FloatArray:
+    def _by_rest(self, felt: Felt, on_scale: float) -> FloatArray:
         out = np.zeros(self._rest_shape)
         if self._strain is not None:
-            out -= self._strain.pull(*self._forces.strain_of(response))
+            out -= self._strain.pull(*self._forces.strain_of(felt))
         if self._scale is not None:
             out += on_scale * self._scale.by_rest
         return out
 
-    def _by_mu(self, response: ComplexArray) -> ComplexArray | None:
-        return None if self._tensors is None else -self._tensors.of(self._forces, response)
+    def _by_mu(self, felt: Felt) -> ComplexArray | None:
+        return None if self._tensors is None else -self._tensors.of(self._forces, felt)
 
     def _rest_positions(self, rest: ArrayLike) -> FloatArray:
         moved = real_array("rest", rest)

@@ -26,6 +26,7 @@ _SAME = 1e-6
 
 
 @takes_mesh
+@takes_mesh
 def flatten_derivative(
     V: ArrayLike,
     F: ArrayLike,

@@ -10,11 +10,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.energy.energies import QuadraticForm
+
+
+class Felt(NamedTuple):
+    """What triangles feel of a displacement of the vertices.
+
+    Attributes
+    ----------
+    dp, dq : (f,) complex128
+        The change of p and q.
+    hp, hq : (f,) complex128
+        The change of φ's derivatives by them.
+    """
+
+    dp: ComplexArray
+    dq: ComplexArray
+    hp: ComplexArray
+    hq: ComplexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +67,6 @@ class Forces:
     by_q: ComplexArray
     form: QuadraticForm
 
-    @cached_property
-    def at_vertices(self) -> ComplexArray:
-        """The forces themselves; (n,) complex128."""
-        return self.gathered(self.by_p, self.by_q)
-
     def derivatives(self, dw: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """The change (f,) of p and of q as vertices (n,) move."""
         moved = dw[self.corners]
@@ -74,10 +87,14 @@ class Forces:
         by_q -= self.by_p * b + self.by_q * a
         return self.gathered(by_p, by_q)
 
-    def strain_of(self, dw: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """The transpose of `by_strain`: gradients (f,) by a and b of the work along a displacement (n,)."""
-        dp, dq = self.derivatives(dw)
-        hp, hq = self.form.apply(dp, dq)
+    def felt(self, dw: ComplexArray) -> Felt:
+        """What the triangles feel of a displacement (n,)."""
+        changes = self.derivatives(dw)
+        return Felt(*changes, *self.form.apply(*changes))
+
+    def strain_of(self, felt: Felt) -> tuple[ComplexArray, ComplexArray]:
+        """The transpose of `by_strain`: gradients (f,) by a and b of the work along a displacement."""
+        dp, dq, hp, hq = felt
         along: FloatArray = (self.by_p.conj() * dp + self.by_q.conj() * dq).real
         by_a = 2 * along - (hp * self.p.conj() + hq.conj() * self.q + self.by_p * dp.conj() + self.by_q.conj() * dq)
         by_b = -(hp.conj() * self.q + hq * self.p.conj() + self.by_p.conj() * dq + self.by_q * dp.conj())

@@ -30,10 +30,12 @@ _CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
 # A step that strains no triangle by more than this is none; one as short as the second, and not half as long as the one
 # before, is rounding; and a map whose last step strains more than the third is not at rest.
 _NOTHING, _SHORT, _AT_REST = 1e-12, 1e-6, 1e-6
+# After a step as short as this second derivatives are the same to so many digits, and are not factored anew.
+_NEAR = 1e-8
 # What the energy may rise by, of itself: its rounding.
 _ROUNDING = 1e-13
 # With the diagonal scaled to one, an eigenvalue as small as this is none.
-_SINGULAR, _ITERATIONS = 1e-10, 4
+_SINGULAR, _ITERATIONS = 1e-10, 2
 # A triangle's singular values, the smaller over the larger, from where on it is as good as collapsed.
 _THIN = 1e-8
 
@@ -92,6 +94,10 @@ class Minimum:
             if size <= _NOTHING or (self._exact and size <= _SHORT and size > 0.5 * last):
                 return size
             if not left or not self._moved(step):
+                return size
+            if self._exact and size <= _NEAR:
+                # Quadratic convergence: this was the last step, and the factor is good to as many digits.
+                self._at()
                 return size
             last = size
         raise AssertionError("the last step has been returned from")

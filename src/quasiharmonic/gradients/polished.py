@@ -23,6 +23,7 @@ from quasiharmonic.problem import Domain
 
 
 @takes_mesh
+@takes_mesh
 def polish_derivative(
     V: ArrayLike,
     F: ArrayLike,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from quasiharmonic.arrays import ComplexArray
 from quasiharmonic.field.tensor import TensorField
-from quasiharmonic.gradients.forces import Forces
+from quasiharmonic.gradients.forces import Felt, Forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class TensorForces:
         p, q = forces.p, forces.q
         return forces.gathered(2 * (dc * p - dtwist.conj() * q), 2 * (dc * q - dtwist * p))
 
-    def of(self, forces: Forces, dw: ComplexArray) -> ComplexArray:
-        """The transpose: the gradient (f,) by the coefficients of the work along a displacement (n,)."""
-        dp, dq = forces.derivatives(dw)
+    def of(self, forces: Forces, felt: Felt) -> ComplexArray:
+        """The transpose: the gradient (f,) by the coefficients of the work along a displacement."""
+        dp, dq = felt.dp, felt.dq
         by_c = 2 * forces.share * (forces.p.conj() * dp + forces.q.conj() * dq).real
         by_twist: ComplexArray = -2 * forces.share * (forces.q * dp.conj() + forces.p.conj() * dq)
         return self.field.pull_twist(by_c, by_twist)
