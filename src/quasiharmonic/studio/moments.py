@@ -116,6 +116,8 @@ def told(moment: Moment) -> list[dict[str, Any]]:
     diagnosis, loops = moment.result.diagnosis, moment.problem.domain.loops
     if diagnosis is None:
         return []
+    # What has a place of its own tells more than what is said of whole loops.
+    found = sorted(diagnosis.obstructions, key=lambda one: not (one.vertices.size or one.edges.size))
     return [
         {
             "message": one.message,
@@ -125,7 +127,7 @@ def told(moment: Moment) -> list[dict[str, Any]]:
             "edges": [*one.edges.tolist(), *(edge for k in one.loops for edge in _around(loops[k]))][:_MOST_ELEMENTS],
             "triangles": one.triangles.tolist()[:_MOST_ELEMENTS],
         }
-        for one in diagnosis.obstructions[:_MOST_TOLD]
+        for one in found[:_MOST_TOLD]
     ]
 
 

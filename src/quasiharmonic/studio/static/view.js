@@ -182,7 +182,10 @@ export function createView(element, options = {}) {
       painter.setBad(arrays.bad);
       clock.maps += 1;
     }
-    if (header.fit) plane.fit(scene.places);
+    if (header.fit) {
+      scene.chosen = -1;
+      plane.fit(scene.places);
+    }
     seq = header.seq;
     hands.answered(header.seq, header.after);
     redraw();
