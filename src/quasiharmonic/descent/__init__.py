@@ -13,4 +13,15 @@ from quasiharmonic.descent.random_restarts import RandomRestarts
 from quasiharmonic.descent.untangling import Untangling
 from quasiharmonic.descent.vector_adam import VectorAdam
 
-__all__ = ["LBFGS", "Alternating", "Combing", "Composite", "Descent", "Newton", "Patches", "RandomRestarts", "Untangling", "VectorAdam"]
+__all__ = [
+    "LBFGS",
+    "Alternating",
+    "Combing",
+    "Composite",
+    "Descent",
+    "Newton",
+    "Patches",
+    "RandomRestarts",
+    "Untangling",
+    "VectorAdam",
+]

@@ -31,9 +31,10 @@ from quasiharmonic.field.objective import Iterate, Objective
 
 Generator = np.random.Generator
 
-# Rings around an inverted triangle, one of them drawn for every patch; and triangles of a patch at most.
+# Rings around an inverted triangle, one of them drawn for every patch; triangles of a patch at most, and of one of the
+# fewest rings, which has many where a vertex has very many neighbours.
 _RINGS = 3, 8, 24
-_MOST_TRIANGLES = 2000
+_MOST_TRIANGLES, _MOST_NEAR = 2000, 20000
 # What a positive triangle keeps of its height over its widest side at the least, as a fraction and in widths; what an
 # inverted one is to get.
 _KEPT, _ENOUGH, _RIGHTED = 0.1, 1.0, 1e-3
@@ -72,7 +73,9 @@ class Combing(VertexDescent):
         in_vain = 0
         while left.size and in_vain < self.in_vain:
             in_vain += 1
-            patch = patch_around(problem, int(rng.choice(left)), int(rng.choice(_RINGS)), _MOST_TRIANGLES)
+            triangle, rings = int(rng.choice(left)), int(rng.choice(_RINGS))
+            patch = patch_around(problem, triangle, rings, _MOST_TRIANGLES)
+            patch = patch or patch_around(problem, triangle, _RINGS[0], _MOST_NEAR)
             if patch is None:
                 continue
             moved = w.copy()

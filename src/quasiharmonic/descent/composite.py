@@ -2,12 +2,12 @@
 
     mesh ──Tutte──▶ disk of chords ◀──same triangles── target, triangulated between its boundary vertices
 
-Tutte's embedding onto a convex outline is injective. A triangulation of the target that has no vertices but those of the
-boundary is one of any convex polygon with as many corners too: corner by corner it is a bijective map of the disk onto
-the target, affine on every triangle. Carrying the mesh through both puts every vertex where it is in the limit of ever
-smaller triangles an injective map; what is inverted then are triangles too large for how the target folds, and a
-descent from the tensors of this map finds few of them and near to where they belong. (Weber and Zorin 2014 compose such
-maps for injectivity itself, and split the mesh for it.)
+Tutte's embedding onto a convex outline is injective. A triangulation of the target that has no vertices but those of
+the boundary is one of any convex polygon with as many corners too: corner by corner it is a bijective map of the disk
+onto the target, affine on every triangle. Every vertex goes through both. Were the mesh's triangles ever smaller, that
+would be an injective map; what is inverted are triangles across which the second map bends, few as a rule, and a
+descent from the tensors of this map has not far to go. (Weber and Zorin 2014 compose such maps for injectivity
+itself, and split the mesh for it.)
 
 It takes a single boundary loop, whose image is simple.
 """
@@ -63,12 +63,12 @@ class Composite(VectorAdam):
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; without a composite all steps are as `VectorAdam` has them."""
         steps = super().iterates(objective, start)
-        for here in islice(steps, self.direct):
-            yield here
+        yield from islice(steps, self.direct)
         left = self.iterations - self.direct - 1
         w = composite_map(objective) if left > 0 else None
         if w is None:
-            return (yield from steps)
+            # None where the steps before were all.
+            return bool((yield from steps))
         there = objective.near_map(w)
         yield there
         nearby = VectorAdam(

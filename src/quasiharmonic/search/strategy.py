@@ -51,20 +51,20 @@ def speed(problem: Problem) -> Stages:
     else:
         first, newton = VectorAdam(iterations=100), Newton(iterations=300, resume=True)
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
-    repair: Stages = (Combing(resume=True), Patches(tries=30, resume=True))
+    repair: Stages = (Combing(resume=True), Patches(tries=15, resume=True))
     if len(problem.domain.loops) == 1 and not problem.domain.pins.size:
         first, straight = Composite(iterations=100), (first, *repair)
     coarse = CoarseToFine(first)
     soon: Stages = (coarse, first, *repair) if problem.n >= _LARGE else (first, *repair, coarse)
     return [
         *soon,
-        Untangling(iterations=300, resume=True),
+        Untangling(iterations=400, resume=True),
         Combing(in_vain=10, resume=True),
         *straight,
-        RandomRestarts(in_vain=30, resume=True),
         newton,
         Untangling(iterations=600, resume=True),
         Combing(in_vain=10, resume=True),
+        RandomRestarts(in_vain=30, resume=True),
         RandomRestarts(in_vain=30),
         RandomRestarts(in_vain=60, resume=True),
     ]
