@@ -97,7 +97,7 @@ def _surface(rng: Generator, scans: Sequence[Path]) -> tuple[str, FloatArray, In
     if scans and rng.random() < 0.5:
         path = scans[rng.integers(len(scans))]
         for _ in range(20):
-            found = _patch(rng, *_scan(path), size)
+            found = patch_of_scan(rng, path, size)
             if found is not None:
                 return path.stem, *found
     if rng.random() < 0.2:
@@ -114,8 +114,9 @@ def _scan(path: Path) -> tuple[FloatArray, IntArray]:
     return mesh.V, mesh.F
 
 
-def _patch(rng: Generator, V: FloatArray, F: IntArray, size: int) -> tuple[FloatArray, IntArray] | None:
+def patch_of_scan(rng: Generator, path: Path, size: int) -> tuple[FloatArray, IntArray] | None:
     """About ``size`` triangles around a random vertex, or all if there are no more; None where they fit no plane."""
+    V, F = _scan(path)
     if len(F) > 1.5 * size:
         distance = _rings(F, len(V), int(rng.integers(len(V))))
         order = np.argsort(distance[F].max(axis=1), kind="stable")

@@ -64,6 +64,8 @@ class SearchStage(ABC):
 
     #: Whether it searches on a coarse mesh, and not on the mesh itself.
     coarse: ClassVar[bool] = False
+    #: Whether it takes no longer than finding out whether there is a map at all, which is put off until after it.
+    quick: ClassVar[bool] = False
 
     @property
     @abstractmethod

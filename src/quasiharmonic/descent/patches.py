@@ -61,6 +61,7 @@ class Patches(VertexDescent):
     tries: int = 30
 
     word: ClassVar[str] = "patches"
+    quick: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         whole_number("tries", self.tries, least=1)

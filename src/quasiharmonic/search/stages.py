@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeAlias
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
-from quasiharmonic.descent import Descent, Newton, Patches, Untangling, VectorAdam
+from quasiharmonic.descent import Combing, Descent, Newton, Patches, Untangling, VectorAdam
 from quasiharmonic.descent.base import FunctionalDescent, Runner, SearchStage, SoFar, Steps
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.certificate import flipped_triangles
@@ -190,7 +190,7 @@ class Search:
         self.best_reference: Reference = "equilateral"
         self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
-        self._rounded = False
+        self._rounded = self._tried = False
 
     def run(self, stages: Stages) -> Status:
         """Run stages until one finds an injective map; why the search ended."""
@@ -213,9 +213,10 @@ class Search:
             status = self._descend_by_any(fallback, status)
             stages = on_the_mesh or [fallback]
         for stage in stages:
+            if status is Status.INJECTIVE or self._left <= 0:
+                break
             # Later stages take long, and are in vain where no injective map exists.
-            hopeless = self.diagnosis is not None and self.diagnosis.forbids_injective
-            if status is Status.INJECTIVE or self._left <= 0 or hopeless:
+            if self._tried and not stage.quick and self._examine().forbids_injective:
                 break
             status = stage.run(self, status)
         if self.best_field is None and self._left > 0:
@@ -229,11 +230,9 @@ class Search:
         return Status.ROUNDED if self._rounded else status
 
     def attempt(self, stage: Descent, before: Status) -> Status:
-        """Run a stage on the mesh itself; where it finds no map, find out whether there is one."""
-        status = self._descend_by_any(stage, before)
-        if status is not Status.INJECTIVE:
-            self._examine()
-        return status
+        """Run a stage on the mesh itself."""
+        self._tried = True
+        return self._descend_by_any(stage, before)
 
     def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
         """Run a stage on the mesh itself, and forget the lowest V₃ that it came to if it finds no map."""
@@ -420,7 +419,7 @@ def _on_coarse(
 ) -> tuple[Status, FloatArray, str]:
     """Solve a coarse problem, and lower the distortion of its map a little: why it ended, the map, the backend."""
     search = Search(problem, linear_solver, callback, budget)
-    status = search.run([first, Patches(resume=True), Untangling(resume=True)])
+    status = search.run([first, Combing(resume=True), Patches(resume=True), Untangling(resume=True)])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
         # Fine vertices crowd where coarse triangles are thin: a few steps against that pay many times over.

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from quasiharmonic.descent import Alternating, Descent, Newton, Patches, RandomRestarts, Untangling, VectorAdam
+from quasiharmonic.descent import (
+    Alternating,
+    Combing,
+    Composite,
+    Descent,
+    Newton,
+    Patches,
+    RandomRestarts,
+    Untangling,
+    VectorAdam,
+)
 from quasiharmonic.descent.base import SearchStage
 from quasiharmonic.problem import Problem
 from quasiharmonic.search.stages import CoarseToFine, InPassing, Stages
@@ -34,20 +44,27 @@ def speed(problem: Problem) -> Stages:
     list of Descent or CoarseToFine
         In the order in which they are run.
     """
+    straight: Stages = ()
     if problem.domain.pins.size:
         first: Descent = VectorAdam(parameterisation="si-log", iterations=400)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
         first, newton = VectorAdam(iterations=100), Newton(iterations=300, resume=True)
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
-    coarse, patches = CoarseToFine(first), Patches(tries=30, resume=True)
-    soon: Stages = (coarse, first, patches) if problem.n >= _LARGE else (first, patches, coarse)
+    repair: Stages = (Combing(resume=True), Patches(tries=15, resume=True))
+    if len(problem.domain.loops) == 1 and not problem.domain.pins.size:
+        first, straight = Composite(iterations=100), (first, *repair)
+    coarse = CoarseToFine(first)
+    soon: Stages = (coarse, first, *repair) if problem.n >= _LARGE else (first, *repair, coarse)
     return [
         *soon,
-        Untangling(iterations=300, resume=True),
-        RandomRestarts(in_vain=30, resume=True),
+        Untangling(iterations=400, resume=True),
+        Combing(in_vain=10, resume=True),
+        *straight,
         newton,
         Untangling(iterations=600, resume=True),
+        Combing(in_vain=10, resume=True),
+        RandomRestarts(in_vain=30, resume=True),
         RandomRestarts(in_vain=30),
         RandomRestarts(in_vain=60, resume=True),
     ]

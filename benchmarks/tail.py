@@ -1,0 +1,173 @@
+"""The tail of the time: hundreds of scanned surfaces onto outlines, and how long the slowest take.
+
+    python benchmarks/tail.py --scans FOLDER [-n 700] [-o tail.jsonl]
+    python benchmarks/tail.py --summary tail.jsonl [OTHER.jsonl …]
+    python benchmarks/tail.py --scans FOLDER --case 17
+
+A number and the folder's files name a pair: a disk of 1,000 to 20,000 triangles around a random place of a scan, its
+boundary laid along a letter, a polygon, a star, a comb or a whirl. Edges across its rim are split, as they may forbid a
+map by themselves. Pairs that the diagnosis proves to have none do not count. Seconds are CPU seconds of one process,
+from arrays to a certified map; for those that can be compared let BLAS have one thread (``OMP_NUM_THREADS=1
+MKL_NUM_THREADS=1``). A campaign may be interrupted and goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import outlines
+from campaign import read
+from pin_problems import patch_of_scan
+from quasiharmonic import Status, injective_map
+from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.exact.loops import judge_loops
+from quasiharmonic.mesh.refinement import refine
+from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.targets import arc_length, filled
+
+Generator = np.random.Generator
+Record = dict[str, Any]
+
+SMALLEST, LARGEST = 1000, 20000
+OUTLINES: dict[str, Callable[[Generator, float], list[FloatArray]]] = {
+    "glyph": outlines.glyph,
+    "polygon": outlines.polygon,
+    "star": outlines.burst,
+    "teeth": outlines.teeth,
+    "whirl": outlines.whirl,
+}
+PERCENTILES = 50, 90, 95, 99, 100
+
+
+class Pair(NamedTuple):
+    """A surface and where its boundary goes.
+
+    Attributes
+    ----------
+    V, F, fixed, target : arrays
+        As `injective_map` takes them.
+    surface, outline : str
+        Whose they are.
+    """
+
+    V: FloatArray
+    F: IntArray
+    fixed: IntArray
+    target: FloatArray
+    surface: str
+    outline: str
+
+
+def make(number: int, scans: Sequence[Path]) -> Pair:
+    """Make a pair; anew where a scan has no disk around the place drawn, or vertices too few for the outline."""
+    rng = np.random.default_rng([7, number])
+    while True:
+        path = scans[rng.integers(len(scans))]
+        size = int(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
+        word = list(OUTLINES)[rng.integers(len(OUTLINES))]
+        contour = filled(OUTLINES[word](rng, rng.random()))[0]
+        found = patch_of_scan(rng, path, size)
+        if found is None or len(found[1]) < SMALLEST or len(boundary_loops(found[1], len(found[0]))) > 1:
+            continue
+        V, F = _without_chords(*found)
+        (loop,) = boundary_loops(F, len(V))
+        try:
+            target = arc_length(V[loop], contour)
+        except ValueError:
+            continue
+        if judge_loops([np.arange(len(loop))], target)[1]:
+            continue  # too few vertices to stay clear of itself
+        return Pair(V, F, loop, target, path.parent.name if path.stem == "input" else path.stem, word)
+
+
+def _without_chords(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
+    """Split interior edges that join two boundary vertices."""
+    found = edges(F, len(V))
+    rim = np.zeros(len(V), dtype=bool)
+    rim[found.boundary] = True
+    refined = refine(V, F, found.interior[rim[found.interior].all(axis=1)])
+    return refined.V, refined.F
+
+
+def run(number: int, scans: Sequence[Path]) -> Record:
+    """Make and solve a pair."""
+    pair = make(number, scans)
+    record: Record = {"name": str(number), "surface": pair.surface, "outline": pair.outline, "triangles": len(pair.F)}
+    began = time.process_time()
+    result = injective_map(pair.V, pair.F, pair.fixed, pair.target)
+    return record | {
+        "seconds": round(time.process_time() - began, 4),
+        "injective": result.injective,
+        "impossible": result.status is Status.IMPOSSIBLE,
+        "iterations": result.iterations,
+        "flipped": len(result.certificate.flipped),
+        "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
+    }
+
+
+def summary(records: Sequence[Record]) -> str:
+    """What was solved, percentiles of seconds, and the slowest."""
+    counted = [r for r in records if not r["impossible"]]
+    solved = [r for r in counted if r["injective"]]
+    if not solved:
+        return "no pair was solved"
+    seconds = np.percentile([r["seconds"] for r in solved], PERCENTILES)
+    lines = [
+        "| pairs | no map exists | solved | " + " | ".join(f"{p} %" for p in PERCENTILES) + " |",
+        "|" + "---|" * (3 + len(PERCENTILES)),
+        f"| {len(records)} | {len(records) - len(counted)} | {len(solved)} of {len(counted)} | "
+        + " | ".join(f"{s:.2f}" for s in seconds)
+        + " |",
+        "",
+    ]
+    unsolved = [r for r in counted if not r["injective"]]
+    slowest = sorted(solved, key=lambda r: -r["seconds"])[:10]
+    return "\n".join(lines + [_story(r) for r in unsolved + slowest])
+
+
+def _story(record: Record) -> str:
+    course = ", ".join(f"{name} {a}→{b} ({k}, {s:.2f} s)" for name, k, a, b, s in record["stages"])
+    verdict = "" if record["injective"] else "unsolved, "
+    return (
+        f"{record['name']}: {verdict}{record['surface']} onto {record['outline']}, {record['triangles']} triangles, "
+        f"{record['seconds']:.2f} s: {course}"
+    )
+
+
+def main() -> None:
+    """Run, summarise or repeat."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scans", type=Path, help="a folder with OBJ files, in folders of it too")
+    parser.add_argument("-n", "--count", type=int, default=700, help="pairs (%(default)s)")
+    parser.add_argument("-o", "--output", type=Path, default=Path("tail.jsonl"), help="records (%(default)s)")
+    parser.add_argument("--summary", type=Path, nargs="+", metavar="RESULTS", help="summarise records and end")
+    parser.add_argument("--case", type=int, action="append", metavar="NUMBER", help="run just this pair")
+    options = parser.parse_args()
+    if options.summary:
+        for path in options.summary:
+            print(f"{path}\n\n{summary(read(path))}\n")
+        return
+    scans = sorted(options.scans.rglob("*.obj")) if options.scans else []
+    if not scans:
+        parser.error("name a folder with OBJ files: --scans FOLDER")
+    if options.case:
+        print(*(_story(run(number, scans)) for number in options.case), sep="\n")
+        return
+    done = {record["name"] for record in read(options.output)}
+    with options.output.open("a", encoding="utf-8") as file:
+        for number in range(options.count):
+            if str(number) not in done:
+                file.write(json.dumps(run(number, scans)) + "\n")
+                file.flush()
+    print(summary(read(options.output)))
+
+
+if __name__ == "__main__":
+    main()
