@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray, named
 from quasiharmonic.energy.deformation import signed_areas
 from quasiharmonic.exact.certificate import flipped_triangles
-from quasiharmonic.flattening.constrained_delaunay import BlockedError, constrained_delaunay
+from quasiharmonic.exact.constrained_delaunay import BlockedError, constrained_delaunay
 from quasiharmonic.flattening.graded_points import Quadtree
 from quasiharmonic.mesh.topology import edge_keys
 
