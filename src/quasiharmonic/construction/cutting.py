@@ -11,7 +11,12 @@ from quasiharmonic.construction.regions import Regions
 from quasiharmonic.construction.sheet import Sheet
 from quasiharmonic.construction.sides import along_sides
 from quasiharmonic.construction.walks import walk
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.problem import Problem
+
+
+class TooManyError(Exception):
+    """More vertices would have to be added than were allowed."""
 
 
 class Cutting:
@@ -24,6 +29,13 @@ class Cutting:
         surface has no handles.
     guide : (n,) complex128, optional
         A map near which the mesh is to be cut. Without it the mesh, once it is a disk, is laid into a circle.
+    most : int, optional
+        Vertices to add at most.
+
+    Raises
+    ------
+    TooManyError
+        When that is not enough.
 
     Attributes
     ----------
@@ -35,14 +47,15 @@ class Cutting:
         The place of every vertex on a cut.
     """
 
-    def __init__(self, problem: Problem, guide: ComplexArray | None = None) -> None:
+    def __init__(self, problem: Problem, guide: ComplexArray | None = None, most: int | None = None) -> None:
+        self._most = most
         domain = problem.domain
         point = np.full(problem.n, -1)
         point[problem.fixed] = np.arange(len(problem.fixed))
         self.regions = Regions(problem.target, [point[loop] for loop in domain.loops], point[domain.pins])
         self.sheet = Sheet(problem.F, problem.n, domain.pins.tolist())
         self.places: dict[int, complex] = {}
-        self._target = (problem.target @ [1, 1j]).tolist()
+        self._target = (problem.target @ np.array([1, 1j])).tolist()
         # The copy at each corner of the target's triangles, by the half-edge that begins there.
         fixed = problem.fixed.tolist()
         self._at = {(a, b): fixed[a] for a, b in self.regions.apex}
@@ -61,6 +74,9 @@ class Cutting:
 
     def _cut(self, a: int, b: int) -> None:
         """Cut target and sheet from one point of the target to another."""
+        still_at_it()
+        if self._most is not None and len(self.sheet.parents) > self._most:
+            raise TooManyError
         self._closed |= {(a, b), (b, a)}
         start, end = self._at[a, b], self._at[b, a]
         way = walk(self.sheet, self._place, start, end)
@@ -92,7 +108,7 @@ class Cutting:
 def _harmonic(problem: Problem) -> ComplexArray:
     """Tutte's embedding, wherever that inverts triangles."""
     w = np.zeros(problem.n, dtype=np.complex128)
-    w[problem.fixed] = problem.target @ [1, 1j]
+    w[problem.fixed] = problem.target @ np.array([1, 1j])
     return tutte(problem.F, w, problem.fixed)
 
 

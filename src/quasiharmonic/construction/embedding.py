@@ -96,7 +96,8 @@ def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[C
     here = objective.of_map(best)
     for repair in _REPAIRS:
         try:
-            for here in repair.iterates(objective, here):
+            for step in repair.iterates(objective, here):
+                here = step
                 yield here.w
         except NotPositiveDefinite:
             return

@@ -33,7 +33,6 @@ class HalfEdges:
         self.add(F.tolist())
         self.following = {a: b for a, b in self.apex if (b, a) not in self.apex}
 
-
     def add(self, triangles: Iterable[Iterable[int]]) -> None:
         """Add triangles, given counterclockwise."""
         apex, some = self.apex, self._some

@@ -22,30 +22,37 @@ _ROUNDS, _TRIES, _RINGS, _STEPS = 6, 30, 2, 20
 
 
 def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined, FloatArray]:
-    """Take vertices out of a refinement as long as its map stays injective.
+    """Take vertices out of a refinement as long as its map stays bijective.
 
     Parameters
     ----------
     problem : Problem
-        On the old mesh, with a target of magnitude about one.
+        On the old mesh.
     refined : Refined
     uv : (n + s, 2) float64
-        An injective map of it.
+        A bijective map of it.
 
     Returns
     -------
     refined : Refined
         With as many vertices or fewer.
     uv : (n + s, 2) float64
-        An injective map of it.
+        A bijective map of it, to the last bit where it was if no vertex went.
     """
+    # Of magnitude about one, so that no product overflows.
+    exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent))
+    uv = np.ldexp(uv, -exponent)
     gradings = cycle(GRADINGS)
     for _ in range(_ROUNDS):
-        refined, uv = _taken_out(problem, refined, uv)
+        refined, uv = _taken_out(unit, refined, uv)
         if not len(refined.parents):
-            return refined, uv
-        uv = _opened(problem, refined, uv, next(gradings))
-    return _taken_out(problem, refined, uv, _TRIES)
+            break
+        uv = _opened(unit, refined, uv, next(gradings))
+    refined, uv = _taken_out(unit, refined, uv, _TRIES)
+    uv = np.ldexp(uv, exponent)
+    uv[problem.fixed] = problem.target
+    return refined, uv
 
 
 def _opened(problem: Problem, refined: Refined, uv: FloatArray, grading: float) -> FloatArray:
@@ -58,7 +65,7 @@ def _opened(problem: Problem, refined: Refined, uv: FloatArray, grading: float) 
 def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
     """Take out what can be taken out, and with so many tries what can be made to go."""
     shares = shares_of(refined)
-    thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ [1, 1j])
+    thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ np.array([1, 1j]))
     thinning.thin()
     for vertex in sorted(thinning.left, reverse=True)[:tries]:
         thinning.try_hard(vertex, partial(_untangled, problem.frame), _RINGS)
@@ -76,7 +83,7 @@ def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 
 
 def _untangled(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray:
     """Where untangling a map of a patch ends, in the units of the target."""
-    inward = last = frame.inward(w.view(np.float64).reshape(-1, 2))
-    for last in islice(untangled(patch.F, inward, np.flatnonzero(patch.held), grading=GRADINGS[0]), _STEPS):
-        pass
+    inward = frame.inward(w.view(np.float64).reshape(-1, 2))
+    steps = untangled(patch.F, inward, np.flatnonzero(patch.held), grading=GRADINGS[0])
+    *_, last = inward, *islice(steps, _STEPS)
     return np.where(patch.held, w, frame.outward(last).view(np.complex128).ravel())

@@ -7,6 +7,7 @@ the vertex that it is of; vertices beyond the mesh's own were made by splitting 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -109,7 +110,7 @@ class Sheet(HalfEdges):
     def _mend_boundary(self, walk: Sequence[int], right: Sequence[int]) -> None:
         """Let the boundary run along both sides of a cut: from its start on the left, back to it on the right."""
         after, before = self.following[walk[0]], self.preceding.get(walk[-1])
-        pairs = [*zip(walk[:-1], walk[1:], strict=True), *zip(right[:0:-1], right[-2::-1], strict=True)]
+        pairs = [*pairwise(walk), *zip(right[:0:-1], right[-2::-1], strict=True)]
         pairs.append((right[0], after))
         if before is not None:
             pairs.append((before, right[-1]))

@@ -19,6 +19,7 @@ from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.construction.halfedges import HalfEdges, Triangle
 from quasiharmonic.descent.patches import Patch
 from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.hearing import still_at_it
 from quasiharmonic.mesh.topology import boundary_edges
 
 # Rounding of a determinant relative to the sum of its terms' magnitudes, with room.
@@ -74,6 +75,7 @@ class Thinning:
         while before != len(self.left):
             before = len(self.left)
             for vertex in sorted(self.left, reverse=True):
+                still_at_it()
                 self._take_out(vertex, self._without(vertex, self._in_map))
 
     def try_hard(self, vertex: int, untangle: Callable[[Patch, ComplexArray], ComplexArray], rings: int) -> bool:
@@ -93,6 +95,7 @@ class Thinning:
         bool
             Whether it was taken out; if not all is as before.
         """
+        still_at_it()
         cut = self._without(vertex, self._bent)
         if cut is None:
             return False

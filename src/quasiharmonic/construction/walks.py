@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from heapq import heappop, heappush
+from itertools import pairwise
 
 from quasiharmonic.construction.halfedges import Edge
 from quasiharmonic.construction.sheet import Sheet
@@ -39,12 +40,15 @@ def walk(sheet: Sheet, place: list[complex], start: int, end: int) -> list[int]:
     list of int
         The walk's copies, all but the ends inside.
     """
-    while True:
-        nodes = _shortest(sheet, place, start, end)
+    copies: list[int] = []
+    # Of three middles in one triangle two are not joined when all are there, and another walk has to be found. Where
+    # all ways are measured alike, the middle one of the three is a detour.
+    for stray in (_STRAY, _STRAY, 0.0):
+        nodes = _shortest(sheet, place, start, end, stray)
         copies = [node if isinstance(node, int) else _split(sheet, place, node) for node in nodes]
-        # Of three middles in one triangle two are not joined when all are there; the next walk finds others.
-        if all(sheet.is_inner(a, b) for a, b in zip(copies[:-1], copies[1:], strict=True)):
-            return copies
+        if all(sheet.is_inner(a, b) for a, b in pairwise(copies)):
+            break
+    return copies
 
 
 def _split(sheet: Sheet, place: list[complex], edge: Edge) -> int:
@@ -52,7 +56,7 @@ def _split(sheet: Sheet, place: list[complex], edge: Edge) -> int:
     return sheet.split(*edge)
 
 
-def _shortest(sheet: Sheet, place: list[complex], start: int, end: int) -> list[Node]:
+def _shortest(sheet: Sheet, place: list[complex], start: int, end: int, weight: float) -> list[Node]:
     """The cheapest nodes from a copy to another (Dijkstra)."""
     chord = place[end] - place[start]
     size = abs(chord) or 1.0
@@ -66,7 +70,8 @@ def _shortest(sheet: Sheet, place: list[complex], start: int, end: int) -> list[
         beyond = max(0.0, -z.real, z.real - 1.0)
         return (z.imag * z.imag + beyond * beyond) ** 0.5
 
-    cost, last = {start: 0.0}, dict[Node, Node]()
+    cost: dict[Node, float] = {start: 0.0}
+    last: dict[Node, Node] = {}
     waiting: list[tuple[float, int, Node]] = [(0.0, 0, start)]
     done, count = set[Node](), 0
     while waiting:
@@ -81,7 +86,7 @@ def _shortest(sheet: Sheet, place: list[complex], start: int, end: int) -> list[
             if other in done:
                 continue
             there = where(other)
-            further = abs(there - here) * (1 + _STRAY * (stray(here) + stray(there))) + _STEP
+            further = abs(there - here) * (1 + weight * (stray(here) + stray(there))) + _STEP
             if not isinstance(other, int):
                 further += _SPLIT if sheet.is_held(other[0]) and sheet.is_held(other[1]) else _SPLIT_MORE
             if so_far + further < cost.get(other, float("inf")):
