@@ -13,7 +13,7 @@ import outlines
 import planar
 from planar import Draft, blank, flow, roughen
 from quasiharmonic import Problem, quasi_harmonic_map
-from quasiharmonic.apply.refining import refine
+from quasiharmonic.ladder.refining import refine
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, edges
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from quasiharmonic import surfaces
-from quasiharmonic.apply.refining import refine
+from quasiharmonic.ladder.refining import refine
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, components, edges
 

@@ -47,7 +47,7 @@ from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import ARAP, AreaBarrier, Combination, UnsignedARAP
 from quasiharmonic.energy.newton_descent import NewtonDescent
 from quasiharmonic.exact.certificate import Certificate
-from quasiharmonic.flattening.constrained_delaunay import constrained_delaunay
+from quasiharmonic.exact.constrained_delaunay import constrained_delaunay
 
 #: Half the width and height of the box that each figure rests in, and points along its lower, right, upper, left side.
 BOX, COUNTS = (1.5, 2.0), (24, 32, 24, 32)

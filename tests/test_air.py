@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quasiharmonic.exact import constrained_delaunay as triangulating
 from quasiharmonic.exact.certificate import certify, is_injective
 from quasiharmonic.exact.constrained_delaunay import BlockedError, Triangulation, constrained_delaunay
-from quasiharmonic.flattening import constrained_delaunay as triangulating
 from quasiharmonic.flattening.air import air_around
 from quasiharmonic.flattening.graded_points import Quadtree
 from quasiharmonic.mesh.topology import boundary_loops, edge_keys, edges

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from quasiharmonic.apply.refining import refine
+from quasiharmonic.ladder.refining import refine
 
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.ladder.mapping import injective_map

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quasiharmonic.apply.refining import refine
+from quasiharmonic.ladder.refining import refine
 
 from quasiharmonic import io
 from quasiharmonic.io.errors import MeshFileError
