@@ -95,26 +95,32 @@ def construct(
     TooManyError
         When more vertices would be added than ``most``.
     """
+    # Of magnitude about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
     near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
-    cutting = Cutting(unit, near, most)
-    sheet = cutting.sheet
-    triangles = np.array(sheet.vertex)[sheet.rows()]
-    refined = as_refined(problem.V, problem.F, triangles, midpoints(problem.n, sheet.parents))
-    fine = refined_problem(unit, refined)
-    walked = np.array(sorted(cutting.places), dtype=np.int64)
-    uv = np.zeros((len(refined.V), 2))
-    uv[walked] = np.array([cutting.places[v] for v in walked.tolist()], dtype=np.complex128).view(float).reshape(-1, 2)
-    uv[unit.fixed] = unit.target
-    uv = fine.positions(embedded(fine, fine.frame.inward(uv), np.concatenate([unit.fixed, walked])))
-    certificate = certify(refined.F, uv, loops=problem.domain.loops)
-    if thin and certificate.bijective:
+    refined, uv = _embedded(unit, Cutting(unit, near, most))
+    if thin and certify(refined.F, uv, loops=problem.domain.loops).bijective:
         refined, uv = thinned(unit, refined, uv)
     uv = np.ldexp(uv, exponent)
     uv[problem.fixed] = problem.target
     certificate = certify(refined.F, uv, loops=problem.domain.loops)
     return Construction(refined, uv, certificate, _nearest(problem, refined.F, uv, certificate))
+
+
+def _embedded(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
+    """The mesh as cutting has left it, in one piece again, and the map of its pieces into convex polygons."""
+    sheet = cutting.sheet
+    triangles = np.array(sheet.vertex)[sheet.rows()]
+    refined = as_refined(problem.V, problem.F, triangles, midpoints(problem.n, sheet.parents))
+    fine = refined_problem(problem, refined)
+    uv = np.zeros((len(refined.V), 2))
+    uv[problem.fixed] = problem.target
+    walked = np.array(sorted(cutting.places), dtype=np.int64)
+    for vertex in walked.tolist():
+        uv[vertex] = cutting.places[vertex].real, cutting.places[vertex].imag
+    held = np.concatenate([problem.fixed, walked])
+    return refined, fine.positions(embedded(fine, fine.frame.inward(uv), held))
 
 
 def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
