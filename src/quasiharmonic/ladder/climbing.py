@@ -43,7 +43,7 @@ AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
 )
 # Iterations of a search between the first rung and a construction that is there to be taken, and how often edges are
 # split around what such a search leaves inverted; the latter where there is no construction.
-_FEW_ITERATIONS, _FEW_ROUNDS, _ROUNDS = 200, 1, 3
+_FEW_ITERATIONS, _FEW_ROUNDS, _ROUNDS = 600, 1, 3
 # A construction that adds so few vertices is taken at once: the mesh as given has no map that was found.
 _LEAST = 1
 

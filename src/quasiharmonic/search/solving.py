@@ -21,7 +21,6 @@ from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH, beltrami_coefficients
-from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
@@ -30,7 +29,6 @@ from quasiharmonic.search.stages import Search, Stages
 from quasiharmonic.search.strategy import stages_of
 
 
-@takes_mesh
 @heard
 def solve(
     problem: Problem,
