@@ -13,8 +13,8 @@ import outlines
 import planar
 from planar import Draft, blank, flow, roughen
 from quasiharmonic import Problem, quasi_harmonic_map
-from quasiharmonic.apply.refining import refine
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.ladder.refining import refine
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, edges
 
 Generator = np.random.Generator

@@ -2,13 +2,15 @@
 
     python benchmarks/campaign.py -n 10000 -o results.jsonl [--families maze,pins] [-j 2]
     python benchmarks/campaign.py -n 1000 -o hard.jsonl --adversarial
+    python benchmarks/campaign.py -n 1000 -o refined.jsonl --refine
     python benchmarks/campaign.py --summary results.jsonl
     python benchmarks/campaign.py --case maze:7:0.8
 
 A campaign writes one line of JSON a problem as soon as that is done, and skips what the file already has: it may be
 interrupted or killed at any moment and started again. Problems are solved in processes of their own, so that a crash or
 a hang is one more result. A *failure* is a problem with a known solution and no certified injective map, and
-whatever raises, warns, returns numbers that are not finite, crashes or exceeds its time.
+whatever raises, warns, returns numbers that are not finite, crashes or exceeds its time. With ``--refine``, which may
+split edges, it is also a problem with a simple target and no certified bijective map, for which doubles have room.
 """
 
 from __future__ import annotations
@@ -30,14 +32,16 @@ from typing import Any
 import numpy as np
 
 from problems import ADVERSARIAL, FAMILIES, Case, make, parse
-from quasiharmonic import Problem, solve
+from quasiharmonic import Problem, Status, solve
+from quasiharmonic.construction.simplicity import is_simple
+from quasiharmonic.ladder.climbing import climb
 from quasiharmonic.search.strategy import STRATEGIES
 
 Record = dict[str, Any]
 
 BANDS = 5
 _ALL = FAMILIES | ADVERSARIAL
-_DEFAULTS = {"strategy": "speed", "max_iterations": 2000}
+_DEFAULTS = {"strategy": "speed", "max_iterations": 2000, "refine": False}
 # Outcomes that are failures whether or not a solution is known to exist.
 _ALWAYS = "exception", "warning", "not finite", "crash", "timeout"
 
@@ -51,11 +55,11 @@ def names(count: int, families: Sequence[str]) -> Iterator[str]:
         yield f"{families[family]}:{seed}:{difficulty!r}"
 
 
-def run(name: str, *, strategy: str = "speed", max_iterations: int = 2000) -> Record:
+def run(name: str, *, strategy: str = "speed", max_iterations: int = 2000, refine: bool = False) -> Record:
     """Make and solve one problem; never raises but for what ends the process."""
     family, seed, difficulty = parse(name)
     record: Record = {"name": name, "family": family, "difficulty": difficulty}
-    record |= {"strategy": strategy, "max_iterations": max_iterations}
+    record |= {"strategy": strategy, "max_iterations": max_iterations, "refine": refine}
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
@@ -63,7 +67,7 @@ def run(name: str, *, strategy: str = "speed", max_iterations: int = 2000) -> Re
             case = make(family, seed, difficulty)
             record |= {"feasible": case.feasible, "simple": case.simple}
             record |= {"triangles": len(case.F), "making": round(time.perf_counter() - began, 4)}
-            record |= _solved(case, strategy, max_iterations)
+            record |= _solved(case, strategy, max_iterations, refine)
         except Exception as error:
             record |= {"outcome": "exception", "message": repr(error), "trace": traceback.format_exc(limit=-4)}
     if warned and record["outcome"] in ("injective", "not injective"):
@@ -71,11 +75,17 @@ def run(name: str, *, strategy: str = "speed", max_iterations: int = 2000) -> Re
     return record
 
 
-def _solved(case: Case, strategy: str, max_iterations: int) -> Record:
+def _solved(case: Case, strategy: str, max_iterations: int, refine: bool) -> Record:
     began = time.perf_counter()
     problem = Problem(case.V, case.F, case.fixed, case.target)
-    result = solve(problem, strategy=strategy, max_iterations=max_iterations)
+    way = climb if refine else solve
+    result = way(problem, strategy=strategy, max_iterations=max_iterations)
     seconds = time.perf_counter() - began
+    told = {}
+    if refine:
+        # What is sure to have a bijective map, on a mesh that is fine enough, if doubles have room for one.
+        told = {"promised": is_simple(problem), "no_room": result.status is Status.NO_ROOM}
+        told |= {"added": result.added, "rung": result.rungs[-1].name}
     verdict = "injective" if result.injective else "not injective"
     energy = min((step.energy for step in result.history), default=np.nan)
     return {
@@ -90,11 +100,14 @@ def _solved(case: Case, strategy: str, max_iterations: int) -> Record:
         "pins": len(problem.domain.pins),
         "interior": problem.n - len(case.fixed),
         "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
+        **told,
     }
 
 
 def failed(record: Record) -> bool:
     """Whether a record is a failure."""
+    if record.get("promised") and not record["no_room"] and not record["bijective"]:
+        return True
     return record["outcome"] in _ALWAYS or (bool(record.get("feasible")) and record["outcome"] != "injective")
 
 
@@ -242,6 +255,8 @@ def summary(records: Sequence[Record]) -> str:
         "",
     ]
     lines += [*_by_stage(feasible), ""]
+    if any("rung" in r for r in records):
+        lines += [*_by_rung([r for r in records if "rung" in r]), ""]
     last = Counter(r["stages"][-1][0] if r.get("stages") else "-" for r in records if r["outcome"] == "injective")
     lines += ["found by: " + "; ".join(f"{k}: {n}" for k, n in last.most_common())]
     lines += [
@@ -254,7 +269,7 @@ def summary(records: Sequence[Record]) -> str:
     )
     for r in failures:
         changed = "".join(
-            f" --{key.replace('_', '-')} {r[key]}"
+            f" --{key.replace('_', '-')}" + ("" if r[key] is True else f" {r[key]}")
             for key, default in _DEFAULTS.items()
             if r.get(key, default) != default
         )
@@ -296,6 +311,26 @@ def _row(title: str, records: Sequence[Record]) -> str:
     return f"{title:10}" + "".join(f"{share:>12}" for share in shares) + f"{effort[0]:>13}{effort[1]:>15}"
 
 
+def _by_rung(records: Sequence[Record]) -> list[str]:
+    """How many problems came to a map by which rung of the ladder, vertices added, and time."""
+    lines = []
+    for title, kind in (("simple targets", True), ("others", False)):
+        group = [r for r in records if r["promised"] is kind]
+        done = [r for r in group if r["outcome"] == "injective"]
+        lines.append(
+            f"{title}: {len(done)} of {len(group)} mapped, {sum(r['bijective'] for r in group)} of them bijectively, "
+            f"{sum(r['no_room'] for r in group)} without room in doubles"
+        )
+        for rung in dict.fromkeys(r["rung"] for r in done):
+            by = [r for r in done if r["rung"] == rung]
+            added, seconds = [r["added"] for r in by], [r["seconds"] for r in by]
+            lines.append(
+                f"  {rung}: {len(by)}; vertices added {np.median(added):g} in the median, {max(added)} at the most; "
+                f"{np.median(seconds):.2f} s in the median, {max(seconds):.1f} s at the most"
+            )
+    return lines
+
+
 def _story(record: Record) -> str:
     """What became of a failure, in a few words."""
     if "stages" not in record:
@@ -315,6 +350,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--adversarial", action="store_true", help="families that aim at where programs break")
     parser.add_argument("--strategy", choices=STRATEGIES, default="speed", help="%(choices)s (%(default)s)")
     parser.add_argument("--max-iterations", type=int, default=2000, help="linear solves a problem (%(default)s)")
+    parser.add_argument("--refine", action="store_true", help="split edges where there is no map without")
     parser.add_argument("-j", "--processes", type=int, default=1, help="problems at a time (%(default)s)")
     parser.add_argument("--limit", type=float, default=120.0, help="seconds a problem (%(default)s)")
     parser.add_argument("--summary", type=Path, metavar="RESULTS", help="summarise records and end")
@@ -337,7 +373,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.summary:
         records = read(options.summary)
     elif options.case:
-        records = [run(name, strategy=options.strategy, max_iterations=options.max_iterations) for name in options.case]
+        chosen = {"strategy": options.strategy, "max_iterations": options.max_iterations, "refine": options.refine}
+        records = [run(name, **chosen) for name in options.case]
         print(*(json.dumps(record, indent=1) for record in records), sep="\n")
         return int(any(map(failed, records)))
     else:
@@ -351,6 +388,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     limit=options.limit,
                     strategy=options.strategy,
                     max_iterations=options.max_iterations,
+                    refine=options.refine,
                 )
             ):
                 if failed(record):

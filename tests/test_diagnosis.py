@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from quasiharmonic.ladder.refining import refine
 
-from quasiharmonic.apply.refining import refine
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.ladder.mapping import injective_map
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.solving import injective_map
 from quasiharmonic.surfaces import disk
 from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto
 from shared.polygons import circle

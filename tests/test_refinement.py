@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem
-from quasiharmonic.apply.refining import refine, refine_problem
 from quasiharmonic.exact.diagnosis import diagnose
+from quasiharmonic.ladder.refining import refine, refine_problem
 from quasiharmonic.mesh.topology import edges
 from shared.meshes import boundary_of, signed_areas, surfaces
 from shared.obstructed import OBSTRUCTED

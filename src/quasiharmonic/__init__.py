@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.cutting import Opened, cut_open
     from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
     from quasiharmonic.apply.morphing import Morphed, morph
-    from quasiharmonic.apply.refining import RefinedProblem, refine, refine_problem
     from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
     from quasiharmonic.apply.transfer import SurfaceMap
     from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
@@ -38,12 +37,14 @@ if TYPE_CHECKING:
     from quasiharmonic.gradients.flattened import flatten_derivative
     from quasiharmonic.gradients.polished import polish_derivative
     from quasiharmonic.gradients.tensors import quasi_harmonic_derivative
+    from quasiharmonic.ladder.mapping import injective_map
+    from quasiharmonic.ladder.refining import RefinedProblem, refine, refine_problem
     from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
     from quasiharmonic.search.harmonising import harmonise
     from quasiharmonic.search.many import injective_maps
-    from quasiharmonic.search.solving import injective_map, quasi_harmonic_map, solve
+    from quasiharmonic.search.solving import quasi_harmonic_map, solve
 
 __version__ = "0.1.0"
 
@@ -65,7 +66,7 @@ _HOME = {
     "Problem": "problem",
     "Rails": "curves",
     "Refined": "mesh.refinement",
-    "RefinedProblem": "apply.refining",
+    "RefinedProblem": "ladder.refining",
     "Repaired": "apply.repairing",
     "RepairedIsland": "apply.repairing",
     "Snapshot": "result",
@@ -85,7 +86,7 @@ _HOME = {
     "flatten_derivative": "gradients.flattened",
     "flipped_triangles": "exact.certificate",
     "harmonise": "search.harmonising",
-    "injective_map": "search.solving",
+    "injective_map": "ladder.mapping",
     "injective_maps": "search.many",
     "is_injective": "exact.certificate",
     "keep_distances": "flattening.distance_descent",
@@ -94,8 +95,8 @@ _HOME = {
     "polish_derivative": "gradients.polished",
     "quasi_harmonic_derivative": "gradients.tensors",
     "quasi_harmonic_map": "search.solving",
-    "refine": "apply.refining",
-    "refine_problem": "apply.refining",
+    "refine": "ladder.refining",
+    "refine_problem": "ladder.refining",
     "repair": "apply.repairing",
     "solve": "search.solving",
     "warp_along": "apply.warping",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.exact.certificate import Certificate
+from quasiharmonic.mesh.refinement import Refined
 from quasiharmonic.showing import Shown
 
 if TYPE_CHECKING:
@@ -59,6 +60,10 @@ class Status(Enum):
     UNIMPROVED = (
         "Every triangle is strictly positive, decided exactly, but this is the map that was given: no injective map of "
         "less distortion was found. A smaller eta may help."
+    )
+    NO_ROOM = (
+        "A finer mesh has a map, but doubles have no room for it at the vertices named: the target is too narrow there "
+        "for the spacing of the numbers. Move it nearer to the origin, or widen it."
     )
     UNSOLVABLE = (
         "No linear solver could factor the system any more; this is the best map so far. "
@@ -143,6 +148,31 @@ class Snapshot:
     uv: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Rung:
+    """One rung of the ladder that `injective_map` climbs with ``refine``.
+
+    Attributes
+    ----------
+    name : str
+        What was mapped: the mesh as given, or with which edges split.
+    added : int
+        Vertices that the mesh had more than the one given, after those were taken out that the map did not need.
+    injective : bool
+        Whether its map is (certified).
+    seconds : float
+    """
+
+    name: str
+    added: int
+    injective: bool
+    seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"name": self.name, "added": self.added, "injective": self.injective, "seconds": self.seconds}
+
+
 @dataclass(frozen=True, repr=False)
 class MapResult(Shown):
     """A map of the mesh into the plane.
@@ -174,6 +204,13 @@ class MapResult(Shown):
         Maps on the way, where the caller asked to have them recorded.
     V : (n, 2) or (n, 3) float64 or None
         Rest positions of what was mapped, for pictures and measures; None where whoever made the map did not say.
+    refined : Refined or None
+        Where edges were split (``refine``): the mesh that this is a map of, and how it came from the one given. Old
+        vertices keep their numbers.
+    rungs : list of Rung
+        What was tried, in order, where edges might be split.
+    crowded : (c,) int64
+        With ``NO_ROOM`` the fixed vertices next to what stays inverted.
     """
 
     uv: NDArray[np.float64]
@@ -188,6 +225,14 @@ class MapResult(Shown):
     reference: str = "equilateral"
     path: list[Snapshot] = field(default_factory=list)
     V: NDArray[np.float64] | None = None
+    refined: Refined | None = None
+    rungs: list[Rung] = field(default_factory=list)
+    crowded: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def added(self) -> int:
+        """Vertices that were added, after the old ones."""
+        return 0 if self.refined is None else len(self.refined.parents)
 
     @property
     def F(self) -> NDArray[np.int64]:
@@ -251,4 +296,13 @@ class MapResult(Shown):
             "stages": [stage.to_dict() for stage in self.stages],
             "certificate": self.certificate.to_dict(),
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
+            **(self._refinement() if self.rungs else {}),
+        }
+
+    def _refinement(self) -> dict[str, Any]:
+        """What the report says where edges might be split."""
+        return {
+            "added_vertices": self.added,
+            "rungs": [rung.to_dict() for rung in self.rungs],
+            "crowded": self.crowded.tolist(),
         }

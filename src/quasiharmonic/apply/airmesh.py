@@ -23,8 +23,8 @@ from quasiharmonic.energy.energies import ARAP, AreaBarrier, Combination
 from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
 from quasiharmonic.exact.certificate import Certificate, certify, is_injective
 from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.ladder.mapping import injective_map
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.solving import injective_map
 from quasiharmonic.targets.contours import signed_area
 
 #: ARAP, and what keeps triangles from collapsing.

@@ -1,23 +1,20 @@
-"""A surface made ready for a map: its boundary where it is or laid along an outline, edges split for room."""
+"""A surface made ready for a map: its boundary where it is, or laid along an outline."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.apply.refining import refine_problem
 from quasiharmonic.arrays import FloatArray, IntArray, named
 from quasiharmonic.mesh.reference import Reference
-from quasiharmonic.mesh.refinement import Refined, composed, split_edges
 from quasiharmonic.mesh.seams import Island
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.targets.asked_corners import AskedCorners
 from quasiharmonic.targets.boundary import boundary_to
-from quasiharmonic.targets.chords import flattened_edges
 from quasiharmonic.targets.contours import corners as corners_of
 from quasiharmonic.targets.contours import in_unit
 from quasiharmonic.targets.nesting import filled
@@ -28,7 +25,7 @@ _GAP = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The problem of mapping a surface, whose mesh was changed if need be.
+    """The problem of mapping a surface.
 
     Attributes
     ----------
@@ -37,19 +34,11 @@ class Fitted:
         Boundary vertices whose place somebody has chosen, or which were found for the outline's corners.
     filled : int
         Holes of the outline that the surface does not have.
-    refined : Refined or None
-        How the problem's mesh came from the surface, where edges were split.
     """
 
     problem: Problem
     held: list[int] = field(default_factory=list)
     filled: int = 0
-    refined: Refined | None = None
-
-    @property
-    def added(self) -> int:
-        """Vertices at the end of the list, each on an edge that was split."""
-        return 0 if self.refined is None else len(self.refined.parents)
 
 
 def held_in_place(
@@ -155,32 +144,3 @@ def at_corners(fixed: IntArray, target: FloatArray, contours: Sequence[FloatArra
     sharp = [corners_of(unit, angle) for unit in in_unit(list(contours))[0]]
     goals = np.concatenate([contour[marks] for contour, marks in zip(contours, sharp, strict=True)])
     return [int(fixed[(target == goal).all(axis=1)][0]) for goal in goals]
-
-
-def with_room(fitted: Fitted) -> Fitted:
-    """Split edges that stand in the way of a map, until none is known.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        As `laid_along` makes it, or of any problem.
-
-    Returns
-    -------
-    Fitted
-        On a finer mesh.
-    """
-    before = fitted.problem
-    # A chord along a straight side of the outline may be a rounding error off it; a diagnosis, which is exact, then
-    # does not name it.
-    flat = split_edges(before.V, before.F, flattened_edges(before.F, before.fixed, before.target))
-    roomy = refine_problem(_on(flat, before))
-    refined = composed(flat, roomy.refined)
-    if not len(refined.parents):
-        return fitted
-    return replace(fitted, problem=_on(refined, before), refined=refined)
-
-
-def _on(refined: Refined, problem: Problem) -> Problem:
-    """A problem on a refinement of its mesh."""
-    return Problem(refined.V, refined.F, problem.fixed, problem.target, reference=problem.reference)

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.apply.inverse import InverseMap
 from quasiharmonic.arrays import FloatArray, IntArray, check_finite, map_array, named
 from quasiharmonic.energy.energies import Energy
+from quasiharmonic.ladder.mapping import injective_map
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.result import MapResult
-from quasiharmonic.search.solving import injective_map
 
 # Cells along the longer side of a picture, and at least along the shorter, so that there is a way past landmarks.
 _ALONG, _ACROSS = 48, 6

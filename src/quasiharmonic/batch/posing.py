@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic import io
-from quasiharmonic.apply.fitting import Fitted, held_in_place, laid_along, with_room
+from quasiharmonic.apply.fitting import Fitted, held_in_place, laid_along
 from quasiharmonic.atlas.mapped import faced, naming
 from quasiharmonic.atlas.seaming import cut_apart
 from quasiharmonic.curves import Curve, Rails
@@ -79,10 +79,9 @@ def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings
     found = []
     for k, (island, _) in enumerate(islands):
         with naming(island, len(islands)):
-            held = (
+            fitted = (
                 held_in_place(island, fixed, reference=reference) if to is None else _onto(island, k, asked, settings)
             )
-            fitted = with_room(held) if settings["refine"] else held
             slide: bool | Rails = settings["slide"]
             if slide:
                 slide = slide if to is None else Rails(_curves(to, _changed(to)), held=fitted.held)

@@ -59,6 +59,8 @@ COLUMNS: dict[str, type] = {
     "islands": int,
     "cut_edges": int,
     "added_vertices": int,
+    # The rung of the ladder that was climbed to, where edges might be split.
+    "rung": str,
     # Triangles not positive: in the first map of the search, and in the one written.
     "flips_before": int,
     "flips_after": int,

@@ -37,6 +37,7 @@ from quasiharmonic.curves import Rails
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.polishing import polished
 from quasiharmonic.flattening.flattened import flattenable
+from quasiharmonic.ladder.climbing import climb, on_refinement
 from quasiharmonic.mesh.refinement import Refined
 from quasiharmonic.mesh.seams import SeamedMesh
 from quasiharmonic.result import MapResult, Status
@@ -183,27 +184,31 @@ def _mapped(
         "loops": sum(len(problem.domain.loops) for problem in problems),
         "islands": len(problems),
     }
-    if settings["refine"]:
-        record["added_vertices"] = sum(one.fitted.added for one in posed)
     tell({"facts": record})
     todo = iter(posed)
     # Each is posed as it is to be solved.
     found = each_island(surface, lambda island: _solved(*next(todo), settings, record), reflect=settings["to"] is None)
     results = [island.result for island in found.islands]
     record |= _told(found)
+    if settings["refine"]:
+        record["added_vertices"] = added = sum(result.added for result in results)
+        record["vertices"] += added
+        record["triangles"] += sum(2 * result.added for result in results)
+        record["rung"] = results[-1].rungs[-1].name if len(results) == 1 else None
     if all(result.history for result in results):
         record["flips_before"] = sum(result.history[0].flipped for result in results)
     why = [result.diagnosis for result in results if not result.injective]
     if why:
         reasons = [reason.summary() for reason in why if reason is not None and reason.obstructions]
         record["error"] = "; ".join(reasons) or found.status.value
-    return found, [one.fitted.refined for one in posed]
+    return found, [result.refined for result in results]
 
 
 def _solved(fitted: Fitted, slide: bool | Rails, settings: dict[str, Any], record: Record) -> MapResult:
     """Map one island, and lower its distortion if that is asked for."""
     with _timed(record, "map"):
-        result = solve(
+        way = climb if settings["refine"] else solve
+        result = way(
             fitted.problem,
             strategy=settings["strategy"],
             max_iterations=settings["max_iterations"],
@@ -212,7 +217,8 @@ def _solved(fitted: Fitted, slide: bool | Rails, settings: dict[str, Any], recor
     if settings["polish"] is None or result.status is not Status.INJECTIVE:
         return result
     with _timed(record, "polish"):
-        return polished(fitted.problem, result, energy=settings["polish"], slide=slide)
+        fine = on_refinement(fitted.problem, result.refined)
+        return polished(fine, result, energy=settings["polish"], slide=slide)
 
 
 def _flattened(

@@ -88,7 +88,9 @@ def add_parser(commands: Commands) -> None:
         help="with --to: corners of the boundary by angle (auto), near:x,y,z,…, or as qhm map takes them",
     )
     solver.add_argument(
-        "--refine", action="store_true", help="split edges that leave the target no room (adds vertices at the end)"
+        "--refine",
+        action="store_true",
+        help="split inner edges where there is no map without, as few as need be (adds vertices)",
     )
     solver.add_argument(
         "--energy",

@@ -75,6 +75,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.atlas.mapped import each_island
     from quasiharmonic.atlas.refined import written_over
     from quasiharmonic.cli import judging, material, report, seams, sliding, targets
+    from quasiharmonic.ladder.climbing import on_refinement
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
@@ -103,25 +104,29 @@ def run(options: argparse.Namespace) -> int:
         posed.append(one)
         problem = one.fitted.problem
         chosen = options.strategy, options.polish, options.max_iterations, options.linear_solver
-        result = search(problem, *chosen, slide=one.slide if options.polish else False)
+        result = search(problem, *chosen, slide=one.slide if options.polish else False, refine=options.refine)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-            result = smoothed(problem, result, options.linear_solver, one.slide)
+            fine = on_refinement(problem, result.refined)
+            result = smoothed(fine, result, options.linear_solver, one.slide)
         return result
 
     with report.about(mesh_path):
         mapped = each_island(found.mesh, solved, reflect=options.to is None)
-    refined = [one.fitted.refined for one in posed]
+    refined = [one.result.refined for one in mapped.islands]
+    refined += [None] * (len(islands) - len(refined))
     written = mesh.with_places(mapped.mesh)
     if any(refined):
         written = written_over(mesh, mapped.mesh.islands, refined, mapped.places())
     if options.pack:
         written = written.with_places(seams.laid_out(options, io.mapped(written)))
     judged = judging.write(options.output, written)
+    added = sum(one.result.added for one in mapped.islands)
     with report.after_writing(options.output):
         if options.plot is not None:
-            draw(options.plot, judged, [one.fitted.problem for one in posed], mapped, options.plot_kind)
+            problems = zip((one.fitted.problem for one in posed), refined, strict=False)
+            draw(options.plot, judged, [on_refinement(*one) for one in problems], mapped, options.plot_kind)
         facts = {
             **mapped.to_dict(),
             **judged.to_dict(),
@@ -131,11 +136,19 @@ def run(options: argparse.Namespace) -> int:
             **({} if options.to is None else {"to": options.to}),
             **found.facts,
             **summed([one.facts for one in posed]),
+            **({"added_vertices": added} if options.refine else {}),
             "input": str(options.input),
             "output": str(options.output),
             "seconds_in_all": time.perf_counter() - began,
         }
         notes = [*found.notes, *dict.fromkeys(note for one in posed for note in one.notes)]
+        if added:
+            notes.append(f"split {added} {'edge' if added == 1 else 'edges'}: new vertices are at the end of the list")
+        notes += [
+            crowded_note(island.vertices[one.result.crowded])
+            for island, one in zip(islands, mapped.islands, strict=False)
+            if one.result.crowded.size
+        ]
         report.emit(facts, options.json, "\n".join([report.of_maps(mapped, judged, options.output), *notes]))
     return 0 if judged.injective else 1
 
@@ -147,13 +160,16 @@ def search(
     max_iterations: int,
     linear_solver: str,
     slide: bool | Rails = False,
+    refine: bool = False,
 ) -> MapResult:
     """Solve with progress on the terminal."""
     from quasiharmonic.cli import progress
+    from quasiharmonic.ladder.climbing import climb
     from quasiharmonic.search.solving import solve
 
+    way = climb if refine else solve
     with progress.line() as show:
-        return solve(
+        return way(
             problem,
             strategy=strategy,
             polish=polish,
@@ -171,6 +187,13 @@ def smoothed(problem: Problem, result: MapResult, linear_solver: str, slide: boo
 
     with progress.line() as show:
         return smoothing.smoothed(problem, result, linear_solver=linear_solver, callback=show, slide=slide)
+
+
+def crowded_note(vertices: NDArray[np.int64]) -> str:
+    """Where doubles have no room for a map."""
+    from quasiharmonic.arrays import named
+
+    return f"no room next to the fixed {named('vertex', 'vertices', vertices)}"
 
 
 def summed(facts: list[dict[str, int]]) -> dict[str, int]:

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apply.refining import RefinedProblem
     from quasiharmonic.cli.arguments import Commands
     from quasiharmonic.io import MeshData
+    from quasiharmonic.ladder.refining import RefinedProblem
     from quasiharmonic.problem import Problem
 
 
@@ -44,8 +44,8 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, split, write, report."""
     from quasiharmonic import io
-    from quasiharmonic.apply.refining import refine_problem
     from quasiharmonic.cli import report
+    from quasiharmonic.ladder.refining import refine_problem
     from quasiharmonic.problem import Problem
 
     output: Path = options.output

@@ -74,7 +74,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     seams.add_options(group)
     group.add_argument(
-        "--refine", action="store_true", help="split edges that leave the target no room (adds vertices at the end)"
+        "--refine",
+        action="store_true",
+        help="split inner edges where there is no map without, as few as need be (adds vertices at the end)",
     )
 
 
@@ -125,7 +127,7 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     ValueError, OSError, ModuleNotFoundError
         When options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
-    from quasiharmonic.apply.fitting import held_in_place, with_room
+    from quasiharmonic.apply.fitting import held_in_place
     from quasiharmonic.cli import report
 
     if options.to is None:
@@ -135,12 +137,6 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     if options.to is not None and not options.refine:
         with report.about(options.input):
             _check_room(posed.fitted.problem, options.to)
-    if options.refine:
-        posed.fitted = with_room(posed.fitted)
-        posed.facts["added_vertices"] = posed.fitted.added
-        if posed.fitted.added:
-            edges = "edge" if posed.fitted.added == 1 else "edges"
-            posed.notes.append(f"split {posed.fitted.added} {edges}: new vertices are at the end of the list")
     if options.slide:
         _slide(options, posed)
     return posed

@@ -43,6 +43,8 @@ _FIRST, _STEPS, _WORTHWHILE = 0.2, 20, 1e-3
 _HOPELESS = 5e-3
 # Determinants below are those of triangles as small as positions are rounded; one of zero has no ε below it.
 _FLAT = 1e-30
+# From a map without inverted triangles: an ε so small that the energy is a barrier; and what a step is to bring.
+_BARRIER, _NOTICEABLE = 1e-9, 1e-2
 # Smallest reference triangle, relative to the largest: their areas must stay within the numbers' range.
 _SMALLEST = 1e-100
 # Raised diagonals, one after the other until a factorisation exists.
@@ -181,6 +183,41 @@ def untangled(
             return
         root = np.hypot(least, descent.energy.epsilon)
         descent.energy.epsilon *= 1 - 0.5 * root / (abs(least) + root)
+
+
+def opened(
+    F: IntArray, w: ComplexArray, held: IntArray, *, grading: float, linear_solver: str = "auto", steps: int = 10
+) -> ComplexArray:
+    """Newton steps from a map without inverted triangles towards one whose triangles are shaped and sized evenly.
+
+    Parameters
+    ----------
+    F, w, held, grading, linear_solver
+        As of `untangled`.
+    steps : int
+        At most; fewer where they no longer lower the energy noticeably.
+
+    Returns
+    -------
+    (n,) complex128
+        A map without inverted triangles, in floating point.
+    """
+    sizes = _sizes(F, w, grading, linear_solver)
+    if sizes is None:
+        return w
+    with np.errstate(all="ignore"):
+        descent = RegularisedDescent(F, w, held, sizes, linear_solver, 1.0)
+        descent.energy.epsilon = _BARRIER
+        before = descent.value()
+        for _ in range(steps):
+            after = descent.step(before)
+            if after is None or not descent.least > 0:
+                break
+            w = descent.w
+            if after > (1 - _NOTICEABLE) * before:
+                break
+            before = after
+    return w
 
 
 def _sizes(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> FloatArray | None:

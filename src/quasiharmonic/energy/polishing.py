@@ -246,6 +246,8 @@ def polished(
         stages=result.stages + further.stages,
         history=result.history + further.history,
         path=result.path,
+        refined=result.refined,
+        rungs=result.rungs,
         seconds=result.seconds + further.seconds,
     )
 

@@ -1,7 +1,6 @@
 """From a problem to a map without inverted triangles: the strategy (§9.2).
 
-``injective_map`` is the one-shot call and ``solve`` the same for a `Problem` at hand. The search stops at
-the first map whose every triangle is strictly positive, decided exactly on the coordinates that are
+The search stops at the first map whose every triangle is strictly positive, decided exactly on the coordinates that are
 handed back.
 """
 
@@ -22,111 +21,12 @@ from quasiharmonic.energy.sliding import moved_onto
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.field.tensor import TANH, beltrami_coefficients
-from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.stages import Search, Stages
 from quasiharmonic.search.strategy import stages_of
-
-
-@takes_mesh
-@heard
-def injective_map(
-    V: ArrayLike,
-    F: ArrayLike,
-    fixed: ArrayLike,
-    target: ArrayLike,
-    *,
-    reference: Reference | None = None,
-    strategy: str | Stages = "speed",
-    polish: str | Energy | None = None,
-    start: ArrayLike | None = None,
-    max_iterations: int = 2000,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    record: int = 0,
-    slide: bool | Rails = False,
-) -> MapResult:
-    """Map a triangle mesh into the plane with no triangle inverted.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
-        Rest positions of a planar or curved mesh, disk-like or with holes.
-    F : (f, 3) array of int
-        Triangles, consistently oriented.
-    fixed : (k,) array of int
-        Vertices with given positions: the whole boundary and any pinned interior vertices.
-    target : (k, 2) array
-        Where they go.
-    reference : {"equilateral", "rest", "corrected"}, optional
-        Shape of the triangles in which gradients are taken (§9.3), whatever the strategy would choose.
-    strategy : {"speed", "paper"} or sequence of Descent
-        ``"speed"`` finds a map soonest; ``"paper"`` is the paper's own pipeline, si-log first; or stages of one's own.
-    polish : str or Energy, optional
-        Once injective, lower this distortion energy; see `quasiharmonic.polish` for the names.
-    start : (n, 2) array, optional
-        A map to begin with, for instance that of the same mesh for a target near this one: the search starts at
-        its tensors, and afresh where that leads nowhere.
-    max_iterations : int
-        Iterations to spend at most on finding the map: one linear solve each on the whole mesh. Tries at repairing a
-        small patch are counted where they succeed.
-    linear_solver : str
-        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
-    callback : callable, optional
-        Called with a `Step` at every iteration, and with the last one again at least every half second in between:
-        while patches are tried, say, or a diagnosis is made, but not within a single factorisation. It may raise
-        `KeyboardInterrupt`, on a clock of its own for instance, which ends the search as Ctrl-C does.
-    record : int
-        Keep the map of every ``record``-th iteration in the result's ``path``; none of them by default.
-    slide : bool or Rails
-        While polishing let boundary vertices glide along their outline, its corners held; see `quasiharmonic.polish`.
-        The boundary of ``target`` is put onto the curves first, if it is off them by a chord.
-
-    Returns
-    -------
-    MapResult
-        With the certified map, or with the best map found and a status that says why it is not injective: of the
-        maps met, the one with the fewest inverted triangles; where the diagnosis proves that none is injective,
-        the one of least area. Failure to find a map is not an exception. Ctrl-C ends the search and returns the
-        best map so far.
-
-    Raises
-    ------
-    ValueError
-        When the input is malformed; see `Problem`.
-
-    Examples
-    --------
-    A square annulus whose hole is turned by a quarter:
-
-    >>> import numpy as np
-    >>> from quasiharmonic import injective_map
-    >>> from quasiharmonic.surfaces import annulus
-    >>> from quasiharmonic.mesh.topology import boundary_loops
-    >>> V, F = annulus()
-    >>> outer, inner = sorted(boundary_loops(F, len(V)), key=len, reverse=True)
-    >>> target = np.concatenate([V[outer], V[inner] @ [[0, 1], [-1, 0]]])
-    >>> result = injective_map(V, F, np.concatenate([outer, inner]), target)
-    >>> result.injective, bool(result.certificate.bijective)
-    (True, True)
-    """
-    began = time.perf_counter()
-    problem = Problem(V, F, fixed, target, reference=reference)
-    result = solve(
-        problem,
-        strategy=strategy,
-        polish=polish,
-        start=start,
-        max_iterations=max_iterations,
-        linear_solver=linear_solver,
-        callback=callback,
-        record=record,
-        slide=slide,
-    )
-    return replace(result, seconds=time.perf_counter() - began)
 
 
 @heard

@@ -1,0 +1,139 @@
+"""A map of a refined mesh onto a simple target: constructed, certified, and thinned out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.construction.ancestry import as_refined, midpoints
+from quasiharmonic.construction.cutting import Cutting, TooManyError
+from quasiharmonic.construction.embedding import embedded
+from quasiharmonic.construction.opening import thinned
+from quasiharmonic.exact.certificate import Certificate, certify
+from quasiharmonic.mesh.refinement import Refined
+from quasiharmonic.problem import Domain, Problem
+
+# Vertices added for each of the mesh's, at which another way to cut is tried first.
+_MANY = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Construction:
+    """A map of a refined mesh.
+
+    Attributes
+    ----------
+    refined : Refined
+        How the mesh came from the problem's.
+    uv : (n + s, 2) float64
+        The map, fixed vertices exactly at their target.
+    certificate : Certificate
+        The exact verdict on it: bijective, or else doubles have no room where triangles are not positive.
+    crowded : (c,) int64
+        Fixed vertices nearest to these, none if there are none.
+    """
+
+    refined: Refined
+    uv: FloatArray
+    certificate: Certificate
+    crowded: IntArray
+
+
+def constructed_by_any(problem: Problem, best_map: FloatArray) -> Construction:
+    """The construction that adds fewest vertices, of those near a map at hand and those without one.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a target that `is_simple`.
+    best_map : (n, 2) float64
+        The best map known, though it inverts triangles.
+
+    Returns
+    -------
+    Construction
+    """
+    found = list[Construction]()
+    # Around a bad map walks may grow without end, each along those before it.
+    most = _MANY * (problem.n + _MANY)
+    for guide, limit in ((best_map, most), (None, most), (best_map, None)):
+        if len(found) and (limit is None or not len(found[-1].refined.parents)):
+            break
+        try:
+            found.append(construct(problem, guide, most=limit))
+        except TooManyError:
+            continue
+    return min(found, key=lambda made: (not made.certificate.bijective, len(made.refined.parents)))
+
+
+def construct(
+    problem: Problem, guide: FloatArray | None = None, *, thin: bool = True, most: int | None = None
+) -> Construction:
+    """Construct a map onto a simple target.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a target that `is_simple`.
+    guide : (n, 2) array, optional
+        A map, whatever it inverts, near which the mesh is to be cut. Without it the mesh is cut open near Tutte's
+        embedding, and then near the map of the disk that it has become into a circle.
+    thin : bool
+        Take out again what vertices the map can do without.
+    most : int, optional
+        Vertices to add at most on the way.
+
+    Returns
+    -------
+    Construction
+        What the proof says exists; where rounding leaves inverted triangles, with these.
+
+    Raises
+    ------
+    TooManyError
+        When more vertices would be added than ``most``.
+    """
+    # Of magnitude about one, so that no product overflows.
+    exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
+    near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
+    refined, uv = _embedded(unit, Cutting(unit, near, most))
+    if thin and certify(refined.F, uv, loops=problem.domain.loops).bijective:
+        refined, uv = thinned(unit, refined, uv)
+    uv = np.ldexp(uv, exponent)
+    uv[problem.fixed] = problem.target
+    certificate = certify(refined.F, uv, loops=problem.domain.loops)
+    return Construction(refined, uv, certificate, _nearest(problem, refined.F, uv, certificate))
+
+
+def _embedded(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
+    """The mesh as cutting has left it, in one piece again, and the map of its pieces into convex polygons."""
+    sheet = cutting.sheet
+    triangles = np.array(sheet.vertex)[sheet.rows()]
+    refined = as_refined(problem.V, problem.F, triangles, midpoints(problem.n, sheet.parents))
+    fine = refined_problem(problem, refined)
+    uv = np.zeros((len(refined.V), 2))
+    uv[problem.fixed] = problem.target
+    walked = np.array(sorted(cutting.places), dtype=np.int64)
+    for vertex in walked.tolist():
+        uv[vertex] = cutting.places[vertex].real, cutting.places[vertex].imag
+    held = np.concatenate([problem.fixed, walked])
+    return refined, fine.positions(embedded(fine, fine.frame.inward(uv), held))
+
+
+def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
+    """The fixed vertices nearest to triangles that are not positive, ascending."""
+    from scipy.spatial import cKDTree
+
+    bad = np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
+    if not bad.size:
+        return bad
+    _, nearest = cKDTree(problem.target).query(np.nan_to_num(uv[F[bad]]).mean(axis=1))
+    return np.unique(problem.fixed[nearest])
+
+
+def refined_problem(problem: Problem, refined: Refined) -> Problem:
+    """A problem on a refinement of its mesh, whose triangles may be as thin as they like at rest."""
+    return Problem.on(Domain(refined.V, refined.F, problem.fixed), problem.target, reference=problem.reference)

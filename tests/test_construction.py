@@ -1,0 +1,341 @@
+"""A map onto every simple target: the construction by itself, what it is made of, and where doubles have no room."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quasiharmonic import Problem, certify
+from quasiharmonic.construction.constructing import construct
+from quasiharmonic.construction.halfedges import HalfEdges
+from quasiharmonic.construction.regions import Regions
+from quasiharmonic.construction.sheet import Sheet
+from quasiharmonic.construction.simplicity import is_simple
+from quasiharmonic.construction.thinning import best_triangles, shape
+from quasiharmonic.construction.walks import walk
+from quasiharmonic.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.surfaces import disk, grid
+from shared.outlined import onto_polygon, polygon, turned_ring, with_holes, without_inner_vertices
+from shared.polygons import circle, random_polygon, spread
+from shared.small_meshes import handle, wheel
+
+KINDS = ["burst", "spiral", "comb", "grid", "flat"]
+
+
+def check(problem, made):
+    """Certified, and a refinement of the problem's mesh that leaves alone all that is held."""
+    refined, n = made.refined, problem.n
+    assert made.certificate.bijective
+    # Not as the construction has it judged: from arrays, its loops found anew.
+    assert certify(refined.F, made.uv).bijective
+    assert np.array_equal(made.uv[problem.fixed], problem.target)
+    assert np.array_equal(refined.V[:n], problem.V)
+    assert len(refined.V) == n + len(refined.parents) == len(made.uv)
+    assert sorted(map(tuple, edges(refined.F, len(refined.V)).boundary.tolist())) == sorted(
+        map(tuple, edges(problem.F, n).boundary.tolist())
+    )
+    assert np.array_equal(np.unique(refined.parent), np.arange(len(problem.F)))
+    assert np.allclose(refined.weights.sum(axis=1), 1)
+    # The parts of a triangle lie in it, wound as it is, and cover it: in its own coordinates, exactly.
+    covered = [Fraction(0)] * len(problem.F)
+    shares = np.zeros((len(refined.V), 0)).tolist()
+    where = [{v: Fraction(1)} for v in range(n)]
+    for between, weights in zip(refined.parents.tolist(), refined.weights.tolist(), strict=True):
+        where.append({v: Fraction(w) for v, w in zip(between, weights, strict=True) if w})
+    assert len(shares) == len(where)
+    for corners, parent in zip(refined.F.tolist(), refined.parent.tolist(), strict=True):
+        a, b, c = problem.F[parent].tolist()
+        assert all(where[v].keys() <= {a, b, c} for v in corners)
+        (px, py), (qx, qy), (rx, ry) = ((where[v].get(b, 0), where[v].get(c, 0)) for v in corners)
+        twice = (qx - px) * (ry - py) - (qy - py) * (rx - px)
+        assert twice > 0
+        covered[parent] += twice
+    assert covered == [1] * len(problem.F)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(6))
+def test_polygons(kind, seed):
+    problem = onto_polygon(seed, kind)
+    assert is_simple(problem)
+    check(problem, construct(problem))
+    check(problem, construct(problem, thin=False))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from(KINDS))
+def test_any_polygon(seed, kind):
+    problem = onto_polygon(seed, kind)
+    if is_simple(problem):
+        check(problem, construct(problem))
+
+
+@pytest.mark.parametrize(("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), (6, 6)])
+@pytest.mark.parametrize("seed", range(2))
+def test_holes_and_pins_in_any_place(holes, pins, seed):
+    problem = with_holes(np.random.default_rng(seed), holes, pins)
+    assert is_simple(problem)
+    assert len(problem.domain.loops) == 1 + holes
+    assert len(problem.domain.pins) == pins
+    check(problem, construct(problem))
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_ring(quarters):
+    problem = turned_ring(quarters)
+    check(problem, construct(problem))
+
+
+def test_a_ring_turned_inside_out():
+    """Which loop is the outer one in the target does not matter."""
+    problem = turned_ring(0)
+    away = problem.target / np.sum(problem.target**2, axis=1)[:, None]
+    # An inversion reverses the sense of loops: reflected, they are wound as the mesh's.
+    problem = problem.moved(away * [1, -1])
+    assert is_simple(problem)
+    check(problem, construct(problem))
+
+
+def test_a_guide_need_not_be_injective():
+    problem = onto_polygon(4, "grid")
+    guide = np.zeros((problem.n, 2))
+    guide[problem.fixed] = problem.target
+    check(problem, construct(problem, guide))
+
+
+@pytest.mark.parametrize("exponent", [-900, -40, 900])
+def test_any_scale(exponent):
+    problem = onto_polygon(2, "grid")
+    far = problem.moved(np.ldexp(problem.target, exponent))
+    made = construct(far)
+    check(far, made)
+    assert np.array_equal(np.ldexp(made.uv, -exponent), construct(problem).uv)
+
+
+def test_far_from_the_origin():
+    problem = onto_polygon(2, "grid")
+    far = problem.moved(problem.target + 2.0**40)
+    check(far, construct(far))
+
+
+def test_what_fits_gains_nothing():
+    V, F = disk(5)
+    (loop,) = boundary_loops(F, len(V))
+    problem = Problem(V, F, loop, V[loop])
+    made = construct(problem)
+    check(problem, made)
+    assert not len(made.refined.parents)
+    assert np.array_equal(made.refined.F, F)
+
+
+def test_thinning_leaves_what_is_needed():
+    """A chord that the target does not contain takes one vertex, and no more."""
+    V, F = grid(1, 1)
+    problem = Problem(V, F, [0, 1, 3, 2], [[0, 0], [1, 0], [0.1, 0.1], [0, 1]], reference="equilateral")
+    chord = edges(F, 4).interior[0].tolist()
+    split = 0 if set(chord) == {0, 3} else 1
+    assert len(construct(problem).refined.parents) == split
+    other = Problem(V, F, [0, 1, 3, 2], [[0.9, 0.9], [1, 0], [1, 1], [0, 1]], reference="equilateral")
+    assert len(construct(other).refined.parents) == 1 - split or set(chord) == {0, 3}
+
+
+class TestNoRoom:
+    def test_a_triangle_of_adjacent_doubles(self):
+        """It contains no further point whose coordinates are doubles."""
+        V, F = wheel(3)
+        step = 2.0**-52
+        problem = Problem(V, F, [0, 1, 2], [[1, 1], [1 + step, 1], [1, 1 + step]])
+        assert is_simple(problem)
+        made = construct(problem)
+        assert not made.certificate.injective
+        assert set(made.crowded.tolist()) <= {0, 1, 2}
+        assert made.crowded.size
+
+    def test_one_place_in_between(self):
+        """Of a lattice with a single point inside the construction finds that point."""
+        V, F = wheel(3)
+        step = 2.0**-52
+        problem = Problem(V, F, [0, 1, 2], 1 + step * np.array([[0, 0], [3, 0], [0, 3]]))
+        made = construct(problem)
+        check(problem, made)
+        assert np.array_equal(made.uv[3], [1 + step, 1 + step])
+
+
+class TestWhichProblems:
+    def test_handles(self):
+        V, F = handle()
+        (loop,) = boundary_loops(F, len(V))
+        assert not is_simple(Problem(V, F, loop, circle(len(loop))))
+
+    def test_crossing_and_reversed_loops(self):
+        V, F = disk(3)
+        (loop,) = boundary_loops(F, len(V))
+        round_ = circle(len(loop))
+        assert is_simple(Problem(V, F, loop, round_))
+        assert not is_simple(Problem(V, F, loop, round_[::-1]))
+        assert not is_simple(Problem(V, F, loop, circle(len(loop), turns=2)))
+
+    @pytest.mark.parametrize(
+        ("place", "simple"), [([0.5, 0.5], True), ([0, 0.5], False), ([0, 0], False), ([1.5, 0.5], False)]
+    )
+    def test_pins(self, place, simple):
+        V, F = grid(4, 4)
+        (loop,) = boundary_loops(F, len(V))
+        assert is_simple(Problem(V, F, [*loop, 12], [*V[loop], place])) is simple
+
+    def test_pins_in_one_place(self):
+        V, F = grid(4, 4)
+        (loop,) = boundary_loops(F, len(V))
+        assert not is_simple(Problem(V, F, [*loop, 11, 12], [*V[loop], [0.5, 0.5], [0.5, 0.5]]))
+
+    def test_a_pin_in_a_hole(self):
+        problem = with_holes(np.random.default_rng(0), 1, 1)
+        hole = min(problem.domain.loops, key=len)
+        target = problem.target.copy()
+        target[-1] = target[np.isin(problem.fixed, hole)].mean(axis=0)
+        assert is_simple(problem)
+        assert not is_simple(problem.moved(target))
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_pins_level_with_corners(self, seed):
+        """On a lattice rays pass through corners and along sides; a rational ray decides as well."""
+        rng = np.random.default_rng(seed)
+        corners = random_polygon(rng, 10, 6)
+        V, F = disk(3)
+        (loop,) = boundary_loops(F, len(V))
+        outline = spread(corners, len(loop))
+        for place in np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=2).reshape(-1, 2):
+            problem = Problem(V, F, [*loop, 0], [*outline, place])
+            assert is_simple(problem) == strictly_inside(place, corners)
+
+
+def strictly_inside(point, corners):
+    """Whether a point is inside a polygon and not on it, by a ray of no rational slope's likelihood, in fractions."""
+    x, y = (Fraction(c) for c in point)
+    slope, inside = Fraction(1234567, 7654321), False
+    for p, q in zip(corners.tolist(), np.roll(corners, -1, axis=0).tolist(), strict=True):
+        (px, py), (qx, qy) = ([Fraction(c) for c in r] for r in (p, q))
+        cross = (qx - px) * (y - py) - (qy - py) * (x - px)
+        if cross == 0 and min(px, qx) <= x <= max(px, qx) and min(py, qy) <= y <= max(py, qy):
+            return False
+        one, other = (py - y) - slope * (px - x), (qy - y) - slope * (qx - x)
+        if (one > 0) != (other > 0):
+            # Where the side meets the line through the point: ahead of it or behind.
+            share = one / (one - other)
+            inside ^= px + share * (qx - px) > x
+    return inside
+
+
+def twice_area(corners):
+    x, y = corners.T
+    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+class TestRegions:
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_convex_and_all_there(self, kind):
+        points = polygon(np.random.default_rng(1), kind, 30)
+        points = points / np.abs(points).max()
+        n = len(points)
+        regions = Regions(points, [np.arange(n)], np.empty(0, dtype=np.int64))
+        cuts = regions.diagonals([])
+        assert regions.bridges() == []
+        assert {frozenset(cut) for cut in cuts} == {frozenset(cut) for cut in regions.kept}
+        # Around every region, along cuts and the outline, no turn to the right.
+        rim = {(k, (k + 1) % n) for k in range(n)} | regions.kept
+        area, seen = 0.0, set()
+        for start in sorted(rim):
+            here, loop = start, []
+            while here not in seen:
+                seen.add(here)
+                loop.append(here[0])
+                a, b = here
+                c = regions.apex[a, b]
+                while (b, c) not in rim:
+                    c = regions.apex[c, b]
+                here = b, c
+            for k in range(len(loop)):
+                assert regions.turn(loop[k - 2], loop[k - 1], loop[k]) >= 0
+            area += twice_area(points[loop])
+        assert np.isclose(area, twice_area(points))
+
+    def test_bridges_connect_loops_and_pins(self):
+        problem = with_holes(np.random.default_rng(3), 4, 5)
+        number = np.full(problem.n, -1)
+        number[problem.fixed] = np.arange(len(problem.fixed))
+        loops = [number[loop] for loop in problem.domain.loops]
+        regions = Regions(problem.target, loops, number[problem.domain.pins])
+        bridges = regions.bridges()
+        assert len(bridges) == len(loops) - 1 + 5
+        chains = [(a, b, a) for a, b in bridges]
+        chains += [(a, b, a) for loop in loops for a, b in zip(loop, np.roll(loop, 1), strict=True)]
+        assert not components(np.array(chains), len(problem.fixed)).any()
+
+
+class TestSheet:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_cuts_make_disks(self, seed):
+        """Cut from boundary vertex to boundary vertex at random: always one piece more, all of them disks."""
+        rng = np.random.default_rng(seed)
+        V, F = without_inner_vertices(rng, 20) if seed % 2 else disk(3)
+        sheet = Sheet(F, len(V))
+        place = (V @ np.array([1, 1j])).tolist()
+        for pieces in range(2, 8):
+            loop = max(sheet.loops(), key=len)
+            i, j = sorted(rng.choice(len(loop), 2, replace=False).tolist())
+            if j - i < 2 or j - i > len(loop) - 2:
+                continue
+            before = len(sheet.loops())
+            way = walk(sheet, place, loop[i], loop[j])
+            assert not any(sheet.is_held(copy) for copy in way[1:-1])
+            right = sheet.cut(way)
+            place += [place[copy] for copy in way]
+            assert len(place) == len(sheet.vertex)
+            assert len(right) == len(way)
+            rows = sheet.rows()
+            kinds = edges(rows, len(sheet.vertex))
+            assert not kinds.inconsistent.size
+            assert not kinds.nonmanifold.size
+            assert len(sheet.loops()) == before + 1 <= pieces
+            assert {tuple(edge) for edge in kinds.boundary.tolist()} == set(sheet.following.items())
+            euler = len(np.unique(rows)) - len(kinds.interior) - len(kinds.boundary) + len(rows)
+            assert euler == len(np.unique(components(rows, len(sheet.vertex))[np.unique(rows)])) == before + 1
+
+    def test_link(self):
+        V, F = disk(2)
+        mesh = HalfEdges(F)
+        for vertex in range(len(V)):
+            around = sorted(tuple(sorted((vertex, a, b))) for a, b in mesh.link(vertex))
+            assert around == sorted(tuple(sorted(row)) for row in F.tolist() if vertex in row)
+
+
+def test_the_best_triangulation_is_the_best():
+    """Against all triangulations of a polygon of seven corners."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        points = random_polygon(rng, 7, 9) @ [1, 1j]
+
+        def worth(a, b, c, points=points):
+            return shape(points[a], points[b], points[c])
+
+        best = best_triangles(list(range(7)), worth)
+        assert min(worth(*t) for t in best) == max(min(worth(*t) for t in cut) for cut in cuts(0, 6))
+
+
+def cuts(i, j):
+    """All triangulations of the polygon of corners i … j."""
+    if j - i < 2:
+        return [[]]
+    return [[*a, (i, k, j), *b] for k in range(i + 1, j) for a in cuts(i, k) for b in cuts(k, j)]
+
+
+def test_shapes_have_the_exact_sign():
+    step = 2.0**-52
+    p, q = complex(1, 1), complex(1 + 1e3 * step, 1 + 1e3 * step)
+    middle = complex(1 + 500 * step, 1 + 500 * step)
+    assert shape(p, q, middle) == 0
+    assert shape(p, q, middle + 1j * step) > 0 > shape(p, q, middle - 1j * step)

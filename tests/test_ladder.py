@@ -1,0 +1,144 @@
+"""The ladder: the mesh as given, then as few vertices added as need be; one for the library and the command."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Problem, Status, certify, injective_map, io
+from quasiharmonic.ladder.climbing import climb
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import disk
+from shared.commands import run
+from shared.outlined import with_holes
+from shared.small_meshes import wheel
+
+
+def chevron():
+    """Two triangles whose common edge leaves the target: it has to be split."""
+    V = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    return V, np.array([[0, 1, 2], [0, 2, 3]]), np.arange(4), np.array([[-1.0, -1.0], [0, 0], [1, -1], [0, 2]])
+
+
+def test_the_mesh_as_given_comes_first():
+    V, F = disk(4)
+    (loop,) = boundary_loops(F, len(V))
+    result = injective_map(V, F, loop, V[loop] * [2, 1], refine=True)
+    assert result.certificate.bijective
+    assert result.refined is None
+    assert result.added == 0
+    assert [(rung.name, rung.injective) for rung in result.rungs] == [("as given", True)]
+    assert np.array_equal(result.uv, injective_map(V, F, loop, V[loop] * [2, 1]).uv)
+
+
+def test_vertices_are_added_where_there_is_no_map_without():
+    V, F, fixed, target = chevron()
+    assert injective_map(V, F, fixed, target).status is Status.IMPOSSIBLE
+    result = injective_map(V, F, fixed, target, refine=True)
+    assert result.status is Status.INJECTIVE
+    assert result.certificate.bijective
+    assert certify(result.refined.F, result.uv).bijective
+    assert np.array_equal(result.refined.V[: len(V)], V)
+    assert np.array_equal(result.uv[fixed], target)
+    assert result.added == len(result.uv) - len(V) == result.rungs[-1].added == 1
+    assert not result.rungs[0].injective
+    assert result.rungs[-1].injective
+    told = result.to_dict()
+    json.dumps(told)
+    assert told["added_vertices"] == result.added
+    assert [rung["name"] for rung in told["rungs"]] == [rung.name for rung in result.rungs]
+    assert "rungs" not in injective_map(V, F, fixed, target).to_dict()
+
+
+def test_a_polish_is_of_the_refined_mesh():
+    V, F, fixed, target = chevron()
+    result = injective_map(V, F, fixed, target, refine=True, polish="symmetric-dirichlet")
+    assert result.status in (Status.POLISHED, Status.EXHAUSTED)
+    assert result.certificate.bijective
+    assert len(result.refined.V) == len(result.uv) > len(V)
+    assert len(result.rungs) > 1
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_holes_and_pins_that_the_mesh_has_elsewhere(seed):
+    problem = with_holes(np.random.default_rng(seed), 2, 2, size=7)
+    result = climb(problem, max_iterations=30)
+    assert result.certificate.bijective
+    assert np.array_equal(result.uv[problem.fixed], problem.target)
+
+
+def test_doubles_without_room_are_told():
+    V, F = wheel(3)
+    step = 2.0**-52
+    result = injective_map(V, F, [0, 1, 2], [[1, 1], [1 + step, 1], [1, 1 + step]], refine=True)
+    assert result.status is Status.NO_ROOM
+    assert not result.injective
+    assert set(result.crowded.tolist()) <= {0, 1, 2}
+    assert result.crowded.size
+    assert result.to_dict()["crowded"] == result.crowded.tolist()
+
+
+def test_targets_that_cross_themselves_are_as_before():
+    """No refinement untwists a target, and what is told is about the mesh as it is given."""
+    V, F = disk(3)
+    (loop,) = boundary_loops(F, len(V))
+    t = 2 * np.pi * np.arange(len(loop)) / len(loop)
+    eight = np.stack([np.sin(2 * t), np.sin(t)], axis=1)
+    result = injective_map(V, F, loop, eight, refine=True)
+    assert result.status is Status.IMPOSSIBLE
+    assert result.refined is None
+    assert len(result.uv) == len(V)
+    assert result.diagnosis.forbids_injective
+
+
+def test_ctrl_c_on_any_rung():
+    """What is handed back fits its own mesh, whenever the search is stopped."""
+    V, F, fixed, target = chevron()
+    seen = []
+    injective_map(V, F, fixed, target, refine=True, callback=seen.append)
+    for last in (1, len(seen) // 2, len(seen) - 1):
+        left = iter(range(last))
+
+        def stop(step, left=left):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+
+        result = injective_map(V, F, fixed, target, refine=True, callback=stop)
+        assert result.status is Status.INTERRUPTED
+        assert len(result.uv) == len(V) + result.added
+
+
+def test_an_energy_is_named_for_what_slides():
+    V, F, fixed, target = chevron()
+    with pytest.raises(ValueError, match="name an energy"):
+        climb(Problem(V, F, fixed, target), slide=True)
+
+
+def test_the_command_climbs_the_same_ladder(tmp_path, capsys):
+    V, F, fixed, target = chevron()
+    uv = target
+    io.write_obj(tmp_path / "in.obj", io.MeshData(np.column_stack([V, np.zeros(4)]), F).with_map(uv))
+    assert run("map", tmp_path / "in.obj", "-o", tmp_path / "plain.obj") == 1
+    capsys.readouterr()
+    out = tmp_path / "out.obj"
+    assert run("map", tmp_path / "in.obj", "-o", out, "--refine", "--json", tmp_path / "report.json") == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    expected = injective_map(V, F, fixed, target, refine=True)
+    assert report["added_vertices"] == expected.added
+    assert [rung["name"] for rung in report["rungs"]] == [rung.name for rung in expected.rungs]
+    assert "new vertices are at the end of the list" in capsys.readouterr().out
+    written = io.read_mesh(out)
+    assert len(written.V) == len(V) + expected.added
+    assert np.array_equal(io.map_of(written)[fixed], target)
+    assert certify(written.F, io.map_of(written)).bijective
+
+
+def test_the_command_names_where_there_is_no_room(tmp_path, capsys):
+    V, F = wheel(3)
+    step = 2.0**-52
+    uv = np.array([[1, 1], [1 + step, 1], [1, 1 + step], [1, 1]])
+    io.write_obj(tmp_path / "in.obj", io.MeshData(np.column_stack([V, np.zeros(4)]), F).with_map(uv))
+    assert run("map", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--refine") == 1
+    assert "no room" in capsys.readouterr().out
