@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
 from quasiharmonic.mesh.refinement import Refined, composed, refine
 from quasiharmonic.problem import Problem
+
+if TYPE_CHECKING:
+    from quasiharmonic.exact.diagnosis import Diagnosis
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,8 @@ def refine_problem(problem: Problem, *, most_rounds: int = 20) -> RefinedProblem
     refine : splits edges that the caller names.
     quasiharmonic.diagnose : names them.
     """
+    from quasiharmonic.exact.diagnosis import diagnose
+
     whole = refine(problem.V, problem.F, [])
     diagnosis = diagnose(problem)
     rounds = 0
