@@ -93,7 +93,6 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
     """
     from quasiharmonic import io
     from quasiharmonic.arrays import counted
-    from quasiharmonic.atlas import seaming
     from quasiharmonic.cli import report
     from quasiharmonic.mesh.seams import SeamedMesh
 
@@ -106,11 +105,16 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
         elif options.seams == "none":
             found = Seamed(SeamedMesh(mesh.V, mesh.F))
         else:
+            from quasiharmonic.atlas.seaming import cut_along
+
             edges = read_edges(Path(options.seams), len(mesh.V))
-            found = Seamed(seaming.cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
+            found = Seamed(cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
         if options.cut:
+            # What finds cuts takes longer to import than all that a small mesh needs.
+            from quasiharmonic.atlas.seaming import cut_apart
+
             before = found.mesh
-            found.mesh = seaming.cut_apart(
+            found.mesh = cut_apart(
                 before, polygons=mesh.polygons, disks_too=disks_too, reach=disks_too or options.refine
             )
             found.facts["cut_edges"] = cut = len(found.mesh.seams) - len(before.seams)

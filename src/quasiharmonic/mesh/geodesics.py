@@ -28,7 +28,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, named
 from quasiharmonic.hearing import still_at_it
@@ -133,6 +132,8 @@ def neighbours_within(edges: csr_array, sources: IntArray, rings: int) -> tuple[
     row, vertex : (k,) int64
         Which source, ascending, and the vertex.
     """
+    from scipy.sparse.csgraph import dijkstra
+
     found = []
     for start, part in _portions(sources):
         inside, graph, own = _around(edges, part, rings)
@@ -161,6 +162,8 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
     -------
     (k,) float64
     """
+    from scipy.sparse.csgraph import dijkstra
+
     length = np.full(row.shape, np.inf)
     first = np.searchsorted(row, np.arange(sources.size + 1))
     left, limit = np.arange(sources.size), reach
@@ -188,6 +191,8 @@ def _portions(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
 
 def _around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:
     """The vertices that can be reached from some sources, the part of the graph between them, and the sources in it."""
+    from scipy.sparse.csgraph import dijkstra
+
     near = dijkstra(graph, indices=sources, limit=reach, min_only=True)
     inside = np.flatnonzero(np.isfinite(near))
     return inside, graph[inside][:, inside], np.searchsorted(inside, sources)

@@ -177,9 +177,9 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     (n,) int64
         The smallest vertex of the component. A vertex without triangle is a component of its own.
     """
-    F = np.asarray(F, dtype=np.int64)
+    T: IntArray = np.asarray(F, dtype=np.int64)
     # Two edges of a triangle connect its three vertices.
-    return linked(F[:, :2].ravel(), F[:, 1:].ravel(), n)
+    return linked(T[:, :2].ravel(), T[:, 1:].ravel(), n)
 
 
 def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
