@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from quasiharmonic.ladder.refining import refine
 
 from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.ladder.mapping import injective_map
+from quasiharmonic.ladder.refining import refine
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import disk
 from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto

@@ -209,7 +209,7 @@ class TestTrouble:
         [
             ({"jobs": 0}, "jobs must be a whole number of at least 1"),
             ({"errors": "ignore"}, "errors must be one of raise, yield"),
-            ({"strategy": "haste"}, "strategy must be one of speed, quality"),
+            ({"strategy": "haste"}, "strategy must be one of speed, paper"),
             ({"reference": "round"}, "reference must be one of equilateral"),
             ({"max_iterations": 0}, "max_iterations must be"),
             ({"polish": "shine"}, "shine"),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quasiharmonic.ladder.refining import refine
 
 from quasiharmonic import io
 from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.ladder.refining import refine
 from quasiharmonic.mesh.polygons import triangulated
 
 
