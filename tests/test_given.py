@@ -325,15 +325,3 @@ def test_pyvista():
         np.testing.assert_array_equal(injective_map(given, LOOP, BEAN).uv, MAP.uv)
     with pytest.raises(ValueError, match=r"an ImageData is no mesh .* no faces"):
         flatten(pyvista.ImageData(dimensions=(3, 3, 1)))
-
-
-def test_torch_and_jax():
-    torch = pytest.importorskip("torch")
-    for tensor in (torch.from_numpy, torch.tensor):
-        np.testing.assert_array_equal(injective_map(*map(tensor, (V, F, LOOP, BEAN))).uv, MAP.uv)
-    with pytest.raises(ValueError, match=r"V is a Tensor that requires grad.*V\.detach\(\)"):
-        flatten(torch.tensor(V, requires_grad=True), F)
-    with pytest.raises(ValueError, match=r"uv is a Tensor on meta: hand over uv\.cpu\(\)"):
-        distortion(V, F, torch.empty(V.shape, device="meta"))
-    numpy = pytest.importorskip("jax").numpy
-    assert injective_map(*map(numpy.asarray, (V, F, LOOP, BEAN))).injective

@@ -124,9 +124,10 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
 
     def _tell(self, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         """Tell all views, and keep what one that comes later has to know."""
-        data, kind = encode(header, arrays), header["kind"]
+        kind = header["kind"]
         if kind == "progress":  # which no cell shows
             return
+        data = encode(header, arrays)
         if kind == "note":
             self._note = header["text"]
         # A map without places says where the boundary is wanted only, and stands for no other.
