@@ -8,6 +8,7 @@
     python benchmarks/speed.py --triangles --join a.csv b.csv   # one table and picture of earlier runs
     python benchmarks/speed.py --fine                           # every iteration on the mesh itself, never a coarse one
     python benchmarks/speed.py --linear-solver qdldl            # by this backend, not by the best present
+    OMP_NUM_THREADS=1 python benchmarks/speed.py --processor    # seconds of the processor, where others use it too
 
 A made problem maps the head of a cat onto the letters C, R and S. A folder is a problem (``input.obj`` +
 ``handles.txt``) or holds problems at any depth. Tools take turns, and medians over the turns are taken; a tool that
@@ -113,13 +114,13 @@ def measure(
             clock = phases.Phases()
             try:
                 with clock.clocking():
-                    began = time.perf_counter()
+                    began = phases.clock()
                     if record.tool == OURS:
                         result = solving.injective_map(*arrays, strategy=strategy, linear_solver=linear_solver)
                         uv, record.iterations = result.uv, result.iterations
                     else:
                         uv = PEERS[record.tool](*arrays)
-                    record.seconds.append(time.perf_counter() - began)
+                    record.seconds.append(phases.clock() - began)
             except (RuntimeError, ValueError):
                 continue
             if record.tool == OURS:
@@ -190,14 +191,14 @@ def animation(triangles: int) -> list[Record]:
     problem, last = Problem(V, F, loop, bent(angles[0])), None
     for angle in angles:
         for record in (afresh, onwards):
-            began = time.perf_counter()
+            began = phases.clock()
             if record is afresh:
                 result = solving.injective_map(V, F, loop, bent(angle))
             else:
                 problem = problem.moved(bent(angle))
                 result = solve(problem, start=last)
                 last = result.uv
-            record.seconds.append(time.perf_counter() - began)
+            record.seconds.append(phases.clock() - began)
             record.injective &= result.injective
             record.iterations += result.iterations
     for record in (afresh, onwards):
@@ -354,6 +355,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--linear-solver", choices=["auto", *available()], default="auto", help="%(choices)s (%(default)s)"
     )
+    parser.add_argument("--processor", action="store_true", help="processor's time, on a machine that others use too")
     parser.add_argument("-r", "--runs", type=_count, default=5, help="turns of every tool")
     parser.add_argument("--limit", type=float, default=30, help="seconds, past which a tool gets no larger problem")
     parser.add_argument("--memory", action="store_true", help="peak memory too")
@@ -364,6 +366,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.peak:
         return print_peak(options.peak[0], Path(options.peak[1]), options.linear_solver)
+    if options.processor:
+        phases.clock = time.process_time
     tools = warm_up([OURS, *options.peers])
     strategy: Strategy = [VectorAdam()] if options.fine else options.strategy
     records = [record for joined in options.join for record in joined]
@@ -381,7 +385,7 @@ def main(arguments: list[str] | None = None) -> None:
         times = ", ".join(f"{record.tool} {_time(record)}" for record in found) or "every tool has exceeded the limit"
         print(f"{name}, {len(arrays[1])} triangles: {times}", flush=True)
     frames += animation(20_000) if options.animation else []
-    text = f"{machine()}\n"
+    text = f"{machine()}{'; seconds of the processor' if options.processor else ''}\n"
     if records:
         text += f"\n{table(records)}\nOur time by phase, in percent:\n\n{phase_table(records)}"
     for record in frames:

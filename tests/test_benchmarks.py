@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 import campaign
 import letters_alone
+import many
 import problems
 import speed
 from quasiharmonic import Problem, certify, solve
@@ -284,3 +286,13 @@ def test_letters_alone(tmp_path):
     recorded = letters_alone.read(letters_alone.RECORDS)
     assert len({(run.surface, run.triangles, run.letter, run.column) for run in recorded}) == len(recorded)
     assert {row["of"] for row in letters_alone.by_kind(recorded)["gallery"].values()} == {30}
+
+
+@pytest.mark.parametrize("name", many.SETS)
+def test_sets_of_small_problems(name):
+    some = list(islice(many.SETS[name](200), 4))
+    assert all(120 <= len(F) <= 280 for _, F, _, _ in some)
+    assert len({target.tobytes() for _, _, _, target in some}) == 4
+    assert many.together(some, 1) == many.one_by_one(some)
+    shared = all(np.array_equal(some[0][0], V) for V, _, _, _ in some)
+    assert shared == (name == "one mesh")

@@ -75,6 +75,7 @@ class TestAgreement:
                 [step.energy for step in result.history], [step.energy for step in alone.history], rtol=1e-6
             )
             assert result.certificate.to_dict() == alone.certificate.to_dict()
+            np.testing.assert_array_equal(result.V, alone.V)
             np.testing.assert_allclose(result.uv, alone.uv, atol=1e-9 * np.ptp(alone.uv))
             if result.mu is not None and result.injective:
                 np.testing.assert_allclose(result.mu, alone.mu, atol=1e-6)

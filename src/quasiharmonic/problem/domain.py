@@ -109,11 +109,17 @@ class Domain(ReadOnly):
     @property
     def pins(self) -> IntArray:
         """Fixed vertices that are not on the boundary, ascending."""
-        return np.setdiff1d(self.fixed, self.edges.boundary)
+        marked = np.zeros(self.n, dtype=bool)
+        marked[self.fixed] = True
+        marked[self.edges.boundary] = False
+        return np.flatnonzero(marked)
 
     def check_boundary_fixed(self) -> None:
         """Raise a ValueError that names boundary vertices which are not held, for methods that need all of them."""
-        missing = np.setdiff1d(self.edges.boundary, self.fixed)
+        marked = np.zeros(self.n, dtype=bool)
+        marked[self.edges.boundary] = True
+        marked[self.fixed] = False
+        missing = np.flatnonzero(marked)
         if missing.size:
             raise ValueError(
                 f"the boundary {named('vertex', 'vertices', missing)} not in fixed: "

@@ -267,4 +267,5 @@ def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: fl
                 linear_solver=solver,
                 seconds=seconds,
                 mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu,
+                V=member.problem.V,
             )
