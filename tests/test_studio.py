@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io as text_io
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -93,6 +95,30 @@ def test_what_cannot_be_reached_shows_a_certified_map_and_says_what_forbids_it(a
     assert told
     assert all(one["message"] and one["advice"] and (one["edges"] or one["vertices"]) for one in told)
     assert settled["injective"] == (one.last("map").arrays["bad"].size == 0)
+
+
+@pytest.mark.slow
+def test_many_movements_leave_nothing_behind():
+    one = Visitor(*cat(6))
+    corner = one.session.moment.corners[2]
+    one.does("grab", vertex=corner)
+
+    def moves(count):
+        for k in range(count):
+            one.does("drag", seq=k, to=[1 + 0.2 * np.cos(k / 9), 1 + 0.2 * np.sin(k / 9)])
+            assert one.last("map").header["injective"]
+            one.told.clear()
+
+    moves(50)
+    tracemalloc.start()
+    moves(50)
+    gc.collect()
+    before = tracemalloc.get_traced_memory()[0]
+    moves(500)
+    gc.collect()
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown < 100_000
 
 
 def test_pins_stay_to_the_bit_and_are_dragged():

@@ -36,6 +36,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     import asyncio
+    import signal
     import webbrowser
     from contextlib import suppress
 
@@ -59,6 +60,8 @@ def run(options: argparse.Namespace) -> int:
         if not options.no_browser:
             webbrowser.open(address)
 
+    # With Python's own handler asyncio takes Ctrl-C as a wish to end, and not as an error wherever it happens to be.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with suppress(KeyboardInterrupt):
         asyncio.run(Studio(source).run(options.port, ready))
     return 0

@@ -18,7 +18,7 @@ from quasiharmonic.studio.recipes import Recipe
 
 #: Obstructions and elements of each that are told; a picture of more says no more.
 _MOST_TOLD = 20
-_MOST_ELEMENTS = 200
+_MOST_ELEMENTS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +124,13 @@ def told(moment: Moment) -> list[dict[str, Any]]:
             "advice": one.advice,
             "forbids": one.forbids.value,
             "vertices": one.vertices.tolist()[:_MOST_ELEMENTS],
-            "edges": [*one.edges.tolist(), *(edge for k in one.loops for edge in _around(loops[k]))][:_MOST_ELEMENTS],
+            "edges": (one.edges.tolist() or _around([loops[k] for k in one.loops]))[:_MOST_ELEMENTS],
             "triangles": one.triangles.tolist()[:_MOST_ELEMENTS],
         }
         for one in found[:_MOST_TOLD]
     ]
 
 
-def _around(loop: Array) -> list[list[int]]:
-    """A loop's edges."""
-    return np.stack([loop, np.roll(loop, -1)], axis=1).tolist()
+def _around(loops: list[Array]) -> list[list[int]]:
+    """Edges of loops."""
+    return [edge for loop in loops for edge in np.stack([loop, np.roll(loop, -1)], axis=1).tolist()]

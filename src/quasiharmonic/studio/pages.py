@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import sys
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -46,7 +45,6 @@ class Page:
             source,
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
-            stderr=None if os.environ.get("QHM_STUDIO_STDERR") else asyncio.subprocess.DEVNULL,
             limit=1 << 20,
         )
         return cls(process, tell)

@@ -161,6 +161,6 @@ export class Panel {
 
   disconnected() {
     document.body.dataset.state = "gone";
-    this.#verdict("bad", "✗", "Cut off", "The server has ended or cannot be reached. Reload the page once it runs again.");
+    this.#verdict("bad", "✗", "Cut off", "The server has ended, or has too many pages open. Reload the page once it runs again, or has one less.");
   }
 }
