@@ -42,11 +42,10 @@ def check(problem, made):
     assert np.allclose(refined.weights.sum(axis=1), 1)
     # The parts of a triangle lie in it, wound as it is, and cover it: in its own coordinates, exactly.
     covered = [Fraction(0)] * len(problem.F)
-    shares = np.zeros((len(refined.V), 0)).tolist()
     where = [{v: Fraction(1)} for v in range(n)]
     for between, weights in zip(refined.parents.tolist(), refined.weights.tolist(), strict=True):
         where.append({v: Fraction(w) for v, w in zip(between, weights, strict=True) if w})
-    assert len(shares) == len(where)
+    assert len(where) == len(refined.V)
     for corners, parent in zip(refined.F.tolist(), refined.parent.tolist(), strict=True):
         a, b, c = problem.F[parent].tolist()
         assert all(where[v].keys() <= {a, b, c} for v in corners)
@@ -58,15 +57,14 @@ def check(problem, made):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_polygons(kind, seed):
     problem = onto_polygon(seed, kind)
     assert is_simple(problem)
-    check(problem, construct(problem))
-    check(problem, construct(problem, thin=False))
+    check(problem, construct(problem, thin=seed > 1))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
 def test_any_polygon(seed, kind):
     problem = onto_polygon(seed, kind)
@@ -75,9 +73,8 @@ def test_any_polygon(seed, kind):
 
 
 @pytest.mark.parametrize(("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), (6, 6)])
-@pytest.mark.parametrize("seed", range(2))
-def test_holes_and_pins_in_any_place(holes, pins, seed):
-    problem = with_holes(np.random.default_rng(seed), holes, pins)
+def test_holes_and_pins_in_any_place(holes, pins):
+    problem = with_holes(np.random.default_rng(holes), holes, pins)
     assert is_simple(problem)
     assert len(problem.domain.loops) == 1 + holes
     assert len(problem.domain.pins) == pins
