@@ -8,8 +8,8 @@ tensors, onto the unit disk, is ``quasiharmonic.torch.quasi_harmonic_map``, a la
 landmarks come to lie from where those of the mean face do, and its gradient goes through the map into the network.
 
 At the default size there are 60 faces to learn from and 12 others to be judged by. The landmarks of the others come to
-lie 0.24 from where they should (root of the mean square) with all tensors the identity, and 0.11 after 150 steps. Of the
-other faces' maps none has an inverted triangle. Above: faces in space; middle: flattened before; below: after.
+lie 0.24 from where they should (root of the mean square) with all tensors the identity, and 0.11 after 150 steps. Of
+the other faces' maps none has an inverted triangle. Above: faces in space; middle: flattened before; below: after.
 
 ``pip install torch``; the library itself does not need it.
 """
