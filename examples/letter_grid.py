@@ -7,7 +7,7 @@ of the polished map, its gradient by all of the outline's vertices is one solve 
 quasi-Newton method lowers it, along with how much the outline is bent. The map stays injective at every step.
 
 At the default size 27 marks begin 0.020 from their nodes (root of the mean square; the letter is 0.73 high) and end
-0.006 from them, after 22 maps. The outline has moved by 0.05 at most. Left: the letter; middle: fitted; right: both.
+0.005 from them, after 89 maps. The outline has moved by 0.05 at most. Left: the letter; middle: fitted; right: both.
 """
 
 from __future__ import annotations
