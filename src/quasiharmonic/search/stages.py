@@ -253,7 +253,7 @@ class Search:
         self.best_reference = objective.mesh.kind
         self.deepest = Iterate(objective, tensors(begun.deepest_xi), begun.deepest_map)
         self.stages.append(begun.stage)
-        self._examine()
+        self._tried = True
         return Status.OUT_OF_ITERATIONS
 
     def _descend_by_any(self, stage: Descent, before: Status) -> Status:
