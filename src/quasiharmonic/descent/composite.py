@@ -44,8 +44,8 @@ class Composite(VectorAdam):
     Attributes
     ----------
     direct : int
-        Steps before, from where any descent begins; easy maps need no more, and take less time than the composite, which
-        takes as long as some 5 to 15 steps.
+        Steps before, from where any descent begins; easy maps need no more, and the composite takes as long as some 5
+        to 15 of them.
     """
 
     direct: int = 6
