@@ -28,7 +28,7 @@ from pin_problems import patch_of_scan
 from quasiharmonic import Status, injective_map
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.exact.loops import judge_loops
-from quasiharmonic.mesh.refinement import refine
+from quasiharmonic.mesh.refinement import split_edges
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import arc_length, filled
 
@@ -92,7 +92,7 @@ def _without_chords(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
     found = edges(F, len(V))
     rim = np.zeros(len(V), dtype=bool)
     rim[found.boundary] = True
-    refined = refine(V, F, found.interior[rim[found.interior].all(axis=1)])
+    refined = split_edges(V, F, found.interior[rim[found.interior].all(axis=1)])
     return refined.V, refined.F
 
 

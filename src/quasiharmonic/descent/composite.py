@@ -44,10 +44,11 @@ class Composite(VectorAdam):
     Attributes
     ----------
     direct : int
-        Steps before, from where any descent begins; easy maps need no more, and take less time than the composite.
+        Steps before, from where any descent begins; easy maps need no more, and the composite takes as long as some 5
+        to 15 of them.
     """
 
-    direct: int = 4
+    direct: int = 6
 
     word: ClassVar[str] = "composite"
 

@@ -22,6 +22,8 @@ from quasiharmonic.search.stages import CoarseToFine, InPassing, Stages
 # Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
 # than ten iterations on the mesh.
 _LARGE = 6000
+# Up to so many triangles, or so many for each edge of the boundary, the composite takes longer than what it saves.
+_SMALL, _SLIM = 1000, 4
 # Turns of alternation and Newton's method in the paper's pipeline.
 _TURNS = 10
 
@@ -30,10 +32,10 @@ def speed(problem: Problem) -> Stages:
     """The stages that find a map soonest, the first of which usually suffices.
 
     Boundaries alone want tanh, pins want si-log: the spike that a pinned point draws needs distortion that
-    grows slowly towards it, and tanh never gets there. What is left then are a few triangles in tight places,
-    which moving vertices rights sooner than moving tensors does; or else the map is far from any solution in
-    parts, and Newton's method brings it nearer. All of this is tried on a coarse mesh first if the mesh is large,
-    and soon if it is not.
+    grows slowly towards it, and tanh never gets there. One loop without pins is near to a solution at once by way of
+    a disk. What is left then are a few triangles in tight places, which moving vertices rights sooner than moving
+    tensors does; or else the map is far from any solution in parts, and Newton's method brings it nearer. All of this
+    is tried on a coarse mesh first if the mesh is large, and soon if it is not.
 
     Parameters
     ----------
@@ -44,7 +46,7 @@ def speed(problem: Problem) -> Stages:
     list of Descent or CoarseToFine
         In the order in which they are run.
     """
-    straight: Stages = ()
+    other: Stages = ()
     if problem.domain.pins.size:
         first: Descent = VectorAdam(parameterisation="si-log", iterations=400)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
@@ -53,14 +55,18 @@ def speed(problem: Problem) -> Stages:
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
     repair: Stages = (Combing(resume=True), Patches(tries=15, resume=True))
     if len(problem.domain.loops) == 1 and not problem.domain.pins.size:
-        first, straight = Composite(iterations=100), (first, *repair)
+        # From one of the two starts or the other.
+        composite = Composite(iterations=100)
+        soonest = len(problem.F) > max(_SMALL, _SLIM * problem.domain.loops[0].size)
+        first, second = (composite, first) if soonest else (first, composite)
+        other = (second, *repair)
     coarse = CoarseToFine(first)
     soon: Stages = (coarse, first, *repair) if problem.n >= _LARGE else (first, *repair, coarse)
     return [
         *soon,
         Untangling(iterations=400, resume=True),
         Combing(in_vain=10, resume=True),
-        *straight,
+        *other,
         newton,
         Untangling(iterations=600, resume=True),
         Combing(in_vain=10, resume=True),
