@@ -130,14 +130,16 @@ def test_what_fits_gains_nothing():
 
 
 def test_thinning_leaves_what_is_needed():
-    """A chord that the target does not contain takes one vertex, and no more."""
-    V, F = grid(1, 1)
-    problem = Problem(V, F, [0, 1, 3, 2], [[0, 0], [1, 0], [0.1, 0.1], [0, 1]], reference="equilateral")
-    chord = edges(F, 4).interior[0].tolist()
-    split = 0 if set(chord) == {0, 3} else 1
-    assert len(construct(problem).refined.parents) == split
-    other = Problem(V, F, [0, 1, 3, 2], [[0.9, 0.9], [1, 0], [1, 1], [0, 1]], reference="equilateral")
-    assert len(construct(other).refined.parents) == 1 - split or set(chord) == {0, 3}
+    """A chord that the target does not contain takes one vertex, and one that it does contain none."""
+    V, F = [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
+    chevron = Problem(V, F, [0, 1, 2, 3], [[-1, -1], [0, 0], [1, -1], [0, 2]])
+    made = construct(chevron)
+    check(chevron, made)
+    assert len(made.refined.parents) == 1
+    turned = chevron.moved(np.roll(chevron.target, 1, axis=0))
+    made = construct(turned)
+    check(turned, made)
+    assert not len(made.refined.parents)
 
 
 class TestNoRoom:
