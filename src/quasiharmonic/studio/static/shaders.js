@@ -80,11 +80,20 @@ function compiled(gl, kind, source) {
   return shader;
 }
 
+/** Whether the processor draws, for which smooth edges are most of the work. */
+function drawsInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
+}
+
 /** What draws triangles and edges of one surface; throws where the browser has no WebGL 2. */
 export class Painter {
   constructor(canvas) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: false, alpha: true });
+    this.gl = canvas.getContext("webgl2", { antialias: !drawsInSoftware(), preserveDrawingBuffer: false, alpha: true });
     if (!this.gl) throw new Error("this browser has no WebGL 2, which draws the surface");
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => this.#build());
