@@ -26,6 +26,7 @@ import traceback
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from io import FileIO, TextIOWrapper
 from pathlib import Path
@@ -306,8 +307,10 @@ def _positive(F: IntArray, uv: FloatArray) -> bool:
 def _import_all() -> None:
     """Import what the command imports, once for all processes that come after."""
     for module in pkgutil.walk_packages(quasiharmonic.__path__, "quasiharmonic."):
+        # What needs an extra says so when it is imported, and the command imports none of it unasked.
         if not module.name.endswith("__main__"):
-            importlib.import_module(module.name)
+            with suppress(ImportError):
+                importlib.import_module(module.name)
     for name in ("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial", "scipy.optimize", "matplotlib.path"):
         importlib.import_module(name)
 

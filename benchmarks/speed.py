@@ -39,9 +39,9 @@ from peers import PEERS
 from quasiharmonic import Problem, io, is_injective, solve, surfaces
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.descent import Descent, VectorAdam
+from quasiharmonic.ladder import mapping
 from quasiharmonic.linsolve import available
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search import solving
 from quasiharmonic.search.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 
@@ -116,7 +116,7 @@ def measure(
                 with clock.clocking():
                     began = phases.clock()
                     if record.tool == OURS:
-                        result = solving.injective_map(*arrays, strategy=strategy, linear_solver=linear_solver)
+                        result = mapping.injective_map(*arrays, strategy=strategy, linear_solver=linear_solver)
                         uv, record.iterations = result.uv, result.iterations
                     else:
                         uv = PEERS[record.tool](*arrays)
@@ -155,7 +155,7 @@ def print_peak(tool: str, path: Path, linear_solver: str) -> None:
     """The child's part of `peak_megabytes`."""
     with np.load(path) as stored:
         arrays = tuple(stored[name] for name in stored.files)
-    ours = partial(solving.injective_map, linear_solver=linear_solver)
+    ours = partial(mapping.injective_map, linear_solver=linear_solver)
     run: Callable[..., object] = ours if tool == OURS else PEERS[tool]
     # A small problem first, for what is loaded once and for all.
     run(*cat(100, "C"))
@@ -193,7 +193,7 @@ def animation(triangles: int) -> list[Record]:
         for record in (afresh, onwards):
             began = phases.clock()
             if record is afresh:
-                result = solving.injective_map(V, F, loop, bent(angle))
+                result = mapping.injective_map(V, F, loop, bent(angle))
             else:
                 problem = problem.moved(bent(angle))
                 result = solve(problem, start=last)
