@@ -6,9 +6,9 @@ concentrates it in a spike at the point, and with Bounded Distortion Mapping (Li
 here. So it is here: si-log takes 3 iterations and its largest ratio is 2.9; the map
 of least MIPS has less than half its energy (0.25 against 0.57) and a largest ratio of 35.
 
-The paper descends MIPS along with V₃ from tanh; here the si-log map is polished. tanh alone takes 218 iterations to
-its first map, whose largest ratio is 126, and on finer grids it does not always get there: a few triangles stay
-inverted.
+The paper descends MIPS along with V₃ from tanh; here the si-log map is polished, for tanh alone does not get there:
+at this size one or two triangles stay inverted, after 366 or 485 iterations, as the linear solver rounds. On grids of
+24 and 30 cells it takes 30 and 170 iterations, on coarser ones a single one.
 """
 
 from __future__ import annotations
