@@ -248,6 +248,17 @@ class TestTheorems:
         assert inverted > 0
         assert iterate.value >= 2 * inverted
 
+    def test_v1_and_v2_vanish_only_where_v3_does(self, name, V, F):
+        """With r = Lw − g, V₃ = ½ wᴴr at the held vertices: bounded by the norm of r in which V₁ and V₂ are."""
+        problem = posed(V, F, noise=0.2)
+        at = Objective(problem).evaluate(random_xi(F))
+        v1, v2 = (Objective(problem, functional).evaluate(at.xi).value for functional in ("neumann", "sobolev"))
+        v3, area = at.value, at.dw.area.sum()
+        held = at.w[problem.fixed]
+        assert v3 > 0.1 * area
+        assert v1 >= 2 * v3**2 / np.linalg.norm(held - held.mean()) ** 2
+        assert v2 >= v3**2 / (v3 + area)
+
 
 def test_v4_can_be_negative():
     """The paper's V₄ ≥ 0 (§7.3.4, Proposition E.1) does not hold in linear elements.
