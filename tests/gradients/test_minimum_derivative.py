@@ -217,7 +217,7 @@ def test_two_maps_that_are_as_good_make_it_doubtful():
 
 
 def test_where_a_map_is_about_to_leap():
-    """At the length from which on the strip gives way straight and bent are the same; and a disk may turn in a circle."""
+    """Where a strip begins to give way straight and bent are the same; and a disk may turn in a circle."""
     V, F = grid(20, 4)
     V = (V - V.mean(axis=0)) * [1, 0.1]
     ends = np.flatnonzero(np.abs(V[:, 0]) > 0.49)
