@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
+from quasiharmonic.gradients.layers import FlattenLayer, PolishedLayer
 from shared.differentiated import flattened_ring, held_ring, tensors
 
 jax = pytest.importorskip("jax")
@@ -73,6 +76,42 @@ def test_vmap_is_a_batch():
     assert np.allclose(one, together[1][1])
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_vmap_over_one_argument_of_a_batch_over_another(count):
+    """Three targets within, tensors outside: as many as there are targets, or another number."""
+    problem = held_ring()
+    targets = np.stack([problem.target, 1.1 * problem.target, 0.9 * problem.target])
+    mu = np.stack([0.2 * (k + 1) * tensors(len(problem.F)) for k in range(count)])
+
+    def loss(mu):
+        return (layers.quasi_harmonic_map(problem, mu, target=targets) ** 3).sum()
+
+    gradients = jax.vmap(jax.grad(loss))(mu)
+    assert np.allclose(gradients, np.stack([jax.grad(loss)(one) for one in mu]), rtol=1e-12)
+    maps = jax.vmap(lambda mu: layers.quasi_harmonic_map(problem, mu, target=targets))(mu)
+    assert np.array_equal(maps[1, 2], layers.quasi_harmonic_map(problem, mu[1], target=targets[2]))
+
+
+def test_programs_are_compiled_once():
+    """Layers that are made anew in each turn of a loop, of the same settings, are the same to JAX."""
+    problem = held_ring()
+    V, F, _, _, _ = flattened_ring()
+    traced = []
+
+    @partial(jax.jit, static_argnums=0)
+    def program(layer):
+        traced.append(layer)
+        return 0
+
+    for _ in range(3):
+        program(PolishedLayer(problem, "mips", False, 1.0 * V, "auto"))
+        program(FlattenLayer.of(V, F.copy(), None, None, energy="mips", weights=None, start=None, solver="auto"))
+    assert len(traced) == 2
+    program(PolishedLayer(problem, "mips", False, 1.1 * V, "auto"))
+    program(PolishedLayer(held_ring(), "mips", False, 1.0 * V, "auto"))
+    assert len(traced) == 4
+
+
 def test_more_maps_than_derivatives_are_kept():
     problem = held_ring()
     targets = np.stack([(1 + 0.01 * k) * problem.target for k in range(20)])
@@ -83,6 +122,10 @@ def test_more_maps_than_derivatives_are_kept():
 
 def test_what_is_refused():
     problem = held_ring()
+    with pytest.raises(ValueError, match=r"batches must go together .*, not mu \(2,\), target \(3,\)"):
+        layers.quasi_harmonic_map(
+            problem, np.zeros((2, len(problem.F)), complex), target=np.stack([problem.target] * 3)
+        )
     with pytest.raises(TypeError, match="target must be an array, not list"):
         layers.injective_map(problem, target=[1.0])
     with pytest.raises(TypeError, match=r"target must be of float64, not float32: target.astype\('float64'\)"):

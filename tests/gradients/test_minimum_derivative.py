@@ -169,6 +169,17 @@ def test_sliding_along_a_circle(dome):
     assert np.abs((ahead - behind) / 2 - moved).max() < 0.01 * np.abs(moved).max()
 
 
+@pytest.mark.parametrize("width", [1.3, 1.5])
+def test_sliding_along_an_ellipse_comes_to_rest(dome, width):
+    """Parameters do not go evenly along it: the barrier's slopes are those of its values only if they are exact."""
+    surface, F, fixed, _ = dome
+    V, _ = disk(6)
+    found = injective_map(surface, F, fixed, V[fixed] * [width, 0.8], polish="symmetric-dirichlet")
+    rails = Rails([Curve.circle().transformed([[width, 0], [0, 0.8]])])
+    uv = polish(surface, F, found.uv, fixed=fixed, slide=rails).uv
+    assert Doubt.NOT_AT_REST not in polish_derivative(surface, F, uv, fixed=fixed, slide=rails).doubts
+
+
 def test_the_map_is_at_rest_and_injective(dome):
     surface, F, fixed, uv = dome
     derivative = polish_derivative(surface, F, uv, fixed=fixed)
@@ -203,6 +214,56 @@ def test_two_maps_that_are_as_good_make_it_doubtful():
     assert not derivative.reliable
     # It is a derivative all the same.
     assert np.allclose(derivative.jvp(target=np.ones((ends.size, 2))), 1, atol=1e-6)
+
+
+def test_where_a_map_is_about_to_leap():
+    """Where a strip begins to give way straight and bent are the same; and a disk may turn in a circle."""
+    V, F = grid(20, 4)
+    V = (V - V.mean(axis=0)) * [1, 0.1]
+    ends = np.flatnonzero(np.abs(V[:, 0]) > 0.49)
+
+    def doubts(length):
+        return flatten_derivative(V, F, V * [length, 1], fixed=ends).doubts
+
+    short, long = 0.8, 1.0
+    assert doubts(long) == ()
+    while Doubt.NEAR_SINGULAR not in (found := doubts(0.5 * (short + long))):
+        assert long - short > 1e-12
+        short, long = (0.5 * (short + long), long) if found else (short, 0.5 * (short + long))
+    disc, G = disk(4)
+    rim = np.arange(len(disc) - 24, len(disc))
+    turning = polish_derivative(disc, G, disc, fixed=rim, slide=Rails([Curve.circle()]))
+    assert Doubt.NEAR_SINGULAR in turning.doubts
+
+
+def test_vertices_that_rest_at_a_kink_are_doubtful():
+    """The bent sides of the outline are polygons that turn at each vertex, by less than a corner does."""
+    problem, uv = polished_ring(curved=True)
+    derivative = polish_derivative(problem.V, problem.F, uv, fixed=problem.fixed, slide=True)
+    assert Doubt.SLIDING in derivative.doubts
+    assert Doubt.NOT_AT_REST not in derivative.doubts
+
+
+class Creased(Isotropic):
+    """An energy with a crease where areas are kept, at which Newton's steps come to no rest."""
+
+    barrier = True
+
+    def density(self, d):
+        return np.where(d.det > 0, SymmetricDirichlet().density(d) + np.abs(np.log(np.abs(d.det))), np.inf)
+
+    def slopes(self, d):
+        a, b = SymmetricDirichlet().slopes(d)
+        return a + np.sign(d.det - 1) / d.det, b - np.sign(d.det - 1) / d.det
+
+    def bends(self, d):
+        crease = -np.sign(d.det - 1) / d.det**2
+        return tuple(bend + way * crease for bend, way in zip(SymmetricDirichlet().bends(d), (1, -1, 1), strict=True))
+
+
+def test_a_map_that_comes_to_no_rest_is_doubtful():
+    V, F, _, _, uv = flattened_ring()
+    assert Doubt.NOT_AT_REST in flatten_derivative(V, F, uv, energy=Creased()).doubts
 
 
 def test_a_boundary_that_leans_on_itself_is_doubtful():

@@ -75,6 +75,18 @@ def test_batches_go_together():
     assert torch.allclose(mu.grad[0], other.grad)
 
 
+def test_tensors_that_are_conjugates_in_name_only():
+    """PyTorch conjugates when it must, and says of a tensor until then that it is to be read so."""
+    problem = held_ring()
+    mu = leaf(tensors(len(problem.F)))
+    maps = layers.quasi_harmonic_map(problem, mu.conj())
+    assert torch.equal(maps, layers.quasi_harmonic_map(problem, mu.detach().conj().resolve_conj()))
+    (maps**3).sum().backward()
+    other = leaf(mu.detach().conj().resolve_conj().numpy())
+    (layers.quasi_harmonic_map(problem, other) ** 3).sum().backward()
+    assert torch.allclose(mu.grad, other.grad.conj())
+
+
 def test_the_map_is_the_library_s_brought_to_rest():
     problem = held_ring()
     maps = layers.injective_map(problem, target=leaf(problem.target))

@@ -173,13 +173,20 @@ class Curve:
                 found[which] = on_ellipse(control, angle_at(self._angles[piece[which]], t[which]))
         return found
 
-    def sampled(self, s: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Points and unit tangents at about these lengths, of any shape, from a table: quick, for measures of shape."""
+    def sampled(self, s: FloatArray, *, exactly: bool = False) -> tuple[ComplexArray, ComplexArray]:
+        """Points and unit tangents at lengths of any shape.
+
+        From a table at about these lengths: quick, for measures of shape. Or exactly at them, so that the tangents are
+        the points' derivatives to rounding.
+        """
         if self.closed:
             s = np.mod(s, self.length)
-        at = np.interp(s.ravel(), *self._table)
-        piece = np.clip(at.astype(np.int64), 0, self._degree.size - 1)
-        t = at - piece
+        if exactly:
+            piece, t = self.place(s.ravel())
+        else:
+            at = np.interp(s.ravel(), *self._table)
+            piece = np.clip(at.astype(np.int64), 0, self._degree.size - 1)
+            t = at - piece
         return self._point(piece, t).reshape(s.shape), self._direction(piece, t)[0].reshape(s.shape)
 
     def frame(self, s: FloatArray, forward: BoolArray) -> tuple[ComplexArray, FloatArray]:

@@ -36,6 +36,9 @@ class Straying:
     track : Track
     loops : sequence of (l,) int64
         Boundary loops.
+    exactly : bool
+        Take points of the curves exactly at their lengths, and not quickly at about these: slopes are then the
+        derivatives of values to rounding.
 
     Attributes
     ----------
@@ -43,10 +46,10 @@ class Straying:
         The sliding vertices at the edges' ends, as positions in ``track.vertices``; -1 for one that is held.
     """
 
-    def __init__(self, track: Track, loops: Sequence[IntArray]) -> None:
+    def __init__(self, track: Track, loops: Sequence[IntArray], *, exactly: bool = False) -> None:
         following = {int(i): int(j) for loop in loops for i, j in zip(loop, np.roll(loop, -1), strict=True)}
         number = {int(v): k for k, v in enumerate(track.vertices)}
-        self._track = track
+        self._track, self._exactly = track, exactly
         self._edges: list[tuple[int, IntArray, IntArray]] = []
         self._bounds: list[float] = []
         pairs = []
@@ -99,7 +102,9 @@ class Straying:
         """``m/M`` of the edges on each curve, and its first and second derivatives by the ends' lengths."""
         found, every = [], self._track.every(s)
         for (k, tail, head), bound in zip(self._edges, self._bounds, strict=True):
-            share, by_ends, by_both = _strayed(self._track.chains[k], every[k][tail], every[k][head])
+            share, by_ends, by_both = _strayed(
+                self._track.chains[k], every[k][tail], every[k][head], exactly=self._exactly
+            )
             found.append((share / bound, by_ends / bound, by_both / bound))
         return found
 
@@ -120,13 +125,15 @@ def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
     return float(found)
 
 
-def _strayed(chain: Chain, begin: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _strayed(
+    chain: Chain, begin: FloatArray, end: FloatArray, *, exactly: bool = False
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean squares of distances between stretches (e,) of a curve and their chords, with derivatives by both ends."""
     curve = chain.curve
     gap = (end - begin) % curve.length if curve.closed else end - begin
     shares = np.concatenate([[0.0], _SHARES, [1.0]])
     along = begin[:, None] + gap[:, None] * shares
-    points, tangents = curve.sampled(along)
+    points, tangents = curve.sampled(along, exactly=exactly)
     side = points[:, -1] - points[:, 0]
     normal = 1j * side / np.abs(side)
     local = (points[:, 1:-1] - points[:, :1]) / side[:, None]

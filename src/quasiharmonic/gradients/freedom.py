@@ -128,7 +128,7 @@ class OnCurves(Freedom):
         held = np.setdiff1d(fixed, track.vertices)
         super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
         self._track, self._s, self._there = track, track.s, track.s
-        self._straying, self._unit = Straying(track, loops), 2.0**exponent
+        self._straying, self._unit = Straying(track, loops, exactly=True), 2.0**exponent
         self._weight = _WEIGHT * energy.value(in_units(track.uv, exponent))
         self._both = (self._straying.pairs >= 0).all(axis=1)
         self.system.couple(self._straying.pairs[self._both])

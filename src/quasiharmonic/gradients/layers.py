@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -51,8 +51,27 @@ class DoubtfulDerivative(UserWarning):
     """A gradient has been asked for that its derivative has `Doubt` about."""
 
 
+@dataclass(frozen=True, eq=False)
 class Layer(ABC):
-    """A map as a function of arrays."""
+    """A map as a function of arrays. Layers that do the same are equal: programs are compiled once for them."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and isinstance(other, Layer) and self._settings == other._settings
+
+    def __hash__(self) -> int:
+        return hash(self._settings)
+
+    @cached_property
+    def _settings(self) -> tuple[Any, ...]:
+        """What it was made of: arrays, numbers and words by what they hold, problems, energies and rails themselves."""
+        found: list[Any] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                found.append((value.shape, value.tobytes()))
+            else:
+                found.append(value if isinstance(value, str | bool | tuple | None) else id(value))
+        return tuple(found)
 
     @property
     @abstractmethod
@@ -75,9 +94,19 @@ class Layer(ABC):
         """
 
     def batch(self, arrays: Mapping[str, Array]) -> tuple[int, ...]:
-        """The axes over which arguments are a batch together."""
-        leads = [array.shape[: array.ndim - len(self.shapes[name])] for name, array in arrays.items()]
-        return np.broadcast_shapes(*leads)
+        """The axes over which arguments are a batch together.
+
+        Raises
+        ------
+        ValueError
+            When batches do not go together.
+        """
+        leads = {name: array.shape[: array.ndim - len(self.shapes[name])] for name, array in arrays.items()}
+        try:
+            return np.broadcast_shapes(*leads.values())
+        except ValueError:
+            batches = ", ".join(f"{name} {tuple(lead)}" for name, lead in leads.items())
+            raise ValueError(f"batches must go together as NumPy broadcasts them, not {batches}") from None
 
     def item(self, arrays: Mapping[str, Array], item: tuple[int, ...]) -> dict[str, Array]:
         """The arguments of one problem of the batch."""

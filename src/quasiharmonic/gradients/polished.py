@@ -60,7 +60,9 @@ def polish_derivative(
     By implicit differentiation, with the second derivative as it is. An energy of one's own may depend on the rest
     positions through p and q alone. Where the boundary slides, its curves do not change, nor does the scale of the
     map; the barrier that keeps edges near curves that are not straight (`quasiharmonic.curves.straying`) has the bounds
-    and the weight that it would have in a polish begun at ``uv``, and is taken as keeping them.
+    and the weight that it would have in a polish begun at ``uv``, and is taken as keeping them: along such curves
+    derivatives are as a rule good to half a percent and not to rounding, without a doubt that says so. A disk that
+    slides around on a circle, with no vertex pinned, may turn at will, and its derivative is doubtful.
 
     Examples
     --------

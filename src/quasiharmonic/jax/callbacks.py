@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -35,14 +36,30 @@ def applied(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
     given = {name: array for name, array in arguments.items() if array is not None}
     for name, array in given.items():
         _check(name, array, layer.shapes[name])
-    maps: jax.Array = _map(layer, tuple(given), *map(jnp.asarray, given.values()))
+    # All with as many axes in front, so that one that `jax.vmap` adds is the first of each.
+    axes = {name: np.ndim(array) - len(layer.shapes[name]) for name, array in given.items()}
+    most = max(axes.values(), default=0)
+    arrays = (jnp.expand_dims(array, tuple(range(most - axes[name]))) for name, array in given.items())
+    maps: jax.Array = _map(layer, tuple(given), *arrays)
     return maps
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A function of a layer's; equal to another of the same, so that JAX compiles and keeps one program for both."""
+
+    function: Callable[..., Any]
+    layer: Layer
+    names: tuple[str, ...]
+
+    def __call__(self, *arrays: Any) -> Any:
+        return self.function(self.layer, self.names, *arrays)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _map(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> jax.Array:
     shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.places), jnp.float64)
-    maps: jax.Array = jax.pure_callback(partial(_found, layer, names), shape, *arrays, vmap_method="expand_dims")
+    maps: jax.Array = jax.pure_callback(_Call(_found, layer, names), shape, *arrays, vmap_method="expand_dims")
     return maps
 
 
@@ -60,9 +77,7 @@ def _backward(
         jax.ShapeDtypeStruct((*lead, *layer.shapes[name]), array.dtype)
         for name, array in zip(names, arrays, strict=True)
     ]
-    pulled = jax.pure_callback(
-        partial(_pulled, layer, names), shapes, uv, cotangent, *arrays, vmap_method="expand_dims"
-    )
+    pulled = jax.pure_callback(_Call(_pulled, layer, names), shapes, uv, cotangent, *arrays, vmap_method="expand_dims")
     return tuple(_summed(gradient, array.shape) for gradient, array in zip(pulled, arrays, strict=True))
 
 

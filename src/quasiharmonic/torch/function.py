@@ -86,7 +86,8 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
 def _numpy(tensor: torch.Tensor) -> Array:
     """What a tensor holds; those that stand for others within transforms of `torch.func` hold nothing."""
     try:
-        return tensor.detach().numpy()
+        # Tensors that are conjugates, or negated parts of such, are so in name only until they are resolved.
+        return tensor.detach().resolve_conj().resolve_neg().numpy()
     except RuntimeError as error:
         raise NotImplementedError(
             "maps are differentiated by backward(), torch.autograd.grad and forward mode, not by torch.func"
