@@ -11,14 +11,18 @@ from hypothesis import strategies as st
 
 from quasiharmonic import Problem, certify
 from quasiharmonic.construction.constructing import construct
+from quasiharmonic.construction.cutting import Cutting
 from quasiharmonic.construction.halfedges import HalfEdges
+from quasiharmonic.construction.opening import thinned
 from quasiharmonic.construction.regions import Regions
 from quasiharmonic.construction.sheet import Sheet
 from quasiharmonic.construction.simplicity import is_simple
 from quasiharmonic.construction.thinning import best_triangles, shape
 from quasiharmonic.construction.walks import walk
+from quasiharmonic.mesh.refinement import split_edges
 from quasiharmonic.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.surfaces import disk, grid
+from quasiharmonic.targets.chords import flattened_edges
 from shared.outlined import onto_polygon, polygon, turned_ring, with_holes, without_inner_vertices
 from shared.polygons import circle, random_polygon, spread
 from shared.small_meshes import handle, wheel
@@ -111,6 +115,57 @@ def test_any_scale(exponent):
     made = construct(far)
     check(far, made)
     assert np.array_equal(np.ldexp(made.uv, -exponent), construct(problem).uv)
+
+
+def pinned_near_each_other(size, apart):
+    """A disk onto itself, three of its inner vertices pinned near the origin."""
+    V, F = disk(4)
+    (loop,) = boundary_loops(F, len(V))
+    pins = np.setdiff1d(np.arange(len(V)), loop)[:3]
+    places = np.array([[1, 0], [0, 1], [0, 0]]) * apart
+    return Problem(V, F, np.concatenate([loop, pins]), np.concatenate([V[loop] * size, places]))
+
+
+@pytest.mark.parametrize("apart", [1e-160, 1e-300])
+def test_cuts_of_any_length(apart):
+    problem = pinned_near_each_other(1, apart)
+    assert is_simple(problem)
+    cutting = Cutting(problem)
+    # Three of the cuts connect a pin, each of the others makes a piece.
+    assert len(cutting.sheet.loops()) == len(cutting.regions.kept) // 2 - 3 + 1
+
+
+def test_what_no_scale_bears_is_told():
+    problem = pinned_near_each_other(1e300, 1e-25)
+    assert is_simple(problem)
+    made = construct(problem)
+    assert not made.certificate.injective
+    assert np.array_equal(made.refined.F, problem.F)
+    assert made.crowded.size
+
+
+def test_thinning_leaves_alone_what_it_would_round():
+    V, F = disk(2)
+    (loop,) = boundary_loops(F, len(V))
+    problem = Problem(V, F, loop, V[loop] * 1e300)
+    refined = split_edges(V, F, problem.domain.edges.interior[:1])
+    uv = refined.V * 1e300
+    uv[np.hypot(*V.T).argmin()] = 1e-25, 0
+    assert certify(refined.F, uv).bijective
+    same, places = thinned(problem, refined, uv)
+    assert same is refined
+    assert np.array_equal(places, uv)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scale", [1e-310, 1.7e308])
+def test_flattened_edges_at_any_scale(scale):
+    F = np.array([[2, (2 + k) % 8, (3 + k) % 8] for k in range(1, 7)])
+    target = circle(8)
+    target[3] = (target[2] + target[4]) / 2
+    expected = flattened_edges(F, np.arange(8), target)
+    assert len(expected)
+    assert np.array_equal(flattened_edges(F, np.arange(8), target * scale), expected)
 
 
 def test_far_from_the_origin():

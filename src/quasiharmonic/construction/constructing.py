@@ -11,6 +11,7 @@ from quasiharmonic.construction.ancestry import as_refined, midpoints
 from quasiharmonic.construction.cutting import Cutting, TooManyError
 from quasiharmonic.construction.embedding import embedded
 from quasiharmonic.construction.opening import thinned
+from quasiharmonic.construction.simplicity import is_simple
 from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.mesh.refinement import Refined
 from quasiharmonic.problem import Domain, Problem
@@ -88,7 +89,8 @@ def construct(
     Returns
     -------
     Construction
-        What the proof says exists; where rounding leaves inverted triangles, with these.
+        What the proof says exists; where rounding leaves inverted triangles, with these. Where the target's coordinates
+        span so much that no scale bears products of all of them: the mesh as it is.
 
     Raises
     ------
@@ -98,10 +100,14 @@ def construct(
     # Of magnitude about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
-    near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
-    refined, uv = _embedded(unit, Cutting(unit, near, most))
-    if thin and certify(refined.F, uv, loops=problem.domain.loops).bijective:
-        refined, uv = thinned(unit, refined, uv)
+    if np.array_equal(np.ldexp(unit.target, exponent), problem.target) or is_simple(unit):
+        near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
+        refined, uv = _embedded(unit, Cutting(unit, near, most))
+        if thin and certify(refined.F, uv, loops=problem.domain.loops).bijective:
+            refined, uv = thinned(unit, refined, uv)
+    else:
+        refined = as_refined(problem.V, problem.F, problem.F, [])
+        uv = np.zeros((problem.n, 2)) if guide is None else np.ldexp(guide, -exponent)
     uv = np.ldexp(uv, exponent)
     uv[problem.fixed] = problem.target
     certificate = certify(refined.F, uv, loops=problem.domain.loops)
@@ -130,7 +136,10 @@ def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certifi
     bad = np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
     if not bad.size:
         return bad
-    _, nearest = cKDTree(problem.target).query(np.nan_to_num(uv[F[bad]]).mean(axis=1))
+    # Of magnitude about one, so that distances neither over- nor underflow.
+    scale = -int(np.frexp(np.abs(problem.target).max())[1])
+    middles = np.nan_to_num(np.ldexp(uv[F[bad]], scale)).mean(axis=1)
+    _, nearest = cKDTree(np.ldexp(problem.target, scale)).query(middles)
     return np.unique(problem.fixed[nearest])
 
 

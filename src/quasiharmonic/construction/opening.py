@@ -41,8 +41,11 @@ def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined
     """
     # Of magnitude about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    given, uv = uv, np.ldexp(uv, -exponent)
+    if not np.array_equal(np.ldexp(uv, exponent), given):
+        # Coordinates that span so much stay as they are: what is left of them may fold.
+        return refined, given
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent))
-    uv = np.ldexp(uv, -exponent)
     gradings = cycle(GRADINGS)
     for _ in range(_ROUNDS):
         refined, uv = _taken_out(unit, refined, uv)

@@ -20,6 +20,8 @@ Node = int | Edge
 # How much longer a walk seems as far off the segment as that is long; and in the segment's lengths what a step costs, a
 # split of an edge that will have to be split some time, and one of another.
 _STRAY, _STEP, _SPLIT, _SPLIT_MORE = 8.0, 1e-3, 0.5, 1.0
+# A shorter segment is taken for one of this length, so that no cost overflows.
+_SHORTEST = 1e-60
 
 
 def walk(sheet: Sheet, place: list[complex], start: int, end: int) -> list[int]:
@@ -59,8 +61,8 @@ def _split(sheet: Sheet, place: list[complex], edge: Edge) -> int:
 def _shortest(sheet: Sheet, place: list[complex], start: int, end: int, weight: float) -> list[Node]:
     """The cheapest nodes from a copy to another (Dijkstra)."""
     chord = place[end] - place[start]
-    size = abs(chord) or 1.0
-    axis = chord / size
+    axis = chord / (abs(chord) or 1.0)
+    size = max(abs(chord), _SHORTEST)
 
     def where(node: Node) -> complex:
         at = place[node] if isinstance(node, int) else (place[node[0]] + place[node[1]]) / 2

@@ -59,6 +59,8 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     F = triangle_rows(mesh_triangles(F))
     fixed = np.asarray(fixed, dtype=np.int64)
     places = np.asarray(target, dtype=np.float64)
+    # Of magnitude about one, so that nothing over- or underflows.
+    places = np.ldexp(places, -int(np.frexp(np.abs(places).max())[1]))
     n = int(F.max()) + 1
     found = edges(F, n)
     position = np.full((n, 2), np.nan)
