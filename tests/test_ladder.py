@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, certify, injective_map, io
+from quasiharmonic.descent import Newton, VectorAdam
 from quasiharmonic.ladder.climbing import climb
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk
 from shared.commands import run
 from shared.outlined import with_holes
 from shared.small_meshes import wheel
+from shared.solvable import star_problem
 
 
 def chevron():
@@ -31,6 +33,19 @@ def test_the_mesh_as_given_comes_first():
     assert result.added == 0
     assert [(rung.name, rung.injective) for rung in result.rungs] == [("as given", True)]
     assert np.array_equal(result.uv, injective_map(V, F, loop, V[loop] * [2, 1]).uv)
+
+
+def test_the_construction_is_asked_before_the_whole_search():
+    """Where it adds no vertex, the climb ends with a map of the mesh as given, and only the first stages were run."""
+    haste = [VectorAdam(iterations=1), Newton()]
+    result = injective_map(*star_problem(depth=0.15, n=60), refine=True, strategy=haste)
+    assert result.certificate.bijective
+    assert result.refined is None
+    assert [(rung.name, rung.injective, rung.added) for rung in result.rungs] == [
+        ("as given", False, 0),
+        ("constructed", True, 0),
+    ]
+    assert [stage.name for stage in result.stages] == [haste[0].name, "constructed"]
 
 
 def test_vertices_are_added_where_there_is_no_map_without():

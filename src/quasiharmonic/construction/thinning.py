@@ -12,13 +12,13 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.construction.halfedges import HalfEdges, Triangle
 from quasiharmonic.descent.patches import Patch
-from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.hearing import still_at_it
 from quasiharmonic.mesh.topology import boundary_edges
 
@@ -71,12 +71,17 @@ class Thinning:
 
     def thin(self) -> None:
         """Take out what can be taken out, the last added first, and again until nothing can."""
-        before = None
-        while before != len(self.left):
-            before = len(self.left)
-            for vertex in sorted(self.left, reverse=True):
+        # Whether a vertex can go is a matter of its star, which changes only as a neighbour goes.
+        waiting = set(self.left)
+        while waiting:
+            for vertex in sorted(waiting, reverse=True):
                 still_at_it()
-                self._take_out(vertex, self._without(vertex, self._in_map))
+                waiting.discard(vertex)
+                cut = self._without(vertex, self._in_map)
+                if cut is not None:
+                    beside = {tail for tail, _ in self.mesh.link(vertex)}
+                    self._take_out(vertex, cut)
+                    waiting |= beside & self.left
 
     def try_hard(self, vertex: int, untangle: Callable[[Patch, ComplexArray], ComplexArray], rings: int) -> bool:
         """Take a vertex out if the map can be untangled around where it was.
@@ -115,11 +120,11 @@ class Thinning:
         self.left.add(vertex)
         return False
 
-    def _take_out(self, vertex: int, cut: list[Triangle] | None) -> None:
-        if cut is not None:
-            self.mesh.remove([(vertex, a, b) for a, b in self.mesh.link(vertex)])
-            self.mesh.add(cut)
-            self.left.remove(vertex)
+    def _take_out(self, vertex: int, cut: list[Triangle]) -> None:
+        """Put other triangles in the place of a vertex's."""
+        self.mesh.remove([(vertex, a, b) for a, b in self.mesh.link(vertex)])
+        self.mesh.add(cut)
+        self.left.remove(vertex)
 
     def _without(self, vertex: int, worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
         """Triangles that cover the star of an added vertex, or None where none are worth anything."""
@@ -182,8 +187,10 @@ def shape(p: complex, q: complex, r: complex) -> float:
     sides = abs(q - p) ** 2 + abs(r - q) ** 2 + abs(p - r) ** 2
     if abs(left - right) > _FLAT * (abs(left) + abs(right)) + 1e-300:
         return (left - right) / sides
-    corners = np.array([p, q, r]).view(np.float64).reshape(3, 1, 2)
-    return 1e-300 * float(orientation(*corners)[0])
+    # For a single triangle fractions are far quicker than the predicates of many.
+    (px, py), (qx, qy), (rx, ry) = ((Fraction(z.real), Fraction(z.imag)) for z in (p, q, r))
+    difference = (px - rx) * (qy - ry) - (py - ry) * (qx - rx)
+    return 1e-300 * ((difference > 0) - (difference < 0))
 
 
 def best_triangles(polygon: list[int], worth: Callable[[int, int, int], float]) -> list[Triangle] | None:

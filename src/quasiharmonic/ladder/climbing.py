@@ -1,10 +1,12 @@
 """The ladder: the mesh as it is; edges split that a diagnosis names; more around what stays inverted; the construction.
 
-    as given ──▶ constructed, if no vertex has to be added ──▶ named edges ──▶ around what is inverted ──▶ constructed
+    as given, shortly ──▶ constructed, if no vertex has to be added
+                      ──▶ as given ──▶ named edges ──▶ around what is inverted ──▶ constructed
 
-A rung is climbed where those below have not led to a map. The construction takes little time, so it is made first where
-the target is one that it is for; what it adds says whether the rungs between are worth their time, and it is taken
-where they come to nothing, or to more.
+A rung is climbed where those below have not led to a map. The construction takes little time, where a whole search that
+finds nothing takes much: so it is made as soon as the first stages of the search have failed, if the target is one that
+it is for. What it adds says whether the rungs between are worth their time, of which they then get a part only; it is
+taken where they come to nothing, or to more.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Rung, Stage, Status, Step
 from quasiharmonic.search.solving import solve
 from quasiharmonic.search.stages import Stages
+from quasiharmonic.search.strategy import soonest, stages_of
 from quasiharmonic.targets.chords import flattened_edges
 
 AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
@@ -41,10 +44,10 @@ AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
     "edges split around inverted triangles",
     "constructed",
 )
-# Iterations of a search between the first rung and a construction that is there to be taken, and how often edges are
-# split around what such a search leaves inverted; the latter where there is no construction.
+# Iterations of a search while a construction is there to be taken, and how often edges are split around what such a
+# search leaves inverted; the latter where there is no construction.
 _FEW_ITERATIONS, _FEW_ROUNDS, _ROUNDS = 600, 1, 3
-# A construction that adds so few vertices is taken at once: the mesh as given has no map that was found.
+# A construction that adds so few vertices is taken as soon as no map of the mesh as given was found.
 _LEAST = 1
 
 
@@ -86,10 +89,10 @@ def climb(
             raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
         problem = moved_onto(slide, problem)
 
-    def search(on: Problem, first: ArrayLike | None, budget: int) -> MapResult:
+    def search(on: Problem, first: ArrayLike | None, budget: int, shortly: bool) -> MapResult:
         return solve(
             on,
-            strategy=strategy,
+            strategy=soonest(stages_of(strategy, on)) if shortly else strategy,
             start=first,
             max_iterations=min(budget, max_iterations),
             linear_solver=linear_solver,
@@ -112,9 +115,11 @@ def on_refinement(problem: Problem, refined: Refined | None) -> Problem:
 class _Ladder:
     """A problem, how it is searched, and what was tried so far."""
 
-    def __init__(self, problem: Problem, search: Callable[[Problem, ArrayLike | None, int], MapResult]) -> None:
+    def __init__(self, problem: Problem, search: Callable[[Problem, ArrayLike | None, int, bool], MapResult]) -> None:
         self._problem = problem
         self._search = search
+        # Inner edges that a straight side of the target flattens.
+        self._flat = flattened_edges(problem.F, problem.fixed, problem.target)
         self._rungs: list[Rung] = []
         # The latest result, with the stages and the history of all before it.
         self._last: MapResult | None = None
@@ -130,26 +135,38 @@ class _Ladder:
 
     def _climb(self, start: ArrayLike | None, budget: int) -> MapResult:
         problem = self._problem
-        flat = flattened_edges(problem.F, problem.fixed, problem.target)
-        # What a straight side of the target flattens seldom has a map, and then by little more than a rounding error.
-        first = self._searched(AS_GIVEN, None, start, min(budget, _FEW_ITERATIONS) if len(flat) else budget)
+        few = min(budget, _FEW_ITERATIONS)
+        if not is_simple(problem):
+            # What a straight side flattens seldom has a map, and then by little more than a rounding error.
+            first = self._searched(AS_GIVEN, None, start, few if len(self._flat) else budget)
+            # Where a finer mesh is no better, what is told is about the one given.
+            return first if first.injective else self._between(first, budget, _ROUNDS) or first
+        first = self._searched(AS_GIVEN, None, start, budget, shortly=True)
         if first.injective:
             return first
-        if not is_simple(problem):
-            # Where a finer mesh is no better, what is told is about the one given.
-            return self._between(first, flat, budget, _ROUNDS) or first
-        made, found = self._constructed(first), None
-        if not made.injective or made.added > _LEAST:
-            found = self._between(first, flat, min(budget, _FEW_ITERATIONS), _FEW_ROUNDS)
+        made = self._constructed(first)
+        if not made.added and made.injective:
+            return self._taken(made)
+        if first.status is not Status.IMPOSSIBLE:
+            first = self._searched(AS_GIVEN, None, start, few if made.injective else budget)
+            if first.injective:
+                return first
+        if made.injective and made.added <= _LEAST:
+            return self._taken(made)
+        found = self._between(first, few, _FEW_ROUNDS)
         if found is not None and (not made.injective or found.added <= made.added):
             return found
+        return self._taken(made)
+
+    def _taken(self, made: MapResult) -> MapResult:
+        """The constructed map, with what was done before it is handed back."""
         self._rungs.append(Rung(CONSTRUCTED, made.added, made.injective, made.stages[-1].seconds))
         return made
 
-    def _between(self, first: MapResult, flat: IntArray, budget: int, rounds: int) -> MapResult | None:
+    def _between(self, first: MapResult, budget: int, rounds: int) -> MapResult | None:
         """Split the edges that a diagnosis names, then others around what stays inverted; a map, if one is found."""
         problem = self._problem
-        straight = split_edges(problem.V, problem.F, flat)
+        straight = split_edges(problem.V, problem.F, self._flat)
         named = refine_problem(refined_problem(problem, straight))
         if named.diagnosis.forbids_injective:
             return None
@@ -164,8 +181,21 @@ class _Ladder:
             result = self._searched(AROUND, refined, finer.extend(result.uv), budget)
         return result if result.injective else None
 
-    def _searched(self, name: str, refined: Refined | None, start: ArrayLike | None, budget: int) -> MapResult:
+    def _searched(
+        self, name: str, refined: Refined | None, start: ArrayLike | None, budget: int, *, shortly: bool = False
+    ) -> MapResult:
         """Search for a map of the mesh as given, or of a finer one, which then is thinned out.
+
+        Parameters
+        ----------
+        name : str
+            Of the rung.
+        refined : Refined or None
+        start : (n, 2) array or None
+        budget : int
+            Iterations at most.
+        shortly : bool
+            With the first stages of the strategy only.
 
         Raises
         ------
@@ -174,7 +204,7 @@ class _Ladder:
         """
         began = time.perf_counter()
         problem = self._problem
-        result = self._search(on_refinement(problem, refined), start, budget)
+        result = self._search(on_refinement(problem, refined), start, budget, shortly)
         if refined is not None:
             uv = result.uv
             if result.certificate.bijective:

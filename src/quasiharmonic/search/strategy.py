@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 
 from quasiharmonic.descent import (
     Alternating,
@@ -119,3 +120,10 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
     if not stages or len(stages) < len(given):
         raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
     return stages
+
+
+def soonest(stages: Stages) -> Stages:
+    """The first stages of a strategy: up to the first descent on the mesh itself, and what is quick right after it."""
+    before = list(takewhile(lambda stage: stage.coarse, stages))
+    first, rest = stages[len(before) : len(before) + 1], stages[len(before) + 1 :]
+    return [*before, *first, *takewhile(lambda stage: stage.quick, rest)]
