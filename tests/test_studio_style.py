@@ -1,4 +1,4 @@
-"""The page's colours: contrast as WCAG 2.2 has it, 4.5 : 1 of text (AA), 3 : 1 of what controls and handles are told by."""
+"""The page's colours: contrast as WCAG 2.2 has it, 4.5 : 1 of text (AA), 3 : 1 of what shows controls and handles."""
 
 from __future__ import annotations
 

@@ -51,6 +51,7 @@ class Clock {
     this.latencies = [];
     this.frames = 0;
     this.maps = 0;
+    this.whole = 0; // milliseconds that the last picture took of which all was drawn
   }
 
   move(seq) {
@@ -84,7 +85,6 @@ export function createView(element, options = {}) {
   let waiting = false;
   const stale = new Set(); // panes that the next picture has to draw anew
   let moves = true; // whether all that asks for it moves
-  let takes = 0; // milliseconds for a whole picture
   let followed = 0; // maps since the surface was drawn
   let resting = 0;
 
@@ -110,12 +110,12 @@ export function createView(element, options = {}) {
   }
 
   function draw() {
-    const coarse = moves && stale.size > 0 && painter.software && takes > QUICK;
+    const coarse = moves && stale.size > 0 && painter.software && clock.whole > QUICK;
     const began = performance.now();
     waiting = false;
     paint(coarse);
     if (options.measured || (painter.software && !coarse)) painter.finish();
-    if (!coarse) takes = performance.now() - began;
+    if (!coarse) clock.whole = performance.now() - began;
     clock.drawn(seq);
     clearTimeout(resting);
     if (coarse) resting = setTimeout(rest, REST);
