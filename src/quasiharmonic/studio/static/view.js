@@ -110,7 +110,8 @@ export function createView(element, options = {}) {
   }
 
   function draw() {
-    const coarse = moves && stale.size > 0 && painter.software && clock.whole > QUICK;
+    // What is red is shown with every pixel, in both panes.
+    const coarse = moves && stale.size > 0 && !scene.bad.length && painter.software && clock.whole > QUICK;
     const began = performance.now();
     waiting = false;
     paint(coarse);
@@ -213,7 +214,6 @@ export function createView(element, options = {}) {
     scene.corners = header.corners;
     scene.numbers = header.numbers;
     scene.pins = header.pins;
-    const red = scene.bad.length > 0;
     if (arrays.places) {
       scene.places = arrays.places;
       scene.bad = arrays.bad;
@@ -231,8 +231,7 @@ export function createView(element, options = {}) {
     if (seq < 0 || header.fit) redraw();
     else {
       redraw("plane");
-      // What is red, or has been, is so in both panes of every picture.
-      if (++followed >= SURFACE_EVERY || red || scene.bad.length) redraw("space");
+      if (++followed >= SURFACE_EVERY) redraw("space");
     }
   }
 
