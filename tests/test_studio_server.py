@@ -213,9 +213,10 @@ def test_so_many_pages_and_no_more(running, monkeypatch):
     with running.page() as page:
         hear(page, "hello")
         time.sleep(0.2)
-        with pytest.raises(InvalidStatus) as refused, running.page():
-            pass
-        assert refused.value.response.status_code == 503
+        with running.page() as one_more, pytest.raises(ConnectionClosed) as refused:
+            hear(one_more, "hello")
+        assert refused.value.rcvd.code == served.TRY_LATER
+        assert refused.value.rcvd.reason == "1 pages are open"
 
 
 def test_the_view_is_to_be_had_as_one_module():

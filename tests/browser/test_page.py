@@ -112,6 +112,36 @@ def test_the_map_follows_the_hand_without_a_flip_in_any_frame(address, opened, s
     assert len({one.tobytes() for one in uv}) == len(uv)
 
 
+def grains(page):
+    """Pixels of the canvas of triangles, and of the one above it, in width."""
+    return page.evaluate("Array.from(document.querySelectorAll('#view canvas'), canvas => canvas.width)")
+
+
+@pytest.mark.parametrize("milliseconds", [1000, 1])
+def test_pictures_are_coarser_only_while_the_hand_moves_and_drawing_is_slow(address, opened, settled, milliseconds):
+    page = opened(address)
+    page.evaluate(f"Object.defineProperty(studio.view.clock, 'whole', {{ get: () => {milliseconds}, set() {{}} }})")
+    whole = grains(page)
+    assert whole[0] == whole[1]
+    x, y = point_of(page, corner(page, 2))
+    page.mouse.move(x, y)
+    page.mouse.down()
+    seen = []
+    for k in range(12):
+        page.mouse.move(x - 2 * k, y + k)
+        until(page, "!studio.view.hands.inFlight && !studio.view.hands.next")
+        page.evaluate("new Promise(drawn => requestAnimationFrame(drawn))")
+        seen.append(grains(page))
+    assert (min(seen)[0] < whole[0] / 2) == (milliseconds > 100)
+    # What is red is not coarse at any time.
+    red = "(view => view.show(view.scene.places, new Uint32Array([0])))(studio.view)"
+    picture = "new Promise(drawn => requestAnimationFrame(() => drawn(document.querySelector('#view canvas').width)))"
+    assert page.evaluate(f"{red}, {picture}") == whole[0]
+    page.mouse.up()
+    settled(page)
+    assert grains(page) == whole
+
+
 def test_pin_undo_and_redo(address, opened, settled):
     page = opened(address)
     before = page.evaluate("Array.from(studio.view.scene.places)")

@@ -26,6 +26,8 @@ from quasiharmonic.studio.protocol import ProtocolError, decode, encode
 HOST = "127.0.0.1"
 #: Bytes of a file dropped on a page, and pages at a time.
 MOST_BYTES, MOST_PAGES = 128 << 20, 8
+#: How a socket is closed while there are so many.
+TRY_LATER = 1013
 # Nothing is loaded from elsewhere, nothing may frame the page, and the address with its token is told to nobody.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -105,8 +107,6 @@ class Studio:
             origins = request.headers.get_all("Origin")
             if origins != [f"http://{hosts[0]}"]:
                 return _answer(HTTPStatus.FORBIDDEN, "the page of another site must not speak to this one")
-            if len(self._pages) >= MOST_PAGES:
-                return _answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_PAGES} pages are open: close one")
             return None
         asset = assets().get(name or "index.html")
         if asset is None:
@@ -115,6 +115,10 @@ class Studio:
 
     async def _page(self, connection: ServerConnection) -> None:
         """Be between a page and its process until one of them goes."""
+        if len(self._pages) >= MOST_PAGES:
+            # Said here and not in the answer to the request, which a browser shows to no script.
+            await connection.close(TRY_LATER, f"{MOST_PAGES} pages are open")
+            return
 
         async def tell(message: bytes) -> None:
             await connection.send(message)

@@ -86,7 +86,7 @@ export class Hands {
     if (event.shiftKey || event.buttons === 4) this.space().shiftBy(dx, dy);
     else this.space().turnBy(dx, dy);
     this.last = point;
-    this.redraw();
+    this.redraw("space");
   }
 
   surfaceUp(event, point) {
@@ -99,7 +99,7 @@ export class Hands {
 
   surfaceWheel(event) {
     this.space()?.zoomBy(ZOOM ** -event.deltaY);
-    this.redraw();
+    this.redraw("space");
   }
 
   surfaceKey(event) {
@@ -142,7 +142,7 @@ export class Hands {
       this.#moveTo(this.plane.placeOf(point));
     } else if (event.buttons && this.last) {
       this.plane.shiftBy(point[0] - this.last[0], point[1] - this.last[1]);
-      this.redraw();
+      this.redraw("plane");
     } else {
       const hovered = this.tool === "move" ? this.handleAt(point) : -1;
       if (hovered !== this.scene.hovered) {
@@ -163,7 +163,7 @@ export class Hands {
 
   mapWheel(event, point) {
     this.plane.zoomBy(ZOOM ** -event.deltaY, point);
-    this.redraw();
+    this.redraw("plane");
   }
 
   mapKey(event) {

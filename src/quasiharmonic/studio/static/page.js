@@ -31,6 +31,7 @@ class Page {
     this.socket.onclose = (event) => {
       this.view.hands.forget();
       if (event.code === 1009) this.panel.note("That file is larger than what is taken. The page begins anew.");
+      else if (event.code === 1013) this.panel.refused(event.reason);
       else if (event.code === 1006) this.panel.disconnected();
       if (event.code === 1009 || event.code === 1011) setTimeout(() => this.connect(), 1500);
     };
@@ -38,7 +39,7 @@ class Page {
 
   send(message, arrays) {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(encodeFrame(message, arrays));
-    else this.panel.disconnected();
+    else if (document.body.dataset.state !== "gone") this.panel.disconnected();
   }
 
   receive(frame) {

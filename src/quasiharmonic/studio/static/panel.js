@@ -160,7 +160,16 @@ export class Panel {
   }
 
   disconnected() {
+    this.#gone("Cut off", "The server has ended. Reload the page once it runs again.");
+  }
+
+  /** The server runs, and has no place for this page. */
+  refused(why) {
+    this.#gone("Not opened", `${why}, and no more are taken. Close one, then reload this one.`);
+  }
+
+  #gone(title, words) {
     document.body.dataset.state = "gone";
-    this.#verdict("bad", "✗", "Cut off", "The server has ended, or has too many pages open. Reload the page once it runs again, or has one less.");
+    this.#verdict("bad", "✗", title, words);
   }
 }

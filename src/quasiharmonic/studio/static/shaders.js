@@ -93,7 +93,9 @@ function drawsInSoftware() {
 export class Painter {
   constructor(canvas) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", { antialias: !drawsInSoftware(), preserveDrawingBuffer: false, alpha: true });
+    /** Whether the processor draws; then a pane that is not drawn anew stays as it is. */
+    this.software = drawsInSoftware();
+    this.gl = canvas.getContext("webgl2", { antialias: !this.software, preserveDrawingBuffer: this.software, alpha: true });
     if (!this.gl) throw new Error("this browser has no WebGL 2, which draws the surface");
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => this.#build());
@@ -160,7 +162,8 @@ export class Painter {
     gl.viewport(box.x, box.y, box.width, box.height);
     gl.scissor(box.x, box.y, box.width, box.height);
     gl.enable(gl.SCISSOR_TEST);
-    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.useProgram(this.program);
     gl.uniform1i(this.at.flat_pane, look.flat ? 1 : 0);
     gl.uniformMatrix4fv(this.at.turn, false, look.turn);
@@ -191,7 +194,7 @@ export class Painter {
     this.#draw(gl.TRIANGLES, this.buffers.bad, this.surface.bad.length * 3);
   }
 
-  /** Begin a picture of the canvas's own size. */
+  /** Draw nothing. */
   clear() {
     const gl = this.gl;
     gl.disable(gl.SCISSOR_TEST);

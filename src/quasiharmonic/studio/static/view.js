@@ -12,6 +12,12 @@ import { SpaceView } from "./space.js";
 
 const STACKED_BELOW = 640; // CSS pixels of width
 const NOTHING = { vertices: [], edges: [], triangles: [] };
+// Where the processor draws: what moves is drawn with so many times fewer pixels a side if all of it takes longer than this,
+// the surface with every so many-th map, and all of it once more when nothing has moved for so long. Milliseconds.
+const COARSER = 3;
+const QUICK = 12;
+const SURFACE_EVERY = 4;
+const REST = 150;
 
 /** What is drawn, as the last frames have told it; see `drawOverlay`. */
 class Scene {
@@ -45,6 +51,7 @@ class Clock {
     this.latencies = [];
     this.frames = 0;
     this.maps = 0;
+    this.whole = 0; // milliseconds that the last picture took of which all was drawn
   }
 
   move(seq) {
@@ -76,6 +83,10 @@ export function createView(element, options = {}) {
   let scale = 1;
   let seq = -1;
   let waiting = false;
+  const stale = new Set(); // panes that the next picture has to draw anew
+  let moves = true; // whether all that asks for it moves
+  let followed = 0; // maps since the surface was drawn
+  let resting = 0;
 
   element.classList.add("qhm-view");
   const canvas = document.createElement("canvas");
@@ -89,23 +100,40 @@ export function createView(element, options = {}) {
   const painter = new Painter(canvas);
   const context = over.getContext("2d");
 
-  function redraw() {
+  /** Ask for a picture: a whole one, or of one pane, "space" or "plane", in which something moves. */
+  function redraw(moving = null) {
+    for (const pane of moving ? [moving] : ["space", "plane"]) stale.add(pane);
+    moves &&= moving !== null;
     if (waiting) return;
     waiting = true;
     requestAnimationFrame(draw);
   }
 
   function draw() {
+    // What is red is shown with every pixel, in both panes.
+    const coarse = moves && stale.size > 0 && !scene.bad.length && painter.software && clock.whole > QUICK;
+    const began = performance.now();
     waiting = false;
-    paint();
-    if (options.measured) painter.finish();
+    paint(coarse);
+    if (options.measured || (painter.software && !coarse)) painter.finish();
+    if (!coarse) clock.whole = performance.now() - began;
     clock.drawn(seq);
+    clearTimeout(resting);
+    if (coarse) resting = setTimeout(rest, REST);
   }
 
-  function paint() {
-    painter.clear();
+  function rest() {
+    // A hand that waits for a map is not at rest.
+    if (hands.inFlight) resting = setTimeout(rest, REST);
+    else redraw();
+  }
+
+  /** Draw what is stale, coarsely, or all of it. */
+  function paint(coarse = false) {
+    const ratio = density() / (coarse ? COARSER : 1);
+    const resized = fill(canvas, ratio);
+    const every = resized || !coarse;
     if (space && scene.places) {
-      const ratio = canvas.width / scene.size.width;
       const within = (box) => ({
         x: Math.round(box.x * ratio),
         y: Math.round((scene.size.height - box.y - box.height) * ratio),
@@ -113,22 +141,34 @@ export function createView(element, options = {}) {
         height: Math.round(box.height * ratio),
       });
       const shared = { ...look, scale, squares: look.squares / plane.extent, toward: space.axes[2], turn: space.matrix };
-      painter.pane(within(space.box), { ...shared, flat: false, window: plane.window });
-      painter.pane(within(plane.box), { ...shared, flat: true, window: plane.window });
-    }
-    const density = over.width / scene.size.width;
-    context.setTransform(density, 0, 0, density, 0, 0);
+      for (const [name, pane] of [["space", space], ["plane", plane]]) {
+        if (!every && !stale.has(name)) continue;
+        painter.pane(within(pane.box), { ...shared, flat: pane === plane, window: plane.window });
+      }
+      if (every || stale.has("space")) followed = 0;
+    } else painter.clear();
+    stale.clear();
+    moves = true;
+    fill(over, density());
+    context.setTransform(density(), 0, 0, density(), 0, 0);
     if (space) drawOverlay(context, scene, space, plane);
+  }
+
+  function density() {
+    return Math.min(window.devicePixelRatio || 1, 2);
+  }
+
+  /** Give a canvas so many pixels to a CSS pixel; whether that is new, which empties it. */
+  function fill(some, ratio) {
+    const [width, height] = [scene.size.width, scene.size.height].map((length) => Math.max(1, Math.round(length * ratio)));
+    if (some.width === width && some.height === height) return false;
+    Object.assign(some, { width, height });
+    return true;
   }
 
   function resize() {
     const width = Math.max(1, element.clientWidth);
     const height = Math.max(1, element.clientHeight);
-    const density = Math.min(window.devicePixelRatio || 1, 2);
-    for (const each of [canvas, over]) {
-      each.width = Math.round(width * density);
-      each.height = Math.round(height * density);
-    }
     scene.size = { width, height };
     const stacked = width < STACKED_BELOW;
     const half = stacked ? { width, height: height / 2 } : { width: width / 2, height };
@@ -188,7 +228,11 @@ export function createView(element, options = {}) {
     }
     seq = header.seq;
     hands.answered(header.seq, header.after);
-    redraw();
+    if (seq < 0 || header.fit) redraw();
+    else {
+      redraw("plane");
+      if (++followed >= SURFACE_EVERY) redraw("space");
+    }
   }
 
   const observer = new ResizeObserver(resize);
@@ -236,7 +280,8 @@ export function createView(element, options = {}) {
       scene.bad = bad;
       painter.setPlaces(places);
       painter.setBad(bad);
-      redraw();
+      redraw("plane");
+      redraw("space");
     },
 
     /** A canvas with the picture as it is now, on white. */
@@ -253,6 +298,7 @@ export function createView(element, options = {}) {
     },
 
     dispose() {
+      clearTimeout(resting);
       observer.disconnect();
       painter.dispose();
       element.replaceChildren();

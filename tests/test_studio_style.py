@@ -1,0 +1,78 @@
+"""The page's colours: contrast as WCAG 2.2 has it, 4.5 : 1 of text (AA), 3 : 1 of what shows controls and handles."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from quasiharmonic.studio.assets import assets
+
+TEXT, SHAPE = 4.5, 3.0
+
+
+def declarations():
+    """(selector, property) -> value of every rule of the style sheet."""
+    css = re.sub(r"/\*.*?\*/", "", assets()["style.css"].content.decode(), flags=re.DOTALL)
+    return {
+        (" ".join(selectors.split()), name.strip()): value.strip()
+        for selectors, body in re.findall(r"([^{}]+)\{([^{}]*)\}", css)
+        for name, _, value in (line.partition(":") for line in body.split(";") if ":" in line)
+    }
+
+
+SHEET = declarations()
+
+
+def colour(value):
+    """The one colour in a value, as six hexadecimal digits; None where there is none, or several."""
+    value = re.sub(r"var\((--\w+)\)", lambda found: SHEET[":root", found[1]], value)
+    found = re.findall(r"#([0-9a-f]{6})\b", value)
+    return found[0] if len(found) == 1 else None
+
+
+def luminance(digits):
+    parts = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one, other):
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+INK, PAPER, GROUND = (colour(SHEET[":root", name]) for name in ("--ink", "--paper", "--ground"))
+
+
+def texts():
+    """Every pair of a text's colour and its ground; of a rule without a ground of its own, both that are there."""
+    for selector in dict.fromkeys(selector for selector, _ in SHEET):
+        own = colour(SHEET.get((selector, "color"), ""))
+        ground = colour(SHEET.get((selector, "background"), ""))
+        for behind in [ground] if ground else [PAPER, GROUND] if own else []:
+            yield pytest.param(own or INK, behind, id=selector)
+
+
+@pytest.mark.parametrize(("text", "ground"), list(texts()))
+def test_text_is_read_easily(text, ground):
+    assert contrast(text, ground) >= TEXT
+
+
+def test_edges_of_controls_and_the_focus_are_seen():
+    edge, focus = colour(SHEET[":root", "--edge"]), colour(SHEET[":focus-visible", "outline"])
+    for one in (edge, focus):
+        assert min(contrast(one, PAPER), contrast(one, GROUND)) >= SHAPE
+    assert contrast(colour(SHEET["header :focus-visible", "outline-color"]), INK) >= SHAPE
+
+
+def test_what_is_drawn_on_the_map_is_seen():
+    drawn = dict(re.findall(r'const (\w+) = "#([0-9a-f]{6})"', assets()["overlay.js"].content.decode()))
+    assert set(drawn) == {"INK", "RED", "HANDLE", "PIN", "PAPER"}
+    assert all(contrast(drawn[name], drawn["PAPER"]) >= SHAPE for name in set(drawn) - {"PAPER"})
+
+
+def test_contrast_as_others_compute_it():
+    assert contrast("ffffff", "000000") == pytest.approx(21)
+    assert contrast("767676", "ffffff") == pytest.approx(4.54, abs=0.005)
+    assert contrast("777777", "ffffff") == pytest.approx(4.48, abs=0.005)
