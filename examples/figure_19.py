@@ -17,6 +17,7 @@ import numpy as np
 
 from common import flips, panels, run, save, show
 from quasiharmonic import solve
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.search.harmonising import ENERGIES, harmonise_map
 from sculptures import seven
@@ -32,7 +33,7 @@ NAMES = {
 
 def main(output: Path, size: int = 40) -> dict[str, Any]:
     problem = seven(size)["rabbit onto R"]
-    first = solve(problem).uv
+    first = solve(problem, strategy=[VectorAdam(iterations=600)]).uv
     w = first @ (1, 1j)
     area = float(signed_areas(problem.F, w).sum())
     measures = {

@@ -23,6 +23,7 @@ from scipy.optimize import minimize
 from common import flips, panels, run, save, show
 from quasiharmonic import Problem, solve
 from quasiharmonic.arrays import FloatArray
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.search.harmonising import ENERGIES, harmonise_map
 from sculptures import seven
@@ -51,7 +52,7 @@ def main(output: Path, size: int = 32) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for j, name in enumerate(COLUMNS):
         problem = seven(size)[name]
-        first = solve(problem).uv
+        first = solve(problem, strategy=[VectorAdam(iterations=600)]).uv
         area = float(signed_areas(problem.F, first @ (1, 1j)).sum())
         row = numbers[name] = {"triangles": len(problem.F)}
         for i, (energy_name, title) in enumerate(NAMES.items()):

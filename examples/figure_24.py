@@ -32,7 +32,7 @@ from matplotlib.colors import LogNorm
 from common import INK, RED, colorbar, first_map, flips, mips, panels, run, save
 from quasiharmonic import Problem, distortion, solve
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import Untangling
+from quasiharmonic.descent import Untangling, VectorAdam
 from quasiharmonic.energy.energies import conformal_area_blend
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.search.harmonising import harmonise_map
@@ -43,7 +43,7 @@ COLUMNS = "bust onto A", "rabbit onto R", "gargoyle onto H"
 
 def maps_of(problem: Problem) -> dict[str, FloatArray]:
     """What is compared."""
-    first = solve(problem).uv
+    first = solve(problem, strategy=[VectorAdam(iterations=600)]).uv
     return {
         "θ = 1: areas": polish_map(problem.domain, first, energy=conformal_area_blend(1.0)).uv,
         "(σ₁σ₂ − 1)² and V₃": harmonise_map(problem.domain, first, energy="area").uv,
