@@ -284,6 +284,12 @@ def test_arrays_of_other_libraries(wrap):
         (lambda: flatten(SimpleNamespace(points=V, cells=[block("tetra", F)])), "cells of the kind 'tetra'"),
         (lambda: flatten(SimpleNamespace(points=V, cells=padded(F), celltypes=[10] * len(F))), "VTK's kind 10"),
         (lambda: flatten(SimpleNamespace(points=V, faces=padded(F + 99))), "the faces refers? to vert"),
+        (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if it counts from 1, hand over F - 1"),
+        (
+            lambda: quasiharmonic.injective_map(V, F, np.ones(len(V), dtype=bool), MAP.uv),
+            r"fixed must hold integer indices, not bool: hand over numpy\.flatnonzero\(fixed\)",
+        ),
+        (lambda: quasiharmonic.solve(MAP), "solve takes a Problem, not a MapResult"),
         (lambda: targets.boundary_to(V, F, 3), 'outline must be contours .* "letter:R", not 3'),
         (lambda: targets.boundary_to(V, F, "letter"), "'letter' is no outline that is known"),
         (lambda: targets.boundary_to(V, F, [["a", "b"]] * 3), "must hold real numbers, not <U1"),

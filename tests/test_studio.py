@@ -17,6 +17,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.search.solving import quasi_harmonic_map
 from quasiharmonic.studio.following import Follower
 from quasiharmonic.studio.grips import grip
+from quasiharmonic.studio.laying import first_moment
 from quasiharmonic.studio.outlines import outline_by_hand, outline_drawn, outline_named
 from quasiharmonic.studio.protocol import ProtocolError, decode, encode
 from quasiharmonic.studio.sheets import MOST_TRIANGLES, sheet_of
@@ -241,6 +242,9 @@ def test_holes_closed_surfaces_and_planes_are_taken():
     star = sheet_of(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj")
     assert star.flags == ("--cut",)
     assert len(star.island.F) == 12 * 64
+    first = first_moment(star)
+    assert first.result.certificate.bijective
+    assert first.recipe.command() == "qhm flatten star.obj --cut -o flat.obj"
 
 
 @pytest.mark.parametrize(

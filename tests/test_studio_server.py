@@ -101,6 +101,8 @@ def test_files_are_served_to_those_with_the_token_and_to_nobody_else(running):
     assert "Server" not in headers
     for name in assets():
         assert running.get(f"/{token}/{name}")[0] == 200
+    status, headers, _ = running.get(f"/{token}")
+    assert (status, headers["Location"]) == (308, f"/{token}/")
     for path in ("/", "/index.html", f"/{token[:-1]}/", f"/{token}x/", f"/x/{token}/", f"//{token}/"):
         status, _, content = running.get(path)
         assert status == 403

@@ -62,7 +62,8 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
     if array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must hold integer indices, not {_held(values, array)}")
+        advice = f": hand over numpy.flatnonzero({name})" if array.dtype.kind == "b" and array.ndim == 1 else ""
+        raise ValueError(f"{name} must hold integer indices, not {_held(values, array)}{advice}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
     made = np.array if copy else np.asarray
@@ -192,7 +193,9 @@ def check_range(
     if indices.size and (indices.min() < least or indices.max() >= n):
         bad = np.unique(indices[(indices < least) | (indices >= n)])
         there = f"only {many} 0 … {n - 1}" if n else f"no {many}"
-        raise ValueError(f"{name} refers to {named(one, many, bad)}, but there are {there}")
+        from_one = name == "F" and indices.min() == 1 and indices.max() == n
+        advice = "; if it counts from 1, hand over F - 1" if from_one else ""
+        raise ValueError(f"{name} refers to {named(one, many, bad)}, but there are {there}{advice}")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
@@ -218,6 +221,8 @@ def _withheld(name: str, values: Any, error: Exception) -> str:
     """Why an array of another library does not give its numbers away, and what to do."""
     if getattr(values, "requires_grad", False):
         return f"that requires grad, which would be lost here: hand over {name}.detach(), or see quasiharmonic.torch"
+    if "Tracer" in type(values).__name__:
+        return "that JAX traces, of which there are no numbers yet: see quasiharmonic.jax"
     device = getattr(values, "device", "cpu")
     if not str(device).startswith("cpu"):
         return f"on {device}: hand over {name}.{'cpu' if hasattr(values, 'cpu') else 'get'}()"

@@ -31,5 +31,5 @@ def test_torch():
 def test_jax():
     jax = pytest.importorskip("jax")
     assert injective_map(*map(jax.numpy.asarray, (V, F, LOOP, BEAN))).injective
-    with pytest.raises(ValueError, match="V is a DynamicJaxprTracer whose numbers NumPy cannot have"):
+    with pytest.raises(ValueError, match=r"V is a DynamicJaxprTracer that JAX traces.*quasiharmonic\.jax"):
         jax.jit(lambda V: distortion(V, F, MAP).sigma1)(jax.numpy.asarray(V))

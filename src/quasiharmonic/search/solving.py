@@ -13,7 +13,15 @@ from typing import get_args
 
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, check_callback, check_choice, map_array, whole_number
+from quasiharmonic.arrays import (
+    ComplexArray,
+    FloatArray,
+    check_callback,
+    check_choice,
+    kind_of,
+    map_array,
+    whole_number,
+)
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
@@ -68,6 +76,8 @@ def solve(
     whole_number("record", record, least=0)
     check_callback(callback)
     lower = None if polish is None else energy_named(polish)
+    if not isinstance(problem, Problem):
+        raise TypeError(f"solve takes a Problem, not {kind_of(problem)}: injective_map takes the arrays of one")
     first = None if start is None else _first_map(problem, start)
     if slide is not False:
         if lower is None:

@@ -26,7 +26,9 @@ _FIRST_OUTLINE = "rect:1x1"
 
 
 def first_moment(sheet: Sheet) -> Moment:
-    """The problem that a surface comes with: its boundary where its own map has it, on a square, or, with holes, free.
+    """The problem that a surface comes with: its boundary where its own map has it, or else on a square.
+
+    With holes, or cut open, the boundary is free.
 
     Raises
     ------
@@ -36,7 +38,8 @@ def first_moment(sheet: Sheet) -> Moment:
     island = sheet.island
     if np.isnan(island.uv).any():
         loops = boundary_loops(island.F, len(island.V))
-        if len(loops) > 1:
+        # A cut turns at its ends within one triangle, which a straight side would flatten.
+        if len(loops) > 1 or "--cut" in sheet.flags:
             V, F, fixed = island.V, island.F, np.concatenate(loops)
             return freed(Problem(V, F, fixed, np.zeros((len(fixed), 2))), Recipe(sheet))
         return laid(sheet, outline_named(_FIRST_OUTLINE))

@@ -100,9 +100,12 @@ class Studio:
         if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
             return _answer(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
         path = urlsplit(request.path).path
-        token, _, name = path.removeprefix("/").partition("/")
+        token, slash, name = path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.token.encode()):
             return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of it")
+        if not slash:
+            # What the page asks for lies beside it, behind the slash that was left out.
+            return _answer(HTTPStatus.PERMANENT_REDIRECT, "the address ends with a slash", location=f"/{self.token}/")
         if name == "socket":
             origins = request.headers.get_all("Origin")
             if origins != [f"http://{hosts[0]}"]:
@@ -158,9 +161,13 @@ class Studio:
             page.end()
 
 
-def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; charset=utf-8") -> Response:
+def _answer(
+    status: HTTPStatus, body: str | bytes, kind: str = "text/plain; charset=utf-8", *, location: str | None = None
+) -> Response:
     content = body.encode() + b"\n" if isinstance(body, str) else body
     headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
+    if location is not None:
+        headers["Location"] = location
     return Response(status.value, status.phrase, headers, content)
 
 
