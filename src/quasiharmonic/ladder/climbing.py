@@ -35,7 +35,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Rung, Stage, Status, Step
 from quasiharmonic.search.solving import solve
 from quasiharmonic.search.stages import Stages
-from quasiharmonic.search.strategy import soonest, stages_of
+from quasiharmonic.search.strategy import soonest, stages_of, without_restarts
 from quasiharmonic.targets.chords import flattened_edges
 
 AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
@@ -44,6 +44,8 @@ AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
     "edges split around inverted triangles",
     "constructed",
 )
+_Choice = Callable[[Stages], Stages]
+_Search = Callable[[Problem, ArrayLike | None, int, _Choice], MapResult]
 # Iterations of a search while a construction is there to be taken, and how often edges are split around what such a
 # search leaves inverted; the latter where there is no construction.
 _FEW_ITERATIONS, _FEW_ROUNDS, _ROUNDS = 600, 1, 3
@@ -89,10 +91,10 @@ def climb(
             raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
         problem = moved_onto(slide, problem)
 
-    def search(on: Problem, first: ArrayLike | None, budget: int, shortly: bool) -> MapResult:
+    def search(on: Problem, first: ArrayLike | None, budget: int, some: _Choice) -> MapResult:
         return solve(
             on,
-            strategy=soonest(stages_of(strategy, on)) if shortly else strategy,
+            strategy=some(stages_of(strategy, on)),
             start=first,
             max_iterations=min(budget, max_iterations),
             linear_solver=linear_solver,
@@ -115,9 +117,11 @@ def on_refinement(problem: Problem, refined: Refined | None) -> Problem:
 class _Ladder:
     """A problem, how it is searched, and what was tried so far."""
 
-    def __init__(self, problem: Problem, search: Callable[[Problem, ArrayLike | None, int, bool], MapResult]) -> None:
+    def __init__(self, problem: Problem, search: _Search) -> None:
         self._problem = problem
         self._search = search
+        # Of a strategy's stages those that are run.
+        self._some: _Choice = list
         # Inner edges that a straight side of the target flattens.
         self._flat = flattened_edges(problem.F, problem.fixed, problem.target)
         self._rungs: list[Rung] = []
@@ -141,10 +145,12 @@ class _Ladder:
             first = self._searched(AS_GIVEN, None, start, few if len(self._flat) else budget)
             # Where a finer mesh is no better, what is told is about the one given.
             return first if first.injective else self._between(first, budget, _ROUNDS) or first
-        first = self._searched(AS_GIVEN, None, start, budget, shortly=True)
+        self._some = soonest
+        first = self._searched(AS_GIVEN, None, start, budget)
         if first.injective:
             return first
         made = self._constructed(first)
+        self._some = without_restarts if made.injective else list
         if not made.added and made.injective:
             return self._taken(made)
         if first.status is not Status.IMPOSSIBLE:
@@ -181,21 +187,8 @@ class _Ladder:
             result = self._searched(AROUND, refined, finer.extend(result.uv), budget)
         return result if result.injective else None
 
-    def _searched(
-        self, name: str, refined: Refined | None, start: ArrayLike | None, budget: int, *, shortly: bool = False
-    ) -> MapResult:
+    def _searched(self, name: str, refined: Refined | None, start: ArrayLike | None, budget: int) -> MapResult:
         """Search for a map of the mesh as given, or of a finer one, which then is thinned out.
-
-        Parameters
-        ----------
-        name : str
-            Of the rung.
-        refined : Refined or None
-        start : (n, 2) array or None
-        budget : int
-            Iterations at most.
-        shortly : bool
-            With the first stages of the strategy only.
 
         Raises
         ------
@@ -204,7 +197,7 @@ class _Ladder:
         """
         began = time.perf_counter()
         problem = self._problem
-        result = self._search(on_refinement(problem, refined), start, budget, shortly)
+        result = self._search(on_refinement(problem, refined), start, budget, self._some)
         if refined is not None:
             uv = result.uv
             if result.certificate.bijective:

@@ -127,3 +127,8 @@ def soonest(stages: Stages) -> Stages:
     before = list(takewhile(lambda stage: stage.coarse, stages))
     first, rest = stages[len(before) : len(before) + 1], stages[len(before) + 1 :]
     return [*before, *first, *takewhile(lambda stage: stage.quick, rest)]
+
+
+def without_restarts(stages: Stages) -> Stages:
+    """A strategy without the stages that start again at random, whose failing tries no budget of iterations counts."""
+    return [stage for stage in stages if not isinstance(stage, RandomRestarts)] or stages
