@@ -193,7 +193,11 @@ def test_vertices_of_no_triangle_are_not_looked_at():
         (np.zeros((2, 4), int), CORNERS, r"F must have shape \(f, 3\), triangles only, not \(2, 4\)"),
         (SQUARE.astype(float), CORNERS, "F must hold integer indices, not float64"),
         (SQUARE.astype(bool), CORNERS, "F must hold integer indices, not bool"),
-        (SQUARE + 1, CORNERS, r"F refers to vertex 4, but there are only vertices 0 … 3$"),
+        (
+            SQUARE + 1,
+            CORNERS,
+            r"F refers to vertex 4, but there are only vertices 0 … 3; if it counts from 1, hand over F - 1$",
+        ),
         (np.arange(-9, 0).reshape(3, 3), CORNERS, r"vertices -9, -8, -7, -6, -5, … \(9 in all\)"),
         (SQUARE, CORNERS[:, :1], r"uv must have shape \(n, 2\), not \(4, 1\)"),
         (SQUARE, np.zeros((4, 3)), r"uv must have shape \(n, 2\), not \(4, 3\)"),

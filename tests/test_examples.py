@@ -362,7 +362,7 @@ def test_figure_02(example):
 
 
 def test_figure_19(example):
-    numbers = example("figure_19", size=24)
+    numbers = example("figure_19")
     assert all(row["flips"] == 0 for row in numbers.values())
     for name in ("ARAP", "mass and springs", "area-preserving", "MIPS", "symmetric Dirichlet"):
         assert min(row[name] for row in numbers.values()) > 0.95 * numbers[name][name]
@@ -380,7 +380,7 @@ def test_figure_21(example):
 
 
 def test_figure_23(example):
-    numbers = example("figure_23", size=20)
+    numbers = example("figure_23")
     for row in numbers.values():
         for name in ("ARAP", "springs", "areas"):
             assert row[name]["and V₃"]["flips"] == 0

@@ -205,12 +205,12 @@ def test_positions_from_a_table(plate, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0,1", "line 1 is not"),
-        ("0,1,2\nzero,1,2", "line 2 is not"),
+        ("0,1", "not 3 numbers: '0,1' at line 1"),
+        ("0,1,2\nzero,1,2", "'zero' is not a finite number at line 2"),
         ("81,0,0", "from 0 to 80"),
-        ("-1,0,0", "line 1 is not"),
-        ("0,nan,0", "line 1 is not"),
-        ("0,0,0,0", "line 1 is not"),
+        ("-1,0,0", "-1 is not a vertex from 0 to 80 at line 1"),
+        ("0,nan,0", "'nan' is not a finite number at line 1"),
+        ("0,0,0,0", "not 3 numbers"),
         ("", "moves no vertex"),
         ("3,0,0\n4,0,0\n3,1,0", "to.csv: names vertex 3 a second time at line 3"),
     ],
@@ -226,7 +226,7 @@ def test_tables_that_cannot_be_read(plate, tmp_path, capsys, text, message):
 def test_a_table_that_is_not_there(plate, tmp_path, capsys):
     out, table = tmp_path / "out.vtu", tmp_path / "none.csv"
     assert main(["morph", str(plate("grid.vtu")), "-o", str(out), "--positions", str(table)]) == 2
-    assert capsys.readouterr().err.strip() == f"qhm morph: {table}: cannot be read: No such file or directory"
+    assert capsys.readouterr().err.strip() == f"qhm morph: {table}: there is no such file"
 
 
 def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from importlib import import_module
 
 import numpy as np
@@ -35,7 +34,6 @@ BACKENDS = {
 QDLDL_UP_TO = 60_000
 
 
-@cache
 def _backend(name: str) -> type[LinearSolver]:
     module, attribute = BACKENDS[name]
     backend: type[LinearSolver] = getattr(import_module(f".{module}", __name__), attribute)
