@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.textual import number, read_text, shown
+from quasiharmonic.io.textual import is_number, number, read_text, shown
 
 
 def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, list[float]]]:
@@ -39,7 +39,7 @@ def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, lis
             words = [word.strip().replace(b",", b".") for word in text.split(b";")]
         else:
             words = text.replace(b",", b" ").split()
-        if at == 1 and not any(_is_number(word) for word in words):
+        if at == 1 and not any(is_number(word) for word in words):
             continue
         if len(words) != columns:
             plural = "number" if columns == 1 else "numbers"
@@ -49,11 +49,3 @@ def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, lis
         except ValueError as error:
             raise MeshFileError(path, str(error), at) from None
     return rows
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        number(word)
-    except ValueError:
-        return False
-    return True

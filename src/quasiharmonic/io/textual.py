@@ -99,6 +99,15 @@ def number(token: bytes) -> float:
     return value
 
 
+def is_number(token: bytes) -> bool:
+    """Whether `number` takes a piece of text."""
+    try:
+        number(token)
+    except ValueError:
+        return False
+    return True
+
+
 def integer(token: bytes) -> int:
     """Turn decimal text into an integer below 10¹⁸; `ValueError` with a clear text for anything else."""
     if len(token) <= 18 and token.isdigit():

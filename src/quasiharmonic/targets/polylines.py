@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.exact.loops import listed
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.textual import number, read_text
+from quasiharmonic.io.textual import is_number, number, read_text
 from quasiharmonic.targets.contours import MOST_POINTS, distinct
 from quasiharmonic.targets.nesting import arranged, collinear
 
@@ -48,7 +48,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
                 loops.append([])
                 starts.append(line)
             continue
-        if line == 1 and not any(map(_is_number, words)):
+        if line == 1 and not any(map(is_number, words)):
             continue
         if len(words) != 2:
             raise MeshFileError(path, f"{len(words)} values in place of two, x and y,", line)
@@ -79,11 +79,3 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     except ValueError as error:
         plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
         raise MeshFileError(path, f"{error} (the {plural} {listed(begins)})") from None
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        number(word)
-    except ValueError:
-        return False
-    return True
