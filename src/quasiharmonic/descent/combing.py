@@ -25,7 +25,7 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
 from quasiharmonic.descent.base import Iterates, VertexDescent
-from quasiharmonic.descent.patches import patch_around
+from quasiharmonic.descent.patches import Patch, patch_around, remapped
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.field.objective import Iterate, Objective
 
@@ -68,24 +68,15 @@ class Combing(VertexDescent):
         """As of `Descent`; a map after every programme that left fewer inverted triangles."""
         problem = objective.problem
         rng = np.random.default_rng(0)
-        w = start.w
-        left = flipped_triangles(problem.F, problem.positions(w))
-        in_vain = 0
-        while left.size and in_vain < self.in_vain:
-            in_vain += 1
+
+        def other(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
             triangle, rings = int(rng.choice(left)), int(rng.choice(_RINGS))
             patch = patch_around(problem, triangle, rings, _MOST_TRIANGLES)
             patch = patch or patch_around(problem, triangle, _RINGS[0], _MOST_NEAR)
-            if patch is None:
-                continue
-            moved = w.copy()
-            moved[patch.vertices] = combed(rng, patch.F, w[patch.vertices], patch.held)
-            now = flipped_triangles(problem.F, problem.positions(moved))
-            if now.size <= left.size:
-                fewer, w, left = now.size < left.size, moved, now
-                if fewer:
-                    in_vain = 0
-                    yield objective.of_map(w)
+            return None if patch is None else (patch, combed(rng, patch.F, w[patch.vertices], patch.held))
+
+        left = flipped_triangles(problem.F, problem.positions(start.w))
+        yield from remapped(objective, start.w, left, other, patience=self.in_vain)
         return True
 
 

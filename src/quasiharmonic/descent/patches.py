@@ -7,8 +7,9 @@ patch that fails is grown.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -46,6 +47,10 @@ class Patch(NamedTuple):
     F: IntArray
     vertices: IntArray
     held: BoolArray
+
+
+#: From a map and its inverted triangles to a patch and another map of it.
+Attempt: TypeAlias = Callable[[ComplexArray, IntArray], tuple[Patch, ComplexArray] | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +106,48 @@ def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patc
     held = np.isin(vertices, problem.fixed)
     held[boundary_edges(renumbered, vertices.size)] = True
     return None if len(F) > most or held.all() else Patch(renumbered, vertices, held)
+
+
+def remapped(
+    objective: Objective, w: ComplexArray, left: IntArray, other: Attempt, *, patience: int, most: int | None = None
+) -> Iterator[Iterate]:
+    """Take other maps of patches, one after the other, as long as they leave no more inverted triangles.
+
+    Parameters
+    ----------
+    objective : Objective
+    w : (n,) complex128
+        The map to begin with.
+    left : (k,) int64
+        Its inverted triangles.
+    other : callable
+        From a map and what is left inverted to a patch and another map (v,) complex128 of it, or None.
+    patience : int
+        So many in a row may right no triangle.
+    most : int, optional
+        Inverted triangles at most for it to be worth a try.
+
+    Yields
+    ------
+    Iterate
+        A map after every patch that left fewer inverted triangles.
+    """
+    problem = objective.problem
+    in_vain = 0
+    while left.size and (most is None or left.size <= most) and in_vain < patience:
+        in_vain += 1
+        found = other(w, left)
+        if found is None:
+            continue
+        patch, there = found
+        moved = w.copy()
+        moved[patch.vertices] = there
+        now = flipped_triangles(problem.F, problem.positions(moved))
+        if now.size <= left.size:
+            fewer, w, left = now.size < left.size, moved, now
+            if fewer:
+                in_vain = 0
+                yield objective.of_map(w)
 
 
 def last_untangled(

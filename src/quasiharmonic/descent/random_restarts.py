@@ -17,9 +17,9 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from quasiharmonic.arrays import BoolArray, ComplexArray, whole_number
+from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray, whole_number
 from quasiharmonic.descent.base import Iterates, VertexDescent
-from quasiharmonic.descent.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around
+from quasiharmonic.descent.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around, remapped
 from quasiharmonic.descent.reweighting import reweighted
 from quasiharmonic.descent.untangling import GRADINGS, untangled
 from quasiharmonic.energy.deformation import signed_areas
@@ -80,25 +80,20 @@ class RandomRestarts(VertexDescent):
             for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
                 yield objective.of_map(w)
             left = flipped_triangles(problem.F, problem.positions(w))
-        in_vain, patience = 0, self.in_vain
+        patience = self.in_vain
         if 0 < left.size <= MOST_FLIPS and objective.of_map(w).energy < _NEXT_TO_NOTHING:
             patience *= _DILIGENCE
-        while 0 < left.size <= MOST_FLIPS and in_vain < patience:
-            in_vain += 1
+
+        def other(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
             patch = patch_around(problem, int(rng.choice(left)), int(rng.choice(_RINGS)), MOST_TRIANGLES)
             if patch is None:
-                continue
-            moved = w.copy()
+                return None
             try:
-                moved[patch.vertices] = _restarted(rng, problem, patch, w[patch.vertices], solver)
+                return patch, _restarted(rng, problem, patch, w[patch.vertices], solver)
             except NotPositiveDefinite:
-                continue
-            now = flipped_triangles(problem.F, problem.positions(moved))
-            if now.size <= left.size:
-                fewer, w, left = now.size < left.size, moved, now
-                if fewer:
-                    in_vain = 0
-                    yield objective.of_map(w)
+                return None
+
+        yield from remapped(objective, w, left, other, patience=patience, most=MOST_FLIPS)
         return True
 
 
