@@ -158,11 +158,10 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
         if len(frame.V) != len(mesh.V):
             raise ValueError(f"{path}: {len(frame.V)} vertices, where the surface has {len(mesh.V)}")
         mapped = io.mapped(frame)
-        if mapped.uv is None or not mapped.seamless:
+        opened = mapped.opened()
+        if opened.uv is None or not mapped.seamless:
             raise ValueError(f"{path}: its map has seams, and frames are of a surface without")
-        uv = np.full((len(mesh.V), 2), np.nan)
-        uv[mapped.F] = mapped.uv[mapped.FT]
-        places.append(uv[held])
+        places.append(opened.uv[held])
     return np.stack(places)
 
 
@@ -184,7 +183,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
 def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> bool:
     """Write every frame that has a map, and say whether all are certified as a reader gets them."""
     from quasiharmonic import io
-    from quasiharmonic.exact.certificate import certify
+    from quasiharmonic.cli import judging
 
     certified = True
     digits = max(4, len(str(len(animation.frames) - 1)))
@@ -192,8 +191,7 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> bool:
         if frame.injective:
             path = folder / f"{t:0{digits}}.obj"
             io.write_mapped(path, mesh.with_map(frame.uv))
-            written = io.cut_at_seams(io.read_mesh(path))
-            certified &= certify(written[1], written[2]).injective
+            certified &= judging.judge(io.read_mesh(path)).injective
     return certified
 
 
