@@ -19,11 +19,10 @@ import numpy as np
 
 from quasiharmonic.animation.frames import farthest
 from quasiharmonic.arrays import FloatArray
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.nearness import NearDescent, Nearness, Neighbour
-from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energy.polishing import at_own_scale
 from quasiharmonic.problem import Domain
 
 # What nearness weighs on the way forward, as a share of the mean energy, which is taken to be _LEAST at the least; and
@@ -62,7 +61,9 @@ class Smoothing:
         self.domain = domain
         self._energy, self._limit, self._linear_solver = energy, limit, linear_solver
         self._system: NewtonSystem | None = None
+        # From a frame to the next: what the boundary moves, and what any vertex does over that.
         self._lengths: list[float] = []
+        self._moves: list[float] = []
         self.maps: list[FloatArray] = []
         self.energies: list[float] = []
 
@@ -80,14 +81,17 @@ class Smoothing:
         lowered, energy = self._lowered(uv, before, Nearness(weight, _FREELY), _STEPS)
         self.maps.append(lowered)
         self.energies.append(energy)
-
-    def move(self, t: int) -> float:
-        """How far vertices move from a frame to the next, over what the boundary does."""
-        return farthest(self.maps[t + 1] - self.maps[t]) / self._lengths[t]
+        if before:
+            self._moves.append(0.0)
+            self._measure(len(self._moves) - 1)
 
     def largest_move(self) -> float:
-        """The largest of them."""
-        return max((self.move(t) for t in range(len(self._lengths))), default=0.0)
+        """How far a vertex moves at most from a frame to the next, over what the boundary does."""
+        return max(self._moves, default=0.0)
+
+    def _measure(self, t: int) -> None:
+        """Take down how far vertices move from a frame to the next."""
+        self._moves[t] = farthest(self.maps[t + 1] - self.maps[t]) / self._lengths[t]
 
     def sweep(self, told: Callable[[int, int], object]) -> None:
         """Spread the moves that are too long over the frames around them.
@@ -99,17 +103,18 @@ class Smoothing:
         """
         weight = _SOFT * _HARD * max(_LEAST, float(np.mean(self.energies)))
         for sweep in range(1, _SWEEPS + 1):
-            leaps = [t for t in range(len(self._lengths)) if self.move(t) > self._limit]
-            if not leaps:
+            if self.largest_move() <= self._limit:
                 return
             # What a frame gives way is the next one's to take up.
             order = range(len(self.maps))
             for t in order if sweep % 2 else reversed(order):
-                around = self._around(t)
-                if any(farthest(self.maps[t] - one.uv) > self._limit * one.length for one in around):
+                beside = range(max(t - 1, 0), min(t + 1, len(self._moves)))
+                if any(self._moves[one] > self._limit for one in beside):
                     told(sweep, t)
                     nearness = Nearness(weight, _WITHIN * self._limit)
-                    self.maps[t], self.energies[t] = self._lowered(self.maps[t], around, nearness, _AGAIN)
+                    self.maps[t], self.energies[t] = self._lowered(self.maps[t], self._around(t), nearness, _AGAIN)
+                    for one in beside:
+                        self._measure(one)
             weight *= _HARDER
 
     def _around(self, t: int) -> list[Neighbour]:
@@ -124,9 +129,7 @@ class Smoothing:
         domain = self.domain
         # As in a polish: overflow gives inf or NaN, and a step with either is never accepted.
         with np.errstate(all="ignore"):
-            exponent = int(np.frexp(np.abs(uv).max())[1])
-            area = float(signed_areas(domain.F, in_units(uv, exponent)).sum())
-            energy = DeformationEnergy(domain.V, domain.F, self._energy, area=area)
+            energy, exponent = at_own_scale(domain, uv, self._energy)
             if self._system is None:
                 self._system = NewtonSystem(energy.F, energy.g, domain.n, domain.fixed, self._linear_solver)
             descent = NearDescent(energy, uv, domain.fixed, exponent, self._system, around, nearness)

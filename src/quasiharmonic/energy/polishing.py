@@ -162,7 +162,7 @@ def polish_map(
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)
     check_callback(callback)
-    start = _start(domain, uv)
+    start = injective_array(domain, uv, "a polish starts from an injective map")
     track = lay_boundary(slide, domain, start) if slide is not False else None
     if track is not None:
         start = track.uv
@@ -170,10 +170,7 @@ def polish_map(
         weights = positive_weights(weights, len(domain.F))
     # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never accepted.
     with np.errstate(all="ignore"):
-        # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
-        exponent = int(np.frexp(np.abs(start).max())[1])
-        area = float(signed_areas(domain.F, in_units(start, exponent)).sum())
-        deformation = DeformationEnergy(domain.V, domain.F, chosen, area=area, weights=weights)
+        deformation, exponent = at_own_scale(domain, start, chosen, weights)
         if track is None:
             descent = NewtonDescent(deformation, start, domain.fixed, exponent, linear_solver)
         else:
@@ -273,13 +270,31 @@ def energy_named(energy: str | Energy) -> Energy:
     return energy
 
 
-def _start(domain: Domain, uv: ArrayLike) -> FloatArray:
-    """The start as float64, checked."""
-    start = map_array("uv", uv, domain.n)
-    flipped = flipped_triangles(domain.F, start)
+def at_own_scale(
+    domain: Domain, uv: FloatArray, energy: Energy, weights: FloatArray | None = None
+) -> tuple[DeformationEnergy, int]:
+    """An energy that measures maps after bringing them to the surface's area, and the exponent of their unit.
+
+    Parameters
+    ----------
+    domain : Domain
+    uv : (n, 2) float64
+        The map whose area says by how much; a power of two of its size is the unit.
+    energy : Energy
+    weights : (f,) float64, optional
+    """
+    # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
+    exponent = int(np.frexp(np.abs(uv).max())[1])
+    area = float(signed_areas(domain.F, in_units(uv, exponent)).sum())
+    return DeformationEnergy(domain.V, domain.F, energy, area=area, weights=weights), exponent
+
+
+def injective_array(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:
+    """A map as float64, checked to be injective; ``why`` ends the message of one that is not."""
+    array = map_array("uv", uv, domain.n)
+    flipped = flipped_triangles(domain.F, array)
     if flipped.size:
         raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; "
-            "a polish starts from an injective map"
+            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; {why}"
         )
-    return start
+    return array

@@ -11,14 +11,14 @@ from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.newton_descent import in_units
-from quasiharmonic.energy.polishing import energy_named
+from quasiharmonic.energy.polishing import energy_named, injective_array
 from quasiharmonic.exact.loops import judge_loops
 from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.gradients.derivative import Derivative, Doubt, Scale, as_rows
 from quasiharmonic.gradients.freedom import Freedom
 from quasiharmonic.gradients.gauge import Gauge
 from quasiharmonic.gradients.minimum import Minimum
-from quasiharmonic.gradients.polished import injective_array, log_surface, placed, surface_strain
+from quasiharmonic.gradients.polished import NOT_FOUND, log_surface, placed, surface_strain
 from quasiharmonic.problem import Domain
 
 # Energies are equal if they differ by no more than this part of them, as `flattening.piece` has it.
@@ -78,7 +78,7 @@ def flatten_derivative(
     """
     domain = Domain(V, F, fixed)
     chosen = energy_named(energy)
-    start = injective_array(uv, domain)
+    start = injective_array(domain, uv, NOT_FOUND)
     strain = surface_strain(domain)
     exponent = int(np.frexp(np.abs(domain.V).max())[1])
     w = in_units(start, exponent)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, map_array, named
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.curves.rails import Rails, Track
-from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
+from quasiharmonic.energy.deformation import positive_weights
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.newton_descent import in_units
-from quasiharmonic.energy.polishing import energy_named
+from quasiharmonic.energy.polishing import at_own_scale, energy_named, injective_array
 from quasiharmonic.energy.sliding import lay_boundary
-from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.gradients.derivative import Derivative, Scale, as_rows
 from quasiharmonic.gradients.freedom import Freedom, OnCurves
@@ -20,6 +19,9 @@ from quasiharmonic.gradients.gauge import log_size
 from quasiharmonic.gradients.minimum import Minimum
 from quasiharmonic.gradients.strain import RestStrain
 from quasiharmonic.problem import Domain
+
+#: Why a map must be injective.
+NOT_FOUND = "there is no derivative of a map that was not found"
 
 
 @takes_mesh
@@ -79,19 +81,13 @@ def polish_derivative(
     domain = Domain(V, F, fixed)
     domain.check_boundary_fixed()
     chosen = energy_named(energy)
-    start = injective_array(uv, domain)
+    start = injective_array(domain, uv, NOT_FOUND)
     track = lay_boundary(slide, domain, start) if slide is not False else None
     if track is not None:
         start = track.uv
-    exponent = int(np.frexp(np.abs(start).max())[1])
+    counts = None if weights is None else positive_weights(weights, len(domain.F))
+    measure, exponent = at_own_scale(domain, start, chosen, counts)
     w = in_units(start, exponent)
-    measure = DeformationEnergy(
-        domain.V,
-        domain.F,
-        chosen,
-        area=float(signed_areas(domain.F, w).sum()),
-        weights=None if weights is None else positive_weights(weights, len(domain.F)),
-    )
     strain = surface_strain(domain)
     by_rest = log_surface(strain)
     if track is None:
@@ -113,18 +109,6 @@ def polish_derivative(
         on_curves=None if track is None else on_track(track),
         scale=scale,
     )
-
-
-def injective_array(uv: ArrayLike, domain: Domain) -> FloatArray:
-    """A map as float64, checked."""
-    array = map_array("uv", uv, domain.n)
-    flipped = flipped_triangles(domain.F, array)
-    if flipped.size:
-        raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; there is no "
-            "derivative of a map that was not found"
-        )
-    return array
 
 
 def surface_strain(domain: Domain) -> RestStrain:
