@@ -28,6 +28,7 @@ from quasiharmonic.descent.base import Iterates, VertexDescent
 from quasiharmonic.descent.patches import Patch, patch_around, remapped
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.hearing import still_at_it
 
 Generator = np.random.Generator
 
@@ -40,8 +41,8 @@ _MOST_TRIANGLES, _MOST_NEAR = 2000, 20000
 _KEPT, _ENOUGH, _RIGHTED = 0.1, 1.0, 1e-3
 # How far a vertex may move, in widths of the triangles around it.
 _REACH = 20.0
-# Steps of the simplex method at most.
-_PIVOTS = 20000
+# Steps of the simplex method at most, each of which takes time like the triangles: a tenth of a second or two in all.
+_PIVOTS_TIMES_TRIANGLES = 4_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,13 +177,14 @@ def best_shift(F: IntArray, x: FloatArray, y: FloatArray, held: BoolArray) -> Fl
     A = csr_array((value, where), shape=(count, free.size + count))
     area = (x[F] * dy).sum(axis=1)[concerned] / scale
     least = np.where(area > 0, np.minimum(_KEPT * area, _ENOUGH), _RIGHTED)
+    still_at_it()
     result = linprog(
         np.repeat([0.0, 1.0], [free.size, count]),
         A_ub=-A,
         b_ub=area - least,
         bounds=np.repeat([[-_REACH, _REACH], [0.0, np.inf]], [free.size, count], axis=0),
         method="highs-ds",
-        options={"maxiter": _PIVOTS},
+        options={"maxiter": max(1, _PIVOTS_TIMES_TRIANGLES // count)},
     )
     if result.x is None or not np.isfinite(result.x).all():
         return None

@@ -233,10 +233,10 @@ def harmonise_map(
                 for value in values:
                     rest = descent.run(f"harmonise, {name}, η = {value:g}", value, max_iterations, tolerance)
                     status = Status.POLISHED if rest else Status.STILL_FALLING
-                if descent.right() or values == len(schedule) * schedule[-1:]:
+                if (descent.right() and descent.best < first) or values == len(schedule) * schedule[-1:]:
                     break
-                # The schedule's long steps left triangles that cannot be righted: from the start once more, with the
-                # last η alone.
+                # The schedule's long steps left triangles that cannot be righted, or no map better than the first:
+                # from the start once more, with the last η alone.
                 descent.back()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
