@@ -307,6 +307,38 @@ def test_files_that_are_none():
         flatten("mesh")
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: injective_map(F, V, LOOP, BEAN),
+        lambda: distortion(F, V, MAP),
+        lambda: certify(V, F),
+        lambda: injective_map(V, F, BEAN, LOOP),
+    ],
+)
+def test_arguments_in_another_order(call):
+    with pytest.raises(ValueError, match="not float64; are these positions, and the arguments in another order"):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("scaled", lambda no: harmonise(V, F, MAP, fixed=LOOP, scaled=no)),
+        ("refine", lambda no: injective_map(V, F, LOOP, BEAN, refine=no)),
+        ("boundary", lambda no: certify(F, MAP, boundary=no)),
+        ("boundary", lambda no: refine(V, F, [[0, 1]], boundary=no)),
+        ("whole", lambda no: repair(V, F, MAP.uv, whole=no)),
+        ("unmirror", lambda no: repair(V, F, MAP.uv, unmirror=no)),
+        ("unit_square", lambda no: flatten(V, F, unit_square=no)),
+        ("overlapping", lambda no: InverseMap(V, F, MAP, overlapping=no)),
+    ],
+)
+def test_a_word_is_no_truth(name, call):
+    with pytest.raises(ValueError, match=f"{name} must be True or False, not 'no'"):
+        call("no")
+
+
 def test_trimesh():
     trimesh = pytest.importorskip("trimesh")
     mesh = trimesh.Trimesh(V, F, process=False)

@@ -96,6 +96,9 @@ def test_what_cannot_be_reached_shows_a_certified_map_and_says_what_forbids_it(a
     assert told
     assert all(one["message"] and one["advice"] and (one["edges"] or one["vertices"]) for one in told)
     assert settled["injective"] == (one.last("map").arrays["bad"].size == 0)
+    # Where there is no map to go on from, what searches for one.
+    if not settled["injective"]:
+        assert settled["command"].startswith("qhm map ")
 
 
 @pytest.mark.slow

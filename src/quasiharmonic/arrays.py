@@ -62,7 +62,11 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
     if array.dtype.kind not in "iu":
-        advice = f": hand over numpy.flatnonzero({name})" if array.dtype.kind == "b" and array.ndim == 1 else ""
+        advice = ""
+        if array.dtype.kind == "b" and array.ndim == 1:
+            advice = f": hand over numpy.flatnonzero({name})"
+        elif array.dtype.kind == "f" and array.ndim == 2:
+            advice = "; are these positions, and the arguments in another order?"
         raise ValueError(f"{name} must hold integer indices, not {_held(values, array)}{advice}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
@@ -250,6 +254,12 @@ def whole_number(name: str, value: Any, *, least: int) -> None:
     """Raise a ValueError for what is not an integer of at least ``least``."""
     if not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")
+
+
+def true_or_false(name: str, value: Any) -> None:
+    """Raise a ValueError for what is neither: a word that says no would count as yes."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, not {value!r}")
 
 
 def not_negative(name: str, value: Any) -> None:

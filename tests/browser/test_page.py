@@ -169,6 +169,7 @@ def test_a_letter_is_saved_and_certified(address, opened, settled, tmp_path):
     deed(page, settled, lambda: page.click("#outline button"))
     assert "no overlap" in page.inner_text("#verdict")
     assert "--to letter:G" in page.inner_text("#command")
+    assert (page.input_value("#shape"), page.input_value("#letter")) == ("letter", "G")
     with page.expect_download() as download:
         page.click("#save")
     download.value.save_as(tmp_path / "map.obj")
@@ -188,6 +189,7 @@ def test_an_svg_dropped_on_the_page_and_a_polygon_drawn_by_hand(address, opened,
     )
     deed(page, settled, lambda: page.dispatch_event("#view", "drop", {"dataTransfer": transfer}))
     assert "--to ell.svg" in page.inner_text("#command")
+    assert page.input_value("#shape") == ""
     assert len(page.evaluate("studio.view.scene.corners")) == 6
     page.check("input[value=draw]")
     box = page.locator(".qhm-map").bounding_box()

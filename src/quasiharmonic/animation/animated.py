@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.animation.following import Following
 from quasiharmonic.animation.frames import Animation, FrameStep, checked_targets
 from quasiharmonic.animation.smoothing import Smoothing
-from quasiharmonic.arrays import FloatArray, check_callback, whole_number
+from quasiharmonic.arrays import FloatArray, check_callback, true_or_false, whole_number
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify
@@ -95,6 +95,7 @@ def animate(
     if not limit >= 1:
         raise ValueError(f"limit must be at least 1, not {limit}: the boundary itself moves as far")
     whole_number("max_iterations", max_iterations, least=1)
+    true_or_false("bridge", bridge)
     check_callback(callback)
     places = checked_targets(targets, len(problem.fixed))
     following = Following(problem, places, max_iterations, linear_solver, callback)

@@ -18,7 +18,16 @@ from typing import Literal, get_args, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, ReadOnly, check_choice, check_range, map_array, vertex_array
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    ReadOnly,
+    check_choice,
+    check_range,
+    map_array,
+    true_or_false,
+    vertex_array,
+)
 from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.exact.point_location import PointLocator
 from quasiharmonic.given.objects import MeshLike
@@ -118,6 +127,7 @@ class InverseMap(ReadOnly):
     def __init__(self, V: MeshLike, uv: ArrayLike, *, overlapping: bool = False) -> None: ...
     @made_of_mesh
     def __init__(self, V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, overlapping: bool = False) -> None:
+        true_or_false("overlapping", overlapping)
         certificate = certify(F, uv)
         _check(certificate, overlapping)
         self.certificate: Certificate = certificate

@@ -19,6 +19,7 @@ from quasiharmonic.arrays import (
     check_callback,
     counted,
     named,
+    true_or_false,
     whole_number,
 )
 from quasiharmonic.atlas.verdict import mirrored_islands
@@ -217,6 +218,8 @@ def repair(
     (2, True, [0])
     """
     whole_number("max_iterations", max_iterations, least=1)
+    true_or_false("whole", whole)
+    true_or_false("unmirror", unmirror)
     check_callback(callback)
     mesh = SeamedMesh(V, F, FT, uv)
     done = []

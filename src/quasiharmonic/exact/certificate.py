@@ -46,6 +46,7 @@ from quasiharmonic.arrays import (
     map_array,
     named,
     triangle_rows,
+    true_or_false,
 )
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
@@ -211,6 +212,7 @@ def certify(
     >>> print(certify(F, [[0, 0], [1, 0], [1, 1], [0.9, 0.5]]).summary())
     Not injective: of 2 triangles, 1 is flipped (1).
     """
+    true_or_false("boundary", boundary)
     F, uv = _checked(F, uv)
     sign, nonfinite = _signs(F, uv)
     flipped = np.flatnonzero(sign < 0)

@@ -24,6 +24,7 @@ from quasiharmonic.arrays import (
     named,
     not_negative,
     triangle_rows,
+    true_or_false,
     vertex_array,
     whole_number,
 )
@@ -151,6 +152,7 @@ def flatten(
     whole_number("record", record, least=0)
     whole_number("rings", rings, least=1)
     not_negative("gap", gap)
+    true_or_false("unit_square", unit_square)
     not_negative("tolerance", tolerance)
     of_distances = isinstance(energy, str) and energy == "distances"
     if of_distances and not (fixed is None and weights is None):

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
+from quasiharmonic.arrays import true_or_false
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.given.taking import takes_mesh
@@ -110,6 +111,7 @@ def injective_map(
     (True, True)
     """
     began = time.perf_counter()
+    true_or_false("refine", refine)
     problem = Problem(V, F, fixed, target, reference=reference)
     way = climb if refine else solve
     result = way(

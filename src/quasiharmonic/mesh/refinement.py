@@ -14,6 +14,7 @@ from quasiharmonic.arrays import (
     index_array,
     named_edges,
     triangle_rows,
+    true_or_false,
     vertex_array,
 )
 from quasiharmonic.mesh.topology import edge_keys
@@ -103,6 +104,7 @@ def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool 
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
     _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
+    true_or_false("boundary", boundary)
     if not boundary:
         _refuse(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it all the same")
 

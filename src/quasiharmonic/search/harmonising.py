@@ -19,6 +19,7 @@ from quasiharmonic.arrays import (
     named,
     not_negative,
     real_array,
+    true_or_false,
     whole_number,
 )
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
@@ -201,6 +202,7 @@ def harmonise_map(
     check_choice("reference", reference, get_args(Reference))
     whole_number("max_iterations", max_iterations, least=1)
     not_negative("tolerance", tolerance)
+    true_or_false("scaled", scaled)
     check_callback(callback)
     start = map_array("uv", uv, domain.n)
     flipped = flipped_triangles(domain.F, start)

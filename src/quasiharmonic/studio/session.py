@@ -284,6 +284,8 @@ class Session:
         moment = self.moment
         result, problem = moment.result, moment.problem
         there = moment.in_place
+        # What has no map yet is searched for from nothing: there is none to go on from.
+        recipe = moment.recipe if result.injective and there else replace(moment.recipe, anew=True)
         state = {
             "state": "settled",
             "reached": there,
@@ -291,10 +293,10 @@ class Session:
             "status": result.status.value,
             "undo": self._at > 0,
             "redo": self._at < len(self._moments) - 1,
-            "command": moment.recipe.command(),
-            "python": moment.recipe.python(),
-            "needs": moment.recipe.files(),
-            "anew": moment.recipe.anew,
+            "command": recipe.command(),
+            "python": recipe.python(),
+            "needs": recipe.files(),
+            "anew": recipe.anew,
             "outline": None if moment.recipe.outline is None else moment.recipe.outline.to,
         }
         self._tell_map(state, shown=(result.uv, result.certificate), asked=None if there else problem.target)

@@ -9,7 +9,10 @@ const HINTS = {
   draw: "Click the polygon's corners in the map; click the first again, or press Enter, to close it.",
 };
 const NUMBER = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
-const shown = (value) => (value === null || value === undefined ? "∞" : NUMBER.format(value));
+const shown = (value) => {
+  if (value === null || value === undefined) return "∞";
+  return Math.abs(value) < 1e6 ? NUMBER.format(value) : value.toExponential(2);
+};
 
 export class Panel {
   constructor(page) {
@@ -32,7 +35,7 @@ export class Panel {
     $("outline").addEventListener("submit", (event) => {
       event.preventDefault();
       const shape = $("shape").value;
-      send({ do: "outline", to: shape === "letter" ? `letter:${$("letter").value.trim()}` : shape });
+      if (shape) send({ do: "outline", to: shape === "letter" ? `letter:${$("letter").value.trim()}` : shape });
     });
     for (const id of ["undo", "redo", "flatten", "save", "stop"]) $(id).addEventListener("click", () => send({ do: id }));
     $("polish").addEventListener("click", () => send({ do: "polish", energy: $("polish-energy").value, slide: $("slide").checked }));
@@ -104,6 +107,7 @@ export class Panel {
     $("energy").textContent = shown(header.energy);
     if (header.state === "following") $("rate").textContent = rate;
     if (header.state !== "settled") return;
+    this.#outline(header.outline);
     $("stop").disabled = true;
     $("undo").disabled = !header.undo;
     $("redo").disabled = !header.redo;
@@ -112,6 +116,15 @@ export class Panel {
     $("needs").textContent = this.#needs(header);
     $("play").disabled = $("film").disabled = this.page.film.maps.length < 2;
     document.body.dataset.state = "settled";
+  }
+
+  /** The menu shows the outline that the map has, none of those where it is somebody's own. */
+  #outline(word) {
+    const [shape, ...letters] = (word ?? "").split("letter:");
+    if (letters.length) $("letter").value = letters[0];
+    $("shape").value = letters.length ? "letter" : shape;
+    if ($("shape").selectedIndex < 0) $("shape").value = "";
+    $("letter").hidden = !letters.length;
   }
 
   #needs(header) {
