@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from quasiharmonic.apply.airmesh import AirMesh, Moment
     from quasiharmonic.apply.cutting import Opened, cut_open
     from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
-    from quasiharmonic.apply.morphing import Morphed, morph
     from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
     from quasiharmonic.apply.transfer import SurfaceMap
     from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from quasiharmonic.search.harmonising import harmonise
     from quasiharmonic.search.many import injective_maps
     from quasiharmonic.search.solving import quasi_harmonic_map, solve
+    from quasiharmonic.simulation.morphing import Morphed, morph
 
 __version__ = "0.1.0"
 
@@ -61,7 +61,7 @@ _HOME = {
     "InverseMap": "apply.inverse",
     "MapResult": "result",
     "Moment": "apply.airmesh",
-    "Morphed": "apply.morphing",
+    "Morphed": "simulation.morphing",
     "Opened": "apply.cutting",
     "Problem": "problem",
     "Rails": "curves",
@@ -90,7 +90,7 @@ _HOME = {
     "injective_maps": "search.many",
     "is_injective": "exact.certificate",
     "keep_distances": "flattening.distance_descent",
-    "morph": "apply.morphing",
+    "morph": "simulation.morphing",
     "polish": "energy.polishing",
     "polish_derivative": "gradients.polished",
     "quasi_harmonic_derivative": "gradients.tensors",

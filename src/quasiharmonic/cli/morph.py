@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apply.morphing import Morphed
     from quasiharmonic.cli.arguments import Commands
+    from quasiharmonic.simulation.morphing import Morphed
 
 
 def add_parser(commands: Commands) -> None:
@@ -64,11 +64,11 @@ def run(options: argparse.Namespace) -> int:
     """Read, morph, write, read again, judge, report."""
     import numpy as np
 
-    from quasiharmonic.apply.morphing import morph
     from quasiharmonic.cli import progress, report
     from quasiharmonic.energy.measures import mean_ratio
     from quasiharmonic.io.fem import check_fem_output, read_fem, write_fem
     from quasiharmonic.mesh.topology import boundary_edges
+    from quasiharmonic.simulation.morphing import morph
 
     report.check_moved(options.output, options.json, inputs=(options.input, options.positions))
     check_fem_output(options.output, options.input)

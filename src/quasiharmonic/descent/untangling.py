@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -131,9 +131,10 @@ def untangled(
     w: ComplexArray,
     held: IntArray,
     *,
-    grading: float,
+    grading: float = 0.0,
     linear_solver: str = "auto",
     weights: FloatArray | None = None,
+    rest: FloatArray | None = None,
 ) -> Iterator[ComplexArray]:
     """Newton steps down the regularised energy, ε falling.
 
@@ -151,18 +152,20 @@ def untangled(
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
     weights : (f,) float64, optional
         How much triangles count; all alike by default.
+    rest : (n, 2) float64, optional
+        Where the triangles have the shapes that they should have; equilateral ones by default. They may overlap then.
 
     Yields
     ------
     (n,) complex128
         The map after every step, until no triangle is inverted in floating point, or no more will be righted.
     """
-    sizes = _sizes(F, w, grading, linear_solver)
-    if sizes is None:
+    references = _even(F, w, grading, linear_solver) if rest is None else _References.at(rest, F)
+    if references is None:
         return
     # Around what is computed, and not around a yield, which would carry the state to the caller.
     with np.errstate(all="ignore"):
-        descent = RegularisedDescent(F, w, held, sizes, linear_solver, 1.0 if weights is None else weights)
+        descent = RegularisedDescent(F, w, held, references, linear_solver, 1.0 if weights is None else weights)
     least = descent.least
     descent.energy.epsilon = np.hypot(1e-9, _FIRST * least)
     while not least > 0 and descent.energy.epsilon > _HOPELESS * max(abs(least), _FLAT):
@@ -202,11 +205,11 @@ def opened(
     (n,) complex128
         A map without inverted triangles, in floating point.
     """
-    sizes = _sizes(F, w, grading, linear_solver)
-    if sizes is None:
+    references = _even(F, w, grading, linear_solver)
+    if references is None:
         return w
     with np.errstate(all="ignore"):
-        descent = RegularisedDescent(F, w, held, sizes, linear_solver, 1.0)
+        descent = RegularisedDescent(F, w, held, references, linear_solver, 1.0)
         descent.energy.epsilon = _BARRIER
         before = descent.value()
         for _ in range(steps):
@@ -220,8 +223,27 @@ def opened(
     return w
 
 
-def _sizes(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> FloatArray | None:
-    """Side of every triangle's reference, (f,) float64, or None where the map has no extent.
+class _References(NamedTuple):
+    """What triangles should look like.
+
+    Attributes
+    ----------
+    corners : (f, 3, 2) float64
+    areas : (f,) float64
+        But for a factor that all have in common.
+    """
+
+    corners: FloatArray
+    areas: FloatArray
+
+    @classmethod
+    def at(cls, rest: FloatArray, F: IntArray) -> _References:
+        """Triangles as they are where vertices are at rest, (n, 2)."""
+        return cls(rest[F], signed_areas(F, rest.view(np.complex128).ravel()))
+
+
+def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _References | None:
+    """Equilateral triangles, or None where the map has no extent.
 
     The logarithms of the boundary edges' lengths, carried inwards as by Tutte's embedding; in all, the references
     have the area of the map, inverted triangles counted as positive.
@@ -242,7 +264,9 @@ def _sizes(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> 
         log = laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit)).extend(log)
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
     sizes = np.maximum(sizes, _SMALLEST * sizes.max())
-    return sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
+    sizes = sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
+    corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
+    return _References(sizes[:, None, None] * corners, sizes**2)
 
 
 class RegularisedDescent:
@@ -253,15 +277,14 @@ class RegularisedDescent:
         F: IntArray,
         w: ComplexArray,
         held: IntArray,
-        sizes: FloatArray,
+        references: _References,
         linear_solver: str,
         weights: FloatArray | float,
     ) -> None:
         self.energy = Regularised(1.0)
-        corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
-        rest = (sizes[:, None, None] * corners).reshape(-1, 2)
+        rest = references.corners.reshape(-1, 2)
         # All triangles of one weight count alike, however small.
-        weights = weights * (sizes**2).mean() / sizes**2
+        weights = weights * references.areas.mean() / references.areas
         self._deformed = DeformationEnergy(
             rest, F, self.energy, weights=weights, rest_F=np.arange(3 * len(F)).reshape(-1, 3)
         )

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, check_callback, map_array, named, not_negative, whole_number
+from quasiharmonic.arrays import FloatArray, IntArray, check_callback, map_array, named, not_negative, whole_number
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
 from quasiharmonic.energy.energies import (
@@ -152,10 +152,12 @@ def polish_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     slide: bool | Rails = False,
+    triangles: IntArray | None = None,
 ) -> MapResult:
     """Polish a map of a `Domain` at hand; the rest as `polish` has it.
 
-    The domain's ``fixed`` vertices stay where they are in ``uv``, or slide.
+    The domain's ``fixed`` vertices stay where they are in ``uv``, or slide. ``triangles`` (t, 3) are measured in place
+    of its own if there are any, and stay positive, as they are in ``uv``; they may overlap, and cover all of it alike.
     """
     began = time.perf_counter()
     chosen = energy_named(energy)
@@ -167,10 +169,10 @@ def polish_map(
     if track is not None:
         start = track.uv
     if weights is not None:
-        weights = positive_weights(weights, len(domain.F))
+        weights = positive_weights(weights, len(domain.F if triangles is None else triangles))
     # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never accepted.
     with np.errstate(all="ignore"):
-        deformation, exponent = at_own_scale(domain, start, chosen, weights)
+        deformation, exponent = at_own_scale(domain, start, chosen, weights, triangles)
         if track is None:
             descent = NewtonDescent(deformation, start, domain.fixed, exponent, linear_solver)
         else:
@@ -224,19 +226,23 @@ def polished(
     *,
     energy: str | Energy,
     max_iterations: int = 200,
+    tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     slide: bool | Rails = False,
+    triangles: IntArray | None = None,
 ) -> MapResult:
-    """Polish the injective map of a result; stages and history are continued."""
+    """Polish the injective map of a result, as `polish_map` does; stages and history are continued."""
     further = polish_map(
         problem.domain,
         result.uv,
         energy=energy,
         max_iterations=max_iterations,
+        tolerance=tolerance,
         linear_solver=linear_solver,
         callback=callback,
         slide=slide,
+        triangles=triangles,
     )
     return replace(
         further,
@@ -271,7 +277,11 @@ def energy_named(energy: str | Energy) -> Energy:
 
 
 def at_own_scale(
-    domain: Domain, uv: FloatArray, energy: Energy, weights: FloatArray | None = None
+    domain: Domain,
+    uv: FloatArray,
+    energy: Energy,
+    weights: FloatArray | None = None,
+    triangles: IntArray | None = None,
 ) -> tuple[DeformationEnergy, int]:
     """An energy that measures maps after bringing them to the surface's area, and the exponent of their unit.
 
@@ -282,11 +292,14 @@ def at_own_scale(
         The map whose area says by how much; a power of two of its size is the unit.
     energy : Energy
     weights : (f,) float64, optional
+    triangles : (t, 3) int64, optional
+        Those to measure; the domain's by default.
     """
+    F = domain.F if triangles is None else triangles
     # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
     exponent = int(np.frexp(np.abs(uv).max())[1])
-    area = float(signed_areas(domain.F, in_units(uv, exponent)).sum())
-    return DeformationEnergy(domain.V, domain.F, energy, area=area, weights=weights), exponent
+    area = float(signed_areas(F, in_units(uv, exponent)).sum())
+    return DeformationEnergy(domain.V, F, energy, area=area, weights=weights), exponent
 
 
 def injective_array(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:

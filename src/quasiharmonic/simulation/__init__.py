@@ -1,0 +1,1 @@
+"""Planar meshes of simulations whose boundary moves: triangles of three and six nodes, and quadrilaterals."""

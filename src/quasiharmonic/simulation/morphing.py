@@ -1,0 +1,329 @@
+"""Morphing of planar meshes: the boundary has moved, give me a valid interior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, map_array, named
+from quasiharmonic.curves.rails import Rails
+from quasiharmonic.energy.energies import Energy
+from quasiharmonic.energy.polishing import energy_named, polished
+from quasiharmonic.energy.sliding import moved_onto
+from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.exact.elements import inverted_elements
+from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.given.taking import takes_planar_mesh
+from quasiharmonic.hearing import heard
+from quasiharmonic.mesh.elements import (
+    corner_triangles,
+    covering_triangles,
+    element_array,
+    name_elements,
+    turned_over,
+)
+from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.problem import Problem
+from quasiharmonic.result import MapResult, Status, Step
+from quasiharmonic.search.solving import solve
+from quasiharmonic.simulation.midsides import carried, settled, sides
+from quasiharmonic.simulation.quadrilaterals import made_convex
+from quasiharmonic.simulation.quality import element_quality
+
+
+@dataclass(frozen=True, eq=False)
+class Morphed:
+    """A planar mesh after its boundary has moved.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        All nodes, those in no element where they were.
+    inverted : (k,) int64
+        Elements that are inverted, or have no area, somewhere, decided exactly on ``points``: see
+        `quasiharmonic.exact.elements`.
+    result : MapResult
+        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes that elements use, in their order,
+        and its triangles are those that cover the elements: two of a quadrilateral, four of a six-node triangle, whose
+        mid-side nodes are placed after that.
+    quality_before, quality_after : (f,) float64
+        `quasiharmonic.simulation.quality.element_quality` of every element: 1 for an equilateral triangle and a square,
+        0 without area, negative where it is inverted.
+    """
+
+    points: FloatArray
+    inverted: IntArray
+    result: MapResult
+    quality_before: FloatArray
+    quality_after: FloatArray
+    _one_step: Callable[[], FloatArray] = field(repr=False)
+
+    @property
+    def valid(self) -> bool:
+        """Whether no element is inverted anywhere, decided exactly."""
+        return not self.inverted.size
+
+    def drift(self) -> float:
+        """How far a node is, at most, from where one step from the mesh at rest puts it, boundary and pins as here.
+
+        It takes such a step, anew each time it is called; NaN where that finds no valid mesh. At the end of a chain
+        whose steps have the first mesh as ``rest`` this is what is left of the way: a trifle that falls with
+        ``tolerance``, unless the energy has several minima and the chain has come to another one.
+        """
+        return float(np.hypot(*(self.points - self._one_step()).T).max())
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        both = (("quality_before", self.quality_before), ("quality_after", self.quality_after))
+        return {
+            **self.result.to_dict(),
+            "valid": self.valid,
+            "inverted": self.inverted.tolist(),
+            **{
+                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
+                for name, quality in both
+            },
+        }
+
+
+@takes_planar_mesh
+@heard
+def morph(
+    points: ArrayLike,
+    F: ArrayLike,
+    moved: ArrayLike,
+    positions: ArrayLike,
+    *,
+    energy: str | Energy | None = "symmetric-dirichlet",
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+    slide: bool | Rails = False,
+    rest: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    tolerance: float = 1e-8,
+) -> Morphed:
+    """Move some nodes of a planar mesh and place the others such that no element is inverted.
+
+    Parameters
+    ----------
+    points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
+        The mesh as it is.
+    F : (f, 3), (f, 4) or (f, 6) array of int
+        Triangles, quadrilaterals, or triangles of six nodes, wound either way, corners first (see
+        `quasiharmonic.mesh.elements`). A quadrilateral whose last two nodes are one is a triangle.
+    moved : (k,) array of int
+        Nodes that go somewhere else: of the boundary, or inside. Boundary nodes not among them stay, but for mid-side
+        nodes, which go along with the side that they are on.
+    positions : (k, 2) array
+        Where they go.
+    energy : str, Energy or None
+        What the placement minimises; see `quasiharmonic.polish`. The default keeps shapes and sizes of the
+        triangles, so that a graded mesh stays graded. None takes the first valid mesh.
+    max_iterations : int
+        Linear solves to spend at most on finding a valid mesh.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
+        not within a single factorisation.
+    slide : bool or Rails
+        Let the boundary vertices that are not moved glide along their outline, its corners held, as nodes on the walls
+        of a channel do: along the curves of `quasiharmonic.curves.Rails`, or with True along the polygon that the
+        boundary is. Moved ones slide only where ``Rails`` tell them a curve of their own.
+    rest : (n, 2) array, optional
+        The mesh against which distortion is measured, ``points`` by default. In a chain of steps it is the first one,
+        so that the chain does not drift (`Morphed.drift`).
+    start : (n, 2) array, optional
+        A mesh near to the one sought, to begin from. By default that is ``points`` where ``rest`` is another, and else
+        the harmonic extension of the displacement.
+    tolerance : float
+        What a further step could lower the energy by, as a part of it, when the mesh counts as at rest; see
+        `quasiharmonic.polish`. The larger, the sooner, and the more it shows from where it came there.
+
+    Returns
+    -------
+    Morphed
+        When no valid mesh was found, ``result.status`` says why, or ``inverted`` which elements are to blame.
+
+    Raises
+    ------
+    ValueError
+        When the input is malformed (see `Problem`), a node to move is in no element, or at rest an element has no area
+        or a quadrilateral is not convex; names the elements.
+
+    Notes
+    -----
+    Triangles are searched for as every map is. Of quadrilaterals the triangles on either side of a diagonal are, and
+    then those at all four corners are righted and their energy lowered. Of six-node triangles the four between their
+    nodes are, boundary nodes on their curve. Mid-side nodes inside then go back to where they are on their sides at
+    rest, straight if they were, and aside by as little as it takes where an element would be inverted; if that does not
+    do, corners near by move too.
+
+    Examples
+    --------
+    The upper side of a square pushed halfway down in its middle:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import morph
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(12, 12)
+    >>> upper = np.flatnonzero(points[:, 1] == 1)
+    >>> x = points[upper, 0]
+    >>> morphed = morph(points, F, upper, np.stack([x, 1 - 0.5 * np.sin(np.pi * x) ** 4], axis=1))
+    >>> morphed.valid, bool(morphed.quality_after.min() > 0.25)
+    (True, True)
+    """
+    points = map_array("points", points, finite=False)
+    F = element_array(F, len(points))
+    used = np.unique(F)
+    _check_used("points", points, used)
+    first = points if rest is None else _like("rest", rest, points, used)
+    begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
+    before = np.abs(element_quality(F, points))
+    F = _counterclockwise(F, first)
+    triangles, _ = covering_triangles(F)
+    fixed, target = _placed(points, F, triangles, moved, positions)
+    own, held = np.searchsorted(used, triangles), np.searchsorted(used, fixed)
+    # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
+    problem = Problem(first[used], own, held, target, reference="corrected")
+    result = _searched(
+        problem,
+        np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None,
+        None if begin is None else begin[used],
+        _rails(slide, problem, used, np.asarray(moved)),
+        energy=energy,
+        max_iterations=max_iterations,
+        linear_solver=linear_solver,
+        callback=callback,
+        tolerance=tolerance,
+    )
+    after = points.copy()
+    after[used] = result.uv
+    if F.shape[1] == 6:
+        after = settled(F, first, after, fixed)
+
+    def one_step() -> FloatArray:
+        # Where the boundary has slid to, it is held.
+        whole = morph(
+            first,
+            F,
+            fixed,
+            after[fixed],
+            energy=energy,
+            max_iterations=max_iterations,
+            linear_solver=linear_solver,
+            tolerance=tolerance,
+        )
+        return whole.points if whole.valid else np.full_like(after, np.nan)
+
+    return Morphed(after, inverted_elements(F, after), result, before, element_quality(F, after), one_step)
+
+
+def _searched(
+    problem: Problem,
+    corners: IntArray | None,
+    start: FloatArray | None,
+    slide: bool | Rails,
+    *,
+    energy: str | Energy | None,
+    max_iterations: int,
+    linear_solver: str,
+    callback: Callable[[Step], object] | None,
+    tolerance: float,
+) -> MapResult:
+    """A map of the triangles that cover the mesh, and be it one where those at quadrilaterals' corners are positive."""
+    if energy is not None:
+        energy_named(energy)
+    elif slide is not False:
+        raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+    if slide is not False:
+        problem = moved_onto(slide, problem)
+    result = solve(problem, start=start, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback)
+    if corners is not None and result.status is not Status.INTERRUPTED:
+        result = made_convex(problem, result, corners, linear_solver=linear_solver)
+    if energy is None or flipped_triangles(problem.F if corners is None else corners, result.uv).size:
+        return result
+    return polished(
+        problem,
+        result,
+        energy=energy,
+        tolerance=tolerance,
+        linear_solver=linear_solver,
+        callback=callback,
+        slide=slide,
+        triangles=corners,
+    )
+
+
+def _like(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:
+    """Other places of the nodes of a mesh; those in no element may be anywhere."""
+    array = map_array(name, mesh, len(points), finite=False)
+    _check_used(name, array, used)
+    return array
+
+
+def _check_used(name: str, points: FloatArray, used: IntArray) -> None:
+    mine = np.zeros_like(points)
+    mine[used] = points[used]
+    check_finite(name, "vertex", "vertices", mine)
+
+
+def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
+    """The elements, all in one direction around; a ValueError that names those of which distortion is not defined."""
+    quadrilaterals = F.shape[1] == 4
+    triangles, of = corner_triangles(F) if quadrilaterals else covering_triangles(F)
+    sign = orientation(*(rest[triangles[:, k]] for k in range(3)))
+    if quadrilaterals:
+        turning = np.bincount(of, sign, len(F))
+        bad = np.flatnonzero(np.abs(turning) != np.bincount(of, minlength=len(F)))
+        if bad.size:
+            raise ValueError(
+                f"{name_elements(F, bad)} not convex: all four corners of a quadrilateral must turn alike before "
+                "it is morphed. Move their nodes, or cut them into triangles"
+            )
+    else:
+        flat = np.unique(of[sign == 0])
+        if flat.size:
+            raise ValueError(f"{name_elements(F, flat)} without area: repair the mesh first")
+        turning = orientation(*(rest[F[:, k]] for k in range(3))).astype(np.float64)
+    return np.where((turning < 0)[:, None], turned_over(F), F)
+
+
+def _placed(
+    points: FloatArray, F: IntArray, triangles: IntArray, moved: ArrayLike, positions: ArrayLike
+) -> tuple[IntArray, FloatArray]:
+    """Return the nodes that are given, those moved and the rest of the boundary, and where they go."""
+    given = index_array("moved", moved)
+    if given.ndim != 1:
+        raise ValueError(f"moved must have shape (k,), not {given.shape}")
+    check_range("moved", given, len(points))
+    target = map_array("positions", positions, len(given), finite=False)
+    check_finite("positions", "row", "rows", target)
+    idle = given[~np.isin(given, F)]
+    if idle.size:
+        raise ValueError(f"{named('vertex', 'vertices', idle)} to be moved in no triangle")
+    left = np.setdiff1d(boundary_edges(triangles, len(points)), given)
+    there = points.copy()
+    there[given] = target
+    if F.shape[1] == 6:
+        middle, ends = sides(F)
+        follows = np.isin(middle, left)
+        there[middle[follows]] = carried(points, there, middle[follows], ends[follows])
+    return np.concatenate([given, left]), np.concatenate([target, there[left]])
+
+
+def _rails(slide: bool | Rails, problem: Problem, used: IntArray, moved: IntArray) -> bool | Rails:
+    """What the boundary slides along, in the numbers of the vertices that triangles use; those moved are held."""
+    held = np.searchsorted(used, moved)
+    if isinstance(slide, Rails):
+        return slide.among(used).holding(held)
+    if slide is not True:
+        return slide
+    places = np.zeros((problem.n, 2))
+    places[problem.fixed] = problem.target
+    return Rails.around(problem.domain.loops, places, held=held)
