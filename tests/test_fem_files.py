@@ -227,7 +227,7 @@ def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
         (lambda d: d.replace(b"Nodes", b"ParametricNodes"), "save it as 4.1, or without them"),
         (lambda d: d.replace(b"$Nodes", b"$Knots").replace(b"$EndNodes", b"$EndKnots"), r"no section \$Nodes"),
         (lambda d: b"solid x\n", "does not begin as an MSH file"),
-        (lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 3 \1\n", d), "quadrangle: three-node triangles"),
+        (lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 4 \1\n", d), "tetrahedron: triangles of three or six"),
         (lambda d: re.sub(rb"\n2 1 2 \d+\n", rb"\n2 1 2 999999\n", d), "ends too early"),
     ],
 )

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     from quasiharmonic.search.harmonising import harmonise
     from quasiharmonic.search.many import injective_maps
     from quasiharmonic.search.solving import quasi_harmonic_map, solve
-    from quasiharmonic.simulation.morphing import Morphed, morph
+    from quasiharmonic.simulation.morphed import Morphed
+    from quasiharmonic.simulation.morphing import morph
 
 __version__ = "0.1.0"
 
@@ -61,7 +62,7 @@ _HOME = {
     "InverseMap": "apply.inverse",
     "MapResult": "result",
     "Moment": "apply.airmesh",
-    "Morphed": "simulation.morphing",
+    "Morphed": "simulation.morphed",
     "Opened": "apply.cutting",
     "Problem": "problem",
     "Rails": "curves",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,17 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.arrays import FloatArray
     from quasiharmonic.cli.arguments import Commands
-    from quasiharmonic.simulation.morphing import Morphed
+    from quasiharmonic.io.fem import FemMesh
+    from quasiharmonic.simulation.morphed import Morphed
+
+# What quality is of elements with so many nodes.
+_QUALITY = {
+    3: "mean-ratio quality",
+    4: "quality at the worst corner",
+    6: "mean-ratio quality times evenness of the Jacobian",
+}
 
 
 def add_parser(commands: Commands) -> None:
@@ -21,10 +31,11 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "morph",
         help="move the boundary of a planar mesh (Gmsh, VTK) and keep its interior valid",
-        description="Move some vertices of a planar triangle mesh and place the others such that no triangle is "
-        "inverted. Boundary vertices that are not moved stay. Positions are changed within the file; every other byte "
-        "of it stays, data, times and physical groups included.",
-        epilog="Exit status: 0 every triangle of the written mesh is positive, decided exactly; 1 not so; 2 wrong "
+        description="Move some nodes of a planar mesh and place the others such that no element is inverted: triangles "
+        "of three or six nodes, quadrilaterals of four. Boundary nodes that are not moved stay; mid-side nodes go "
+        "along with their sides. Positions are changed within the file; every other byte of it stays, data, times and "
+        "physical groups included.",
+        epilog="Exit status: 0 no element of the written mesh is inverted, decided exactly; 1 not so; 2 wrong "
         "input or call, nothing written; 3 written, but not what should be told about it.",
     )
     parser.add_argument(
@@ -55,6 +66,13 @@ def add_parser(commands: Commands) -> None:
         help="let boundary vertices that are not moved, or by nothing, glide along the boundary as it is, its corners "
         "held",
     )
+    parser.add_argument(
+        "--rest",
+        type=Path,
+        metavar="MESH",
+        help="the mesh against which distortion is measured: of a chain of steps the first one. How far the written "
+        "mesh is from where one step from there would end is told (default: the input)",
+    )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
     parser.set_defaults(run=run)
@@ -62,22 +80,18 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, morph, write, read again, judge, report."""
-    import numpy as np
-
     from quasiharmonic.cli import progress, report
-    from quasiharmonic.energy.measures import mean_ratio
+    from quasiharmonic.exact.elements import inverted_elements
     from quasiharmonic.io.fem import check_fem_output, read_fem, write_fem
-    from quasiharmonic.mesh.topology import boundary_edges
+    from quasiharmonic.mesh.elements import rim
     from quasiharmonic.simulation.morphing import morph
 
-    report.check_moved(options.output, options.json, inputs=(options.input, options.positions))
+    report.check_moved(options.output, options.json, inputs=(options.input, options.positions, options.rest))
     check_fem_output(options.output, options.input)
     mesh = read_fem(options.input)
+    rest = None if options.rest is None else _rest(options.rest, mesh)
     if options.field is not None:
-        clockwise = mean_ratio(mesh.points, mesh.F) < 0
-        F = np.where(clockwise[:, None], mesh.F[:, ::-1], mesh.F)
-        with report.about(options.input):
-            moved = np.unique(boundary_edges(F, len(mesh.points)))
+        moved = rim(mesh.F)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
         if options.slide:
             goes = (positions != mesh.points[moved]).any(axis=1)
@@ -95,37 +109,57 @@ def run(options: argparse.Namespace) -> int:
             linear_solver=options.linear_solver,
             callback=show,
             slide=options.slide,
+            rest=rest,
         )
     write_fem(options.output, mesh, morphed.points)
     with report.after_writing(options.output):
         # What a reader gets is judged: a format may hold fewer digits.
-        written = read_fem(options.output)
-        inverted = np.flatnonzero(mean_ratio(written.points, written.F) * mean_ratio(mesh.points, mesh.F) <= 0)
+        inverted = inverted_elements(morphed.F, read_fem(options.output).points)
+        drift = None if rest is None else morphed.drift()
         facts = {
             **morphed.to_dict(),
             "injective": not inverted.size,
             "flipped": inverted.tolist(),
+            "drift": drift if drift is None or isfinite(drift) else None,
             "input": str(options.input),
             "output": str(options.output),
             "moved": len(moved),
         }
-        report.emit(facts, options.json, _sentences(morphed, len(inverted), options.output))
+        report.emit(facts, options.json, _sentences(morphed, len(inverted), drift, options.output))
     return 0 if not inverted.size else 1
 
 
-def _sentences(morphed: Morphed, inverted: int, output: Path) -> str:
+def _rest(path: Path, mesh: FemMesh) -> FloatArray:
+    """Places of the same nodes in another file."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.fem import read_fem
+
+    first = read_fem(path)
+    if first.points.shape != mesh.points.shape or not np.array_equal(first.F, mesh.F):
+        raise MeshFileError(path, f"is not the mesh of {mesh.source}: the same nodes and elements in order are needed")
+    return first.points
+
+
+def _sentences(morphed: Morphed, inverted: int, drift: float | None, output: Path) -> str:
     before, after = morphed.quality_before, morphed.quality_after
-    verdict = f"{inverted} of {len(after)} triangles are not positive" if inverted else "every triangle is positive"
+    what = "triangle" if morphed.F.shape[1] != 4 else "quadrilateral"
+    verdict = f"{inverted} of {len(after)} {what}s are not positive" if inverted else f"every {what} is positive"
     lines = [f"wrote {output}: {verdict}"]
     if inverted:
-        lines.append(morphed.result.status.value)
-        if morphed.result.diagnosis is not None and morphed.result.diagnosis.obstructions:
-            lines.append(morphed.result.diagnosis.summary())
+        lines.append(morphed.result.status.value if morphed.valid else morphed.summary())
     elif not morphed.result.certificate.bijective:
         lines.append(f"but the mesh overlaps itself. {morphed.result.certificate.summary()}")
     for name, quality in (("before", before), ("after", after)):
-        worst = f"worst {quality.min():.3g} (triangle {int(quality.argmin())})"
-        lines.append(f"mean-ratio quality {name}: {worst}, mean {quality.mean():.3g}")
+        worst = f"worst {quality.min():.3g} ({what} {int(quality.argmin())})"
+        lines.append(f"{_QUALITY[morphed.F.shape[1]]} {name}: {worst}, mean {quality.mean():.3g}")
+    if drift is not None:
+        lines.append(
+            f"no node is further than {drift:.3g} from where one step from the mesh at rest puts it"
+            if isfinite(drift)
+            else "one step from the mesh at rest finds no valid mesh: how far this one has drifted is not known"
+        )
     return "\n".join(lines)
 
 

@@ -53,14 +53,37 @@ class _VF(Protocol):
     def F(self) -> Any: ...
 
 
+class _DoflocsT(Protocol):
+    @property
+    def doflocs(self) -> Any: ...
+    @property
+    def t(self) -> Any: ...
+
+
+class _Geometry(Protocol):
+    @property
+    def geometry(self) -> Any: ...
+
+
 #: What stands for a mesh: an object with vertices and faces, a mapping with these keys, or the path of a file.
 MeshLike = (
-    _VerticesFaces | _VerticesTriangles | _PointsFaces | _PointsCells | _VF | Mapping[str, Any] | str | PathLike[str]
+    _VerticesFaces
+    | _VerticesTriangles
+    | _PointsFaces
+    | _PointsCells
+    | _VF
+    | _DoflocsT
+    | _Geometry
+    | Mapping[str, Any]
+    | str
+    | PathLike[str]
 )
 
 # A mesh of trimesh has "triangles" too, which are coordinates: its "faces" come first.
 _POSITIONS = ("vertices", "points", "V", "coordinates", "verts")
 _FACES = ("faces", "triangles", "F", "cells", "simplices")
+# What scikit-fem calls its positions, which are columns, as the corners of its elements are.
+_BY_COLUMNS = "doflocs"
 
 # Kinds of cells that are faces, and those that are no part of a surface and are passed over: meshio's, and VTK's.
 _FACES_OF, _PASSED_OVER = ("triangle", "quad", "polygon"), ("vertex", "line")
@@ -71,7 +94,7 @@ def stands_for_mesh(value: object) -> bool:
     """Whether a value can only be meant as a whole mesh: it is a path, has vertices and faces, or is no array."""
     if isinstance(value, np.ndarray):
         return False
-    if isinstance(value, str | PathLike | Mapping) or None not in _parts(value):
+    if isinstance(value, str | PathLike | Mapping) or None not in _parts(value) or hasattr(value, _BY_COLUMNS):
         return True
     numbers = isinstance(value, Number | Sequence | bytes | memoryview | type(None))
     return not numbers and not any(
@@ -87,8 +110,8 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     mesh : object, mapping or path
         With positions as ``vertices``, ``points``, ``V``, ``coordinates`` or ``verts``, and faces as ``faces``,
         ``triangles``, ``F``, ``cells`` or ``simplices``: rows of corners, VTK's numbers (count, corners, count, …), or
-        meshio's blocks. Larger faces are cut into triangles as those of files are; vertices and lines among cells are
-        passed over. A path is that of a file as `quasiharmonic.io.read_mesh` reads it.
+        meshio's blocks; or a mesh of scikit-fem. Larger faces are cut into triangles as those of files are; vertices
+        and lines among cells are passed over. A path is that of a file as `quasiharmonic.io.read_mesh` reads it.
 
     Returns
     -------
@@ -107,8 +130,12 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
 
         read = read_mesh(mesh)
         return read.V, read.F
-    positions, faces = _parts(mesh)
     what = kind_of(mesh)
+    by_columns = getattr(mesh, _BY_COLUMNS, None)
+    if by_columns is not None:
+        V = vertex_array(np.asarray(by_columns).T, f"{_BY_COLUMNS} of {what}")
+        return V, _triangles(V, f"t of {what}", np.asarray(_part(mesh, "t")).T, None)
+    positions, faces = _parts(mesh)
     if positions is None or faces is None:
         lacking = "vertices" if positions is None else "faces"
         raise ValueError(

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, kind_of
-from quasiharmonic.given.objects import MeshLike, mesh_arrays, planar_arrays, stands_for_mesh
+from quasiharmonic.given.cells import planar_cells
+from quasiharmonic.given.objects import MeshLike, mesh_arrays, stands_for_mesh
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -58,8 +59,8 @@ def writes_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R
 
 
 def takes_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesPlanarMesh[P, R]:
-    """Let a function whose first two arguments are ``points`` in the plane and ``F`` take one mesh in their place."""
-    return _taking(function, 0, planar_arrays)
+    """Let a function whose first two arguments are ``points`` and elements ``F`` of a plane take one mesh instead."""
+    return _taking(function, 0, planar_cells)
 
 
 def made_of_mesh(init: Callable[..., None]) -> Callable[..., None]:

@@ -29,14 +29,15 @@ _DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
 
 @dataclass(frozen=True, eq=False)
 class FemMesh:
-    """A planar triangle mesh and all else that its file holds.
+    """A planar mesh and all else that its file holds.
 
     Attributes
     ----------
     points : (n, 2) float64
         Every point of the file, in its order.
-    F : (f, 3) int64
-        Triangles of all blocks of the file, in their order.
+    F : (f, 3), (f, 4) or (f, 6) int64
+        Triangles of three or six nodes and quadrilaterals of all blocks of the file, in their order, as
+        `quasiharmonic.mesh.elements` has them.
     source : Path
     parts : MeshParts
         The file taken apart.
@@ -84,7 +85,7 @@ class FemMesh:
 
 
 def read_fem(path: str | os.PathLike[str]) -> FemMesh:
-    """Read a planar triangle mesh for finite elements.
+    """Read a planar mesh for finite elements.
 
     Parameters
     ----------
@@ -95,8 +96,8 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
     Raises
     ------
     MeshFileError
-        When the file is another, cannot be read, has cells with area other than three-node triangles, no
-        triangles, or is not planar.
+        When the file is another, cannot be read, has cells with area other than triangles of three or six nodes and
+        quadrilaterals of four, none of these, or is not planar.
     """
     source = Path(path)
     try:

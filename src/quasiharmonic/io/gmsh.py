@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import groupby
 
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.io.meshparts import MeshParts
 from quasiharmonic.io.tables import Table, TableReader, replaced, stacked
+from quasiharmonic.mesh.elements import joined
 
-_LINE, _TRIANGLE, _POINT = 1, 2, 15
-_CORNERS = {_LINE: 2, _TRIANGLE: 3, _POINT: 1}
+# Nodes of each kind of element that is read, and of those that are passed over: lines and points.
+_ELEMENTS = {2: 3, 3: 4, 9: 6}
+_NODES = {**_ELEMENTS, 1: 2, 8: 3, 15: 1}
 _NAMES = {
-    3: "quadrangle",
     4: "tetrahedron",
     5: "hexahedron",
     6: "prism",
     7: "pyramid",
-    8: "second-order line",
-    9: "second-order triangle",
     10: "second-order quadrangle",
     11: "second-order tetrahedron",
     16: "second-order quadrangle",
@@ -37,8 +37,8 @@ def read_gmsh(data: bytes) -> MeshParts:
     Raises
     ------
     ValueError
-        When it is not an MSH file of version 2 or 4, ends early, or has elements other than points, lines and
-        triangles of the first order.
+        When it is not an MSH file of version 2 or 4, ends early, or has elements other than points, lines,
+        triangles of three or six nodes and quadrilaterals of four.
     """
     version, order, position = _format(data)
     nodes: list[tuple[IntArray, Table]] = []
@@ -57,20 +57,20 @@ def read_gmsh(data: bytes) -> MeshParts:
                 later.setdefault(title.line().strip(b'"').decode("utf-8", "replace"), []).append((begin, end))
     if not (nodes and elements):
         raise ValueError(f"there is no section ${'Elements' if nodes else 'Nodes'}")
-    tags, triangles = nodes[0][0], elements[0]
+    tags, numbers = nodes[0][0], elements[0]
     # Gmsh repeats the mesh with every view that it appends.
     if not (
         all(np.array_equal(t, tags) and np.array_equal(p.values, nodes[0][1].values) for t, p in nodes[1:])
-        and all(np.array_equal(other, triangles) for other in elements[1:])
+        and all(np.array_equal(other, numbers) for other in elements[1:])
     ):
         raise ValueError("it has several meshes: save each in a file of its own")
     place = stacked([table for _, table in nodes], 3)
     known = np.argsort(tags, kind="stable")
-    at = np.searchsorted(tags, triangles, sorter=known).clip(max=max(len(tags) - 1, 0))
-    F = known[at] if len(tags) else triangles
-    wrong = triangles[tags[F] != triangles] if len(tags) else triangles.ravel()
+    at = np.searchsorted(tags, numbers, sorter=known).clip(max=max(len(tags) - 1, 0))
+    F = known[at] if len(tags) else numbers
+    wrong = numbers[tags[F] != numbers] if len(tags) else numbers.ravel()
     if wrong.size:
-        raise ValueError(f"a triangle refers to node {wrong[0]}, which is not there")
+        raise ValueError(f"an element refers to node {wrong[0]}, which is not there")
     if version == "2":
         # An element in several physical groups is there once for each.
         F = F[np.sort(np.unique(np.sort(F, axis=1), axis=0, return_index=True)[1])]
@@ -151,8 +151,8 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
 
 
 def _elements(data: bytes, begin: int, end: int, version: str, order: str | None) -> IntArray:
-    """Tags of the triangles' nodes, (f, 3)."""
-    found = [np.empty((0, 3), dtype=np.int64)]
+    """Tags of the elements' nodes, (f, 3), (f, 4) or (f, 6)."""
+    found: list[IntArray] = []
     if version == "2":
         head = TableReader(data, begin, end, "<")
         count = int(head.words()[0])
@@ -161,42 +161,44 @@ def _elements(data: bytes, begin: int, end: int, version: str, order: str | None
         reader = TableReader(data, head.position, end, order)
         while count > 0:
             kind, size, tags = reader.take("i4", 3).tolist()
-            table = reader.tables(size, ("i4", 1 + tags + _corners(kind)))[0].values
-            if kind == _TRIANGLE:
-                found.append(table[:, -3:].astype(np.int64))
+            table = reader.tables(size, ("i4", 1 + tags + _nodes_of(kind)))[0].values
+            if kind in _ELEMENTS:
+                found.append(table[:, -_nodes_of(kind) :].astype(np.int64))
             count -= max(size, 1)
-        return np.concatenate(found)
+        return joined(found)
     reader = TableReader(data, begin, end, order)
     for _ in range(int(reader.take("u8", 2 if version == "4.0" else 4)[0])):
         kind = int(reader.take("i4", 3)[2])
         size = int(reader.take("u8", 1)[0])
-        table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _corners(kind)))[0].values
-        if kind == _TRIANGLE:
+        table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _nodes_of(kind)))[0].values
+        if kind in _ELEMENTS:
             found.append(table[:, 1:].astype(np.int64))
-    return np.concatenate(found)
+    return joined(found)
 
 
 def _element_lines(numbers: list[int], count: int) -> IntArray:
-    """Triangles of lines "number kind tags … nodes …" of version 2."""
-    found, at = [], 0
+    """Elements of lines "number kind tags … nodes …" of version 2."""
+    found: list[list[int]] = []
+    at = 0
     for _ in range(count):
         if at + 3 > len(numbers):
             raise ValueError("it ends too early")
-        kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _corners(numbers[at + 1])
-        if kind == _TRIANGLE:
-            found.append(numbers[stop - 3 : stop])
+        kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1])
+        if kind in _ELEMENTS:
+            found.append(numbers[stop - _nodes_of(kind) : stop])
         at = stop
     if at > len(numbers):
         raise ValueError("it ends too early")
-    return np.array(found, dtype=np.int64).reshape(-1, 3)
+    return joined([np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)])
 
 
-def _corners(kind: int) -> int:
-    if kind not in _CORNERS:
+def _nodes_of(kind: int) -> int:
+    if kind not in _NODES:
         raise ValueError(
-            f"there are cells of the kind {_NAMES.get(kind, f'number {kind}')}: three-node triangles are needed"
+            f"there are cells of the kind {_NAMES.get(kind, f'number {kind}')}: triangles of three or six "
+            "nodes or quadrilaterals are needed"
         )
-    return _CORNERS[kind]
+    return _NODES[kind]
 
 
 def _node_data(data: bytes, begin: int, end: int, order: str | None, tags: IntArray, which: IntArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.io.meshparts import MeshParts
 from quasiharmonic.io.tables import Table, TableReader, replaced
-from quasiharmonic.io.vtk_cells import triangles
+from quasiharmonic.io.vtk_cells import elements
 
 _KINDS = {
     b"char": "i1",
@@ -44,8 +44,8 @@ def read_legacy_vtk(data: bytes) -> MeshParts:
     Raises
     ------
     ValueError
-        When it is no such file, ends early, has cells with area other than triangles, or something in it is not
-        known.
+        When it is no such file, ends early, has cells with area other than triangles and quadrilaterals, or something
+        in it is not known.
     """
     return _Walk(data).parts()
 
@@ -83,7 +83,7 @@ class _Walk:
         lists = [np.full(len(offsets) - 1, kind) for offsets, _, kind in self._lists]
         kinds = self._kinds if self._kinds is not None else np.concatenate([np.empty(0, dtype=np.int64), *lists])
         place = self._points
-        F = triangles(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values))
+        F = elements(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values))
         points = place.values.astype(np.float64)
         change = partial(replaced, self._data, place)
         return MeshParts(points, F, np.dtype(place.values.dtype.newbyteorder("=")), self._fields, change)

@@ -1,4 +1,4 @@
-"""What a file in another program's format has of a planar triangle mesh."""
+"""What a file in another program's format has of a planar mesh."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from quasiharmonic.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class MeshParts:
-    """Positions and triangles of a file, and a way to change the positions alone.
+    """Positions and elements of a file, and a way to change the positions alone.
 
     Attributes
     ----------
     points : (n, 3) float64
         As a reader gets them.
-    F : (f, 3) int64
+    F : (f, 3), (f, 4) or (f, 6) int64
+        As `quasiharmonic.mesh.elements` has them.
     precision : dtype
         Of the positions in the file.
     fields : mapping of str to callable

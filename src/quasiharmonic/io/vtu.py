@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.io.meshparts import MeshParts
 from quasiharmonic.io.tables import TableReader, replaced
-from quasiharmonic.io.vtk_cells import triangles
+from quasiharmonic.io.vtk_cells import elements
 
 _KINDS = {
     **{f"Int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
@@ -68,7 +68,7 @@ def read_vtu(data: bytes) -> MeshParts:
     ------
     ValueError
         When it is no such file, has several pieces or times, an encoding that is not known, or cells with area
-        other than triangles.
+        other than triangles and quadrilaterals.
     """
     file = _VtuFile(data)
     points = file.only("Points", None)
@@ -78,7 +78,7 @@ def read_vtu(data: bytes) -> MeshParts:
     place = file.values(points, 3 * file.points).reshape(-1, 3)
     ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
     connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
-    F = triangles(connectivity, np.concatenate([[0], ends]), kinds, len(place))
+    F = elements(connectivity, np.concatenate([[0], ends]), kinds, len(place))
     fields = {name: partial(_rows, file, array) for name, array in file.point_data.items()}
     kind = np.dtype(_KINDS[precision])
     return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replaced, points))

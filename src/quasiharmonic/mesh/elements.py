@@ -7,6 +7,8 @@ order them. A row of four whose last two are one node is a triangle among quadri
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -47,6 +49,23 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
     if twice.any():
         raise ValueError(f"{name_elements(array, np.flatnonzero(twice))} with a node twice")
     return array
+
+
+def joined(blocks: Sequence[IntArray]) -> IntArray:
+    """Blocks of elements (k, 3), (k, 4) or (k, 6), one after another, as rows of one length.
+
+    Raises
+    ------
+    ValueError
+        When there are six-node triangles beside others.
+    """
+    sizes = {block.shape[1] for block in blocks if len(block)}
+    if len(sizes) > 1 and 6 in sizes:
+        raise ValueError("there are six-node triangles beside others: all elements must be of one order")
+    width = max(sizes, default=3)
+    # A triangle among quadrilaterals has its last node twice.
+    whole = [block[:, [*range(block.shape[1]), 2][:width]] for block in blocks if len(block)]
+    return np.concatenate([np.empty((0, width), dtype=np.int64), *whole])
 
 
 def name_elements(F: IntArray, which: IntArray) -> str:
@@ -90,6 +109,14 @@ def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
     at = np.arange(len(of)) % len(_CORNERS)
     kept = (F[:, 2] != F[:, 3])[of] | np.isin(at, (0, 3))
     return triangles[kept], of[kept]
+
+
+def rim(F: IntArray) -> IntArray:
+    """Nodes on sides that one element alone has, however elements are wound; ascending."""
+    triangles, _ = covering_triangles(F)
+    pairs = np.sort(triangles[:, SIDES].reshape(-1, 2), axis=1)
+    found, count = np.unique(pairs, axis=0, return_counts=True)
+    return np.unique(found[count == 1])
 
 
 def turned_over(F: IntArray) -> IntArray:

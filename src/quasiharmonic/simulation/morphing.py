@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,63 +29,9 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.solving import solve
 from quasiharmonic.simulation.midsides import carried, settled, sides
+from quasiharmonic.simulation.morphed import Morphed, forbidden_elements
 from quasiharmonic.simulation.quadrilaterals import made_convex
 from quasiharmonic.simulation.quality import element_quality
-
-
-@dataclass(frozen=True, eq=False)
-class Morphed:
-    """A planar mesh after its boundary has moved.
-
-    Attributes
-    ----------
-    points : (n, 2) float64
-        All nodes, those in no element where they were.
-    inverted : (k,) int64
-        Elements that are inverted, or have no area, somewhere, decided exactly on ``points``: see
-        `quasiharmonic.exact.elements`.
-    result : MapResult
-        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes that elements use, in their order,
-        and its triangles are those that cover the elements: two of a quadrilateral, four of a six-node triangle, whose
-        mid-side nodes are placed after that.
-    quality_before, quality_after : (f,) float64
-        `quasiharmonic.simulation.quality.element_quality` of every element: 1 for an equilateral triangle and a square,
-        0 without area, negative where it is inverted.
-    """
-
-    points: FloatArray
-    inverted: IntArray
-    result: MapResult
-    quality_before: FloatArray
-    quality_after: FloatArray
-    _one_step: Callable[[], FloatArray] = field(repr=False)
-
-    @property
-    def valid(self) -> bool:
-        """Whether no element is inverted anywhere, decided exactly."""
-        return not self.inverted.size
-
-    def drift(self) -> float:
-        """How far a node is, at most, from where one step from the mesh at rest puts it, boundary and pins as here.
-
-        It takes such a step, anew each time it is called; NaN where that finds no valid mesh. At the end of a chain
-        whose steps have the first mesh as ``rest`` this is what is left of the way: a trifle that falls with
-        ``tolerance``, unless the energy has several minima and the chain has come to another one.
-        """
-        return float(np.hypot(*(self.points - self._one_step()).T).max())
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        both = (("quality_before", self.quality_before), ("quality_after", self.quality_after))
-        return {
-            **self.result.to_dict(),
-            "valid": self.valid,
-            "inverted": self.inverted.tolist(),
-            **{
-                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
-                for name, quality in both
-            },
-        }
 
 
 @takes_planar_mesh
@@ -221,7 +165,9 @@ def morph(
         )
         return whole.points if whole.valid else np.full_like(after, np.nan)
 
-    return Morphed(after, inverted_elements(F, after), result, before, element_quality(F, after), one_step)
+    inverted = inverted_elements(F, after)
+    forbidden = np.intersect1d(inverted, forbidden_elements(F, after, fixed))
+    return Morphed(after, F, inverted, forbidden, result, before, element_quality(F, after), one_step)
 
 
 def _searched(
