@@ -37,14 +37,34 @@ def carried(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntAr
     return place.view(np.float64).reshape(-1, 2)
 
 
-def settled(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) -> FloatArray:
-    """Place the mid-side nodes that are not held: as at rest, or aside where an element would be inverted.
+def followed(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) -> FloatArray:
+    """Put the mid-side nodes that are not held where they are on their sides at rest; (n, 2) float64.
 
     Parameters
     ----------
     F : (f, 6) int64
     rest, points : (n, 2) float64
-        The mesh at rest, and now: the triangles between its nodes are positive.
+        The mesh at rest, and now.
+    held : (k,) int64
+        Nodes that stay where they are.
+    """
+    middle, ends = sides(F)
+    free = ~np.isin(middle, held)
+    there = points.copy()
+    there[middle[free]] = carried(rest, points, middle[free], ends[free])
+    return there
+
+
+def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntArray) -> FloatArray:
+    """Move nodes aside where elements are inverted, by as little as it takes.
+
+    Parameters
+    ----------
+    F : (f, 6) int64
+    straight : (n, 2) float64
+        The mesh with its mid-side nodes where they should be.
+    searched : (n, 2) float64
+        The mesh with these elsewhere, perhaps at better places.
     held : (k,) int64
         Nodes that stay where they are.
 
@@ -53,15 +73,11 @@ def settled(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) -
     (n, 2) float64
         Elements may be inverted still.
     """
-    middle, ends = sides(F)
-    free = ~np.isin(middle, held)
-    straight = points.copy()
-    straight[middle[free]] = carried(rest, points, middle[free], ends[free])
     best, least = straight, inverted_elements(F, straight).size
     for rings, share in _ATTEMPTS:
-        if not least:
+        if not least or (share and searched is straight):
             break
-        begin = straight + share * (points - straight)
+        begin = straight + share * (searched - straight)
         bad = inverted_elements(F, begin)
         movable = F[bad][:, MIDDLES] if rings is None else F[_around(F, bad, rings)]
         found = _bent(F, begin, np.setdiff1d(movable, held))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,17 +19,19 @@ from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.given.taking import takes_planar_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.elements import (
+    MIDDLES,
     corner_triangles,
     covering_triangles,
     element_array,
     name_elements,
+    nets_of,
     turned_over,
 )
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.solving import solve
-from quasiharmonic.simulation.midsides import carried, settled, sides
+from quasiharmonic.simulation.midsides import carried, followed, settled, sides
 from quasiharmonic.simulation.morphed import Morphed, forbidden_elements
 from quasiharmonic.simulation.quadrilaterals import made_convex
 from quasiharmonic.simulation.quality import element_quality
@@ -103,10 +106,11 @@ def morph(
     Notes
     -----
     Triangles are searched for as every map is. Of quadrilaterals the triangles on either side of a diagonal are, and
-    then those at all four corners are righted and their energy lowered. Of six-node triangles the four between their
-    nodes are, boundary nodes on their curve. Mid-side nodes inside then go back to where they are on their sides at
-    rest, straight if they were, and aside by as little as it takes where an element would be inverted; if that does not
-    do, corners near by move too.
+    then those at all four corners are righted and their energy lowered. Of six-node triangles those between their
+    corners are, and mid-side nodes inside go where they are on their sides at rest, straight if they were, or aside by
+    as little as it takes where a curved side would invert an element; if that does not do, corners near by move too,
+    and the search is made once more on the four triangles between the nodes of each. Where the boundary slides it is
+    made on these at once, so that its mid-side nodes slide too.
 
     Examples
     --------
@@ -130,80 +134,131 @@ def morph(
     begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
     before = np.abs(element_quality(F, points))
     F = _counterclockwise(F, first)
-    triangles, _ = covering_triangles(F)
-    fixed, target = _placed(points, F, triangles, moved, positions)
-    own, held = np.searchsorted(used, triangles), np.searchsorted(used, fixed)
-    # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
-    problem = Problem(first[used], own, held, target, reference="corrected")
-    result = _searched(
-        problem,
-        np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None,
-        None if begin is None else begin[used],
-        _rails(slide, problem, used, np.asarray(moved)),
-        energy=energy,
-        max_iterations=max_iterations,
-        linear_solver=linear_solver,
-        callback=callback,
-        tolerance=tolerance,
-    )
-    after = points.copy()
-    after[used] = result.uv
-    if F.shape[1] == 6:
-        after = settled(F, first, after, fixed)
+    fixed, target = _placed(points, F, moved, positions)
+    question = _Question(F, first, fixed, nets_of(F, sliding=slide is not False))
+    settings = _Settings(energy, max_iterations, linear_solver, callback, tolerance)
+    after, result = _answered(question, points, target, begin, (slide, np.asarray(moved)), settings)
 
     def one_step() -> FloatArray:
         # Where the boundary has slid to, it is held.
-        whole = morph(
-            first,
-            F,
-            fixed,
-            after[fixed],
-            energy=energy,
-            max_iterations=max_iterations,
-            linear_solver=linear_solver,
-            tolerance=tolerance,
-        )
-        return whole.points if whole.valid else np.full_like(after, np.nan)
+        alone = settings._replace(callback=None)
+        whole, _ = _answered(question, first, after[fixed], None, (False, fixed), alone)
+        return np.full_like(whole, np.nan) if inverted_elements(F, whole).size else whole
 
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, forbidden_elements(F, after, fixed))
     return Morphed(after, F, inverted, forbidden, result, before, element_quality(F, after), one_step)
 
 
+class _Question(NamedTuple):
+    """A mesh at rest, the nodes whose places are given, and the triangles to search on, one set after the other."""
+
+    F: IntArray
+    rest: FloatArray
+    fixed: IntArray
+    nets: list[IntArray]
+
+
+class _Settings(NamedTuple):
+    """How to search, as of `morph`."""
+
+    energy: str | Energy | None
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    tolerance: float
+
+
+def _answered(
+    question: _Question,
+    points: FloatArray,
+    target: FloatArray,
+    begin: FloatArray | None,
+    slide: tuple[bool | Rails, IntArray],
+    settings: _Settings,
+) -> tuple[FloatArray, MapResult]:
+    """Places of all nodes by the first set of triangles that leaves no element inverted, or the best one.
+
+    Parameters
+    ----------
+    question : _Question
+    points : (n, 2) float64
+        Where nodes are that belong to no element, and mid-side nodes on a boundary that slides.
+    target : (k, 2) float64
+        Where the given nodes go.
+    begin : (n, 2) float64 or None
+        What to begin with.
+    slide : (bool or Rails, (l,) int64)
+        What the boundary slides along, and which nodes do not.
+    settings : _Settings
+    """
+    F, rest, fixed, nets = question
+    best, least = None, np.inf
+    for triangles in nets:
+        after, result = _searched(question, triangles, points, target, begin, slide, settings)
+        if F.shape[1] == 6:
+            # Mid-side nodes that the triangles leave out have not been anywhere.
+            inside = ~np.isin(F[:, MIDDLES], triangles).any()
+            straight = followed(F, rest, after, fixed)
+            after = settled(F, straight, straight if inside else after, fixed)
+        left = inverted_elements(F, after).size
+        if left < least:
+            best, least = (after, result), left
+        if not left:
+            break
+    assert best is not None
+    return best
+
+
 def _searched(
-    problem: Problem,
-    corners: IntArray | None,
-    start: FloatArray | None,
-    slide: bool | Rails,
-    *,
-    energy: str | Energy | None,
-    max_iterations: int,
-    linear_solver: str,
-    callback: Callable[[Step], object] | None,
-    tolerance: float,
-) -> MapResult:
-    """A map of the triangles that cover the mesh, and be it one where those at quadrilaterals' corners are positive."""
+    question: _Question,
+    triangles: IntArray,
+    points: FloatArray,
+    target: FloatArray,
+    begin: FloatArray | None,
+    slide: tuple[bool | Rails, IntArray],
+    settings: _Settings,
+) -> tuple[FloatArray, MapResult]:
+    """A map of some triangles, those at quadrilaterals' corners positive, and the mesh with its nodes there."""
+    F, rest, fixed, _ = question
+    energy, max_iterations, linear_solver, callback, tolerance = settings
+    used = np.unique(triangles)
+    known = np.isin(fixed, used)
+    own, held = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
+    # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
+    problem = Problem(rest[used], own, held, target[known], reference="corrected")
+    rails = _rails(slide[0], problem, used, slide[1])
+    corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
     if energy is not None:
         energy_named(energy)
-    elif slide is not False:
+    elif rails is not False:
         raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
-    if slide is not False:
-        problem = moved_onto(slide, problem)
-    result = solve(problem, start=start, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback)
-    if corners is not None and result.status is not Status.INTERRUPTED:
-        result = made_convex(problem, result, corners, linear_solver=linear_solver)
-    if energy is None or flipped_triangles(problem.F if corners is None else corners, result.uv).size:
-        return result
-    return polished(
+    if rails is not False:
+        problem = moved_onto(rails, problem)
+    result = solve(
         problem,
-        result,
-        energy=energy,
-        tolerance=tolerance,
+        start=None if begin is None else begin[used],
+        max_iterations=max_iterations,
         linear_solver=linear_solver,
         callback=callback,
-        slide=slide,
-        triangles=corners,
     )
+    if corners is not None and result.status is not Status.INTERRUPTED:
+        result = made_convex(problem, result, corners, linear_solver=linear_solver)
+    if energy is not None and not flipped_triangles(own if corners is None else corners, result.uv).size:
+        result = polished(
+            problem,
+            result,
+            energy=energy,
+            tolerance=tolerance,
+            linear_solver=linear_solver,
+            callback=callback,
+            slide=rails,
+            triangles=corners,
+        )
+    after = points.copy()
+    after[fixed] = target
+    after[used] = result.uv
+    return after, result
 
 
 def _like(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:
@@ -240,9 +295,7 @@ def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
     return np.where((turning < 0)[:, None], turned_over(F), F)
 
 
-def _placed(
-    points: FloatArray, F: IntArray, triangles: IntArray, moved: ArrayLike, positions: ArrayLike
-) -> tuple[IntArray, FloatArray]:
+def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Return the nodes that are given, those moved and the rest of the boundary, and where they go."""
     given = index_array("moved", moved)
     if given.ndim != 1:
@@ -253,7 +306,7 @@ def _placed(
     idle = given[~np.isin(given, F)]
     if idle.size:
         raise ValueError(f"{named('vertex', 'vertices', idle)} to be moved in no triangle")
-    left = np.setdiff1d(boundary_edges(triangles, len(points)), given)
+    left = np.setdiff1d(boundary_edges(covering_triangles(F)[0], len(points)), given)
     there = points.copy()
     there[given] = target
     if F.shape[1] == 6:
