@@ -132,7 +132,6 @@ def morph(
     _check_used("points", points, used)
     first = points if rest is None else _like("rest", rest, points, used)
     begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
-    before = np.abs(element_quality(F, points))
     F = _counterclockwise(F, first)
     fixed, target = _placed(points, F, moved, positions)
     question = _Question(F, first, fixed, nets_of(F, sliding=slide is not False))
@@ -147,7 +146,8 @@ def morph(
 
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, forbidden_elements(F, after, fixed))
-    return Morphed(after, F, inverted, forbidden, result, before, element_quality(F, after), one_step)
+    before, now = element_quality(F, points), element_quality(F, after)
+    return Morphed(after, F, inverted, forbidden, result, before, now, one_step)
 
 
 class _Question(NamedTuple):

@@ -1,0 +1,254 @@
+"""Meshes of simulations whose boundary moves: chains of steps, quadrilaterals, second-order triangles, sliding."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Rails, Status, morph, surfaces
+from quasiharmonic.exact.elements import inverted_elements
+from quasiharmonic.mesh.elements import rim
+from quasiharmonic.mesh.topology import boundary_loops
+from shared.meshes import boundary_of
+from shared.simulation import channel, quadrilaterals, second_order, turned
+
+
+@pytest.fixture(scope="module")
+def flap():
+    """A mesh around a flap, and the flap's vertices."""
+    points, F = surfaces.annulus(12, hole=(-0.6, -0.05, 0.6, 0.05))
+    loops = boundary_loops(F, len(points))
+    return points, F, min(loops, key=lambda loop: np.abs(points[loop]).max())
+
+
+def dent(points, depth, waves=1):
+    """The upper side of the unit square, and where so many dents of a depth put it."""
+    upper = np.flatnonzero(points[:, 1] == 1)
+    x = points[upper, 0]
+    return upper, np.stack([x, 1 - depth * np.sin(waves * np.pi * x) ** 2], axis=1)
+
+
+# ---- chains ---------------------------------------------------------------------------------------------------------
+
+
+def test_fifty_small_steps_end_as_one_large_step_does(flap):
+    points, F, body = flap
+    whole = morph(points, F, body, turned(points[body], 50))
+    here = careless = points
+    for degrees in range(1, 51):
+        place = turned(points[body], degrees)
+        morphed = morph(here, F, body, place, rest=points)
+        assert morphed.valid
+        here = morphed.points
+        careless = morph(careless, F, body, place).points
+    size = np.sqrt(4 / len(F))
+    away = np.abs(here - whole.points).max()
+    assert away < 1e-3 * size
+    assert morphed.drift() == pytest.approx(np.hypot(*(here - whole.points).T).max(), rel=1e-6)
+    # Measured against the mesh before, every step is forgotten at the next.
+    assert np.abs(careless - whole.points).max() > 100 * away
+
+
+@pytest.mark.parametrize("slide", [False, True])
+def test_a_closed_path_leads_back(flap, slide):
+    points, F, body = flap
+    here = points
+    for degrees in (10, 20, 30, 20, 5, -10, 0):
+        here = morph(here, F, body, turned(points[body], degrees), rest=points, slide=slide).points
+    back = morph(points, F, body, points[body], slide=slide).points
+    assert np.abs(here - back).max() < 1e-3
+    if not slide:
+        assert np.abs(here - points).max() < 1e-6
+
+
+def test_a_chain_that_drifts_says_so(flap):
+    points, F, body = flap
+    # Without an energy a mesh is where its search happened to find it.
+    here = points
+    for degrees in (20, 40, 60):
+        morphed = morph(here, F, body, turned(points[body], degrees), rest=points, energy=None)
+        here = morphed.points
+    assert morphed.valid
+    assert morphed.drift() > 1e-3
+    # What one step does not get to cannot be compared with.
+    crossing = points[body] * (1, 30)
+    assert np.isnan(morph(points, F, body, crossing, max_iterations=20).drift())
+
+
+def test_the_start_is_where_the_search_begins(flap):
+    points, F, body = flap
+    place = turned(points[body], 75)
+    plain = morph(points, F, body, place)
+    begun = morph(points, F, body, place, start=plain.points)
+    assert begun.result.iterations < plain.result.iterations
+    assert np.abs(begun.points - plain.points).max() < 1e-4
+    again = morph(plain.points, F, body, place, rest=points)
+    assert np.abs(again.points - begun.points).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", ["rest", "start"])
+def test_other_meshes_that_are_none(flap, name):
+    points, F, body = flap
+    lost = points.copy()
+    lost[7] = np.nan
+    for mesh, message in ((points[:-1], r"\(n, 2\)|shape"), (lost, f"{name} is not finite at vertex 7")):
+        with pytest.raises(ValueError, match=message):
+            morph(points, F, body, points[body], **{name: mesh})
+    with pytest.raises(ValueError, match="without area"):
+        morph(points, F, body, points[body], rest=points * (1, 0))
+
+
+# ---- quadrilaterals -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("depth", "waves"), [(0.3, 1), (0.9, 1), (0.5, 3)])
+def test_quadrilaterals_stay_convex(depth, waves):
+    points, F = quadrilaterals(12, 12)
+    moved, positions = dent(points, depth, waves)
+    morphed = morph(points, F[:, ::-1], moved, positions)
+    assert morphed.valid
+    assert morphed.quality_after.min() > 0
+    assert np.array_equal(morphed.points[moved], positions)
+    still = np.setdiff1d(rim(F), moved)
+    assert np.array_equal(morphed.points[still], points[still])
+    assert not inverted_elements(F, morphed.points).size
+
+
+@pytest.mark.parametrize("slide", [False, True])
+def test_both_diagonals_are_minded(slide):
+    points, F, body = channel(16)
+    place = turned(points[body], 120)
+    morphed = morph(points, F, body, place, slide=slide)
+    # The triangles on either side of one diagonal alone leave corners inverted.
+    assert "untangling corners" in [stage.name for stage in morphed.result.stages]
+    assert morphed.valid
+    assert morphed.result.status is Status.POLISHED
+    assert np.array_equal(morphed.points[body], place)
+    walls = np.setdiff1d(rim(F), body)
+    assert np.abs(np.abs(morphed.points[walls]).max(axis=1) - 1).max() < 1e-12
+    assert np.array_equal(morphed.points[walls], points[walls]) is not slide
+
+
+def test_quadrilaterals_and_triangles_in_one_mesh():
+    points, F = quadrilaterals(10, 10)
+    a, b, c, d = F[::7].T
+    mixed = np.concatenate([np.delete(F, np.s_[::7], axis=0), np.stack([a, b, c, c], 1), np.stack([a, c, d, d], 1)])
+    morphed = morph(points, mixed, *dent(points, 0.8))
+    assert morphed.valid
+    assert morphed.quality_after.min() > 0
+
+
+def test_concave_quadrilaterals_are_named():
+    points, F = quadrilaterals(6, 6)
+    bad = points.copy()
+    centre = 24
+    bad[centre] += (0.1, 0.1)
+    with pytest.raises(ValueError, match="quadrilateral 21 not convex: all four corners"):
+        morph(bad, F, *dent(bad, 0.2))
+    # They may be so on the way, as long as they are not at rest.
+    assert morph(bad, F, *dent(bad, 0.2), rest=points).valid
+    with pytest.raises(ValueError, match=r"quadrilaterals 0, 1, .* not convex"):
+        morph(points * (1, 0), F, [0], [[0, 0]])
+
+
+def test_quadrilaterals_that_the_boundary_inverts_are_named():
+    points, F = quadrilaterals(6, 6)
+    # The corner of the square goes past the line between its neighbours.
+    corner = len(points) - 1
+    morphed = morph(points, F, [corner], [[0.9, 0.9]])
+    assert morphed.inverted.tolist() == morphed.forbidden.tolist() == [len(F) - 1]
+    assert not morphed.valid
+    assert "wherever the others go: quadrilateral 35" in morphed.summary()
+    assert json.loads(json.dumps(morphed.to_dict()))["forbidden"] == [35]
+
+
+# ---- second order ---------------------------------------------------------------------------------------------------
+
+
+def middles(F):
+    """Mid-side nodes and the ends of their sides, one after the other."""
+    return F[:, 3:].ravel(), F[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def off_straight(points, F):
+    """How far mid-side nodes are from the middles of their sides, by node."""
+    middle, ends = middles(F)
+    off = np.zeros(len(points))
+    off[middle] = np.hypot(*(points[middle] - points[ends].mean(axis=1)).T)
+    return off
+
+
+def test_middle_nodes_follow_straight_sides(flap):
+    flat, three, body = flap
+    points, F = second_order(flat, three)
+    morphed = morph(points, F, body, turned(flat[body], 60))
+    assert morphed.valid
+    # Corners go as they do without them, and what is between stays there.
+    assert np.array_equal(morphed.points[: len(flat)], morph(flat, three, body, turned(flat[body], 60)).points)
+    assert off_straight(morphed.points, F).max() < 1e-15
+    still = np.setdiff1d(boundary_of(three), body)
+    assert np.array_equal(morphed.points[still], flat[still])
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_sides_bend_where_a_curved_boundary_needs_it(mirror):
+    points, F = second_order(*surfaces.grid(8, 8))
+    if mirror:
+        F = F[:, [0, 2, 1, 5, 4, 3]]
+    # Only the middles of the upper sides go down, deeper than half of an element.
+    moved, positions = dent(points, 0.08, 8)
+    morphed = morph(points, F, moved, positions)
+    assert morphed.valid
+    assert np.array_equal(morphed.points[moved], positions)
+    straight = morphed.points.copy()
+    middle, ends = middles(F)
+    inner = ~np.isin(middle, rim(F))
+    straight[middle[inner]] = straight[ends[inner]].mean(axis=1)
+    assert inverted_elements(morphed.F, straight).size == 8
+    # Far from the boundary none has bent, and a boundary that bulges asks for nothing.
+    off = off_straight(morphed.points, F)
+    assert off[points[:, 1] < 0.7].max() < 1e-12
+    bulging = morph(points, F, moved, positions * (1, -1) + (0, 2))
+    assert bulging.valid
+    assert off_straight(bulging.points, F)[np.setdiff1d(middle, moved)].max() < 1e-15
+
+
+def test_a_bent_mesh_stays_as_it_is():
+    points, F = second_order(*surfaces.grid(5, 5))
+    rng = np.random.default_rng(0)
+    number = np.unique(F[:, 3:])
+    points[number] += rng.normal(scale=0.01, size=(len(number), 2))
+    assert not inverted_elements(F, points).size
+    morphed = morph(points, F, [], np.empty((0, 2)))
+    assert morphed.valid
+    assert np.abs(morphed.points - points).max() < 1e-12
+    # Turned as a whole, its sides keep their bends: those inside, and those of the boundary that are not given.
+    corners = np.setdiff1d(rim(F), number)
+    whole = morph(points, F, corners, turned(points[corners], 90))
+    assert np.abs(whole.points - turned(points, 90)).max() < 1e-6
+
+
+def test_elements_that_cannot_be_righted_are_told():
+    points, F = second_order(*surfaces.grid(4, 4))
+    # A middle node three quarters along its side turns the element over at an end, whatever else moves.
+    side = np.flatnonzero((points[:, 1] == 1) & (points[:, 0] == 0.125))
+    morphed = morph(points, F, side, [[0.2, 1]])
+    assert not morphed.valid
+    assert morphed.inverted.size == 1
+    assert side[0] in F[morphed.inverted[0]]
+
+
+@pytest.mark.parametrize("slide", [True, "rails"])
+def test_middle_nodes_slide_too(flap, slide):
+    points, F = second_order(*flap[:2])
+    body = rim(F)[np.abs(points[rim(F)]).max(axis=1) < 0.9]
+    square = Rails([[(-1, -1), (1, -1), (1, 1), (-1, 1)]])
+    morphed = morph(points, F, body, turned(points[body], 45), slide=square if slide == "rails" else True)
+    held = morph(points, F, body, turned(points[body], 45))
+    assert morphed.valid
+    walls = np.setdiff1d(rim(F), body)
+    assert np.abs(np.abs(morphed.points[walls]).max(axis=1) - 1).max() < 1e-12
+    assert morphed.result.history[-1].energy < held.result.history[-1].energy
+    assert morphed.drift() < 1e-4
