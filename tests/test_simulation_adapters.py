@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -163,6 +165,16 @@ def test_gmsh(order, recombined):
         assert np.array_equal(gmsh.model.mesh.getNodes()[1].reshape(-1, 3)[:, :2], morphed.points)
     finally:
         gmsh.finalize()
+
+
+@pytest.mark.parametrize("library", ["skfem", "meshio", "gmsh"])
+def test_what_the_documents_say_of_libraries(library):
+    pytest.importorskip(library)
+    page = (Path(__file__).parent.parent / "docs" / "howto.md").read_text(encoding="utf-8")
+    (code,) = re.findall(rf"^```py\n# {library}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    names = {}
+    exec(compile(code, library, "exec"), names)
+    assert names["morphed"].valid
 
 
 # ---- the command ----------------------------------------------------------------------------------------------------
