@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -169,7 +170,8 @@ def test_gmsh(order, recombined):
 
 @pytest.mark.parametrize("library", ["skfem", "meshio", "gmsh"])
 def test_what_the_documents_say_of_libraries(library):
-    pytest.importorskip(library)
+    if find_spec(library) is None:
+        pytest.skip(f"{library} is not installed; .ci/optional does it")
     page = (Path(__file__).parent.parent / "docs" / "howto.md").read_text(encoding="utf-8")
     (code,) = re.findall(rf"^```py\n# {library}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     names = {}
