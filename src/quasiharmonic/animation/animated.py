@@ -131,8 +131,11 @@ def _smoothed(
                 continue
             if not which or not np.array_equal(targets[t], targets[which[-1]]):
                 # The last map is another than when this frame was searched for, since it has been lowered.
-                near = following.found(targets[t], smoothing.maps[-1] if which else frames[t].uv)
-                smoothing.append(near.uv if near.injective else frames[t].uv)
+                uv = frames[t].uv
+                if which:
+                    near = following.found(targets[t], smoothing.maps[-1], targets[which[-1]])
+                    uv = near.uv if near.injective else uv
+                smoothing.append(uv)
                 which.append(t)
                 told(0, len(which) - 1)
             of[t] = len(which) - 1
