@@ -66,10 +66,10 @@ def test_frames_are_certified_and_follow(head):
     assert animation.moves.shape == (23,)
 
 
-@pytest.mark.parametrize("pinned", [False, True])
-def test_frames_that_are_searched_for_stay_near(pinned):
+@pytest.mark.parametrize(("pinned", "most"), [(False, 2), (True, 5)])
+def test_frames_that_are_searched_for_stay_near(pinned, most):
     """Where the map of the last frame does not do, the search goes no farther than it has to."""
-    V, F = cat(14)
+    V, F = cat(10 if pinned else 14)
     held = loop = boundary_loops(F, len(V))[0]
     targets = turning_stars(len(loop), 40, depth=0.6 if pinned else 0.75)
     if pinned:
@@ -79,7 +79,7 @@ def test_frames_that_are_searched_for_stay_near(pinned):
     animation = animate(Problem(V, F, held, targets[0]), targets)
     assert animation.found.all()
     assert any(frame.iterations for frame in animation.frames[1:])
-    assert animation.largest_move <= 2
+    assert animation.largest_move <= most
 
 
 def test_polished_frames_do_not_leap(head):
