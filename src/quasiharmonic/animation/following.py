@@ -115,10 +115,9 @@ class Following:
         """The map for a target by way of that for the boundary halfway from the last, if short steps find both."""
         if times == 0:
             return None
-        between = (target + last) / 2
-        middle: MapResult | None = self._nearby(self._problem.moved(between), start)
-        if middle is not None and not middle.injective:
-            middle = self._by_halves(between, start, last, times - 1)
+        between = target / 2 + last / 2
+        here = self._nearby(self._problem.moved(between), start)
+        middle = here if here.injective else self._by_halves(between, start, last, times - 1)
         if middle is None:
             return None
         end = self._nearby(self._problem.moved(target), middle.uv)
