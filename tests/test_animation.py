@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -63,6 +64,22 @@ def test_frames_are_certified_and_follow(head):
         assert np.array_equal(uv[loop], target)
     assert np.isnan(animation.energies).all()
     assert animation.moves.shape == (23,)
+
+
+@pytest.mark.parametrize(("pinned", "most"), [(False, 2), (True, 5)])
+def test_frames_that_are_searched_for_stay_near(pinned, most):
+    """Where the map of the last frame does not do, the search goes no farther than it has to."""
+    V, F = cat(10 if pinned else 14)
+    held = loop = boundary_loops(F, len(V))[0]
+    targets = turning_stars(len(loop), 40, depth=0.6 if pinned else 0.75)
+    if pinned:
+        first = animate(Problem(V, F, loop, targets[0]), targets[:1]).uv[0]
+        held = np.append(loop, np.argmin(np.linalg.norm(first, axis=1)))
+        targets = np.concatenate([targets, np.zeros((40, 1, 2))], axis=1)
+    animation = animate(Problem(V, F, held, targets[0]), targets)
+    assert animation.found.all()
+    assert any(frame.iterations for frame in animation.frames[1:])
+    assert animation.largest_move <= most
 
 
 def test_polished_frames_do_not_leap(head):
@@ -153,15 +170,70 @@ def test_wrong_targets_are_named(head):
     problem = Problem(V, F, loop, targets[0])
     targets[57] = targets[57].copy()
     targets[57][[3, 8]] = np.nan
-    with pytest.raises(ValueError, match="frame 57 has no finite place in rows 3, 8"):
+    with pytest.raises(ValueError, match="frame 57 is not finite at rows 3, 8"):
         animate(problem, targets)
     targets[31] = targets[31][1:]
     with pytest.raises(ValueError, match=rf"frame 31 must have shape \({len(loop)}, 2\)"):
         animate(problem, targets)
     with pytest.raises(ValueError, match="no frame"):
         animate(problem, [])
-    with pytest.raises(ValueError, match="limit must be at least 1"):
-        animate(problem, targets[:2], polish="mips", limit=0.5)
+    with pytest.raises(ValueError, match="frame 1 must hold real numbers"):
+        animate(problem, [targets[0], targets[1] + 1j])
+    for none in (None, 5, "frames"):
+        with pytest.raises(TypeError, match="targets must be a sequence of arrays"):
+            animate(problem, none)
+    with pytest.raises(TypeError, match="animate takes a Problem, not a ndarray"):
+        animate(V, targets[:2])
+
+
+def test_wrong_options_are_told(head):
+    V, F, loop = head
+    problem = Problem(V, F, loop, V[loop, :2])
+    targets = turning_stars(len(loop), 2)
+    for limit in (0.5, np.nan, "3", [3]):
+        with pytest.raises(ValueError, match="limit must be a number of at least 1"):
+            animate(problem, targets, polish="mips", limit=limit)
+    with pytest.raises(ValueError, match="limit is for frames that are polished"):
+        animate(problem, targets, limit=2)
+
+
+def test_what_is_given_is_not_changed(head):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 4).astype(np.float32)
+    before = targets.copy()
+    targets.setflags(write=False)
+    problem = Problem(V, F, loop, targets[0])
+    first, second = (animate(problem, targets, polish="mips", bridge=True) for _ in range(2))
+    assert np.array_equal(targets, before)
+    assert np.array_equal(first.uv, second.uv)
+    assert repr(first) == "<Animation: 4 frames, 4 injective, largest move 1>"
+
+
+@pytest.mark.parametrize("energy", [None, "mips"])
+def test_no_frame_has_a_map(head, energy):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 3)[:, ::-1]
+    animation = animate(Problem(V, F, loop, targets[0]), targets, polish=energy, bridge=True)
+    assert not animation.found.any()
+    assert animation.largest_move == 0
+    assert {frame.status for frame in animation.frames} == {Status.IMPOSSIBLE}
+
+
+def test_interrupted_before_the_first_frame(head, monkeypatch):
+    V, F, loop = head
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("quasiharmonic.animation.following.solve", interrupted)
+    targets = turning_stars(len(loop), 3)
+    animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips", bridge=True)
+    assert animation.interrupted
+    assert animation.frames == []
+    assert animation.moves.shape == (0,)
+    assert len(animation.uv) == 0
+    assert animation.summary().startswith("0 frames")
+    json.dumps(animation.to_dict(), allow_nan=False)
 
 
 @pytest.mark.parametrize("sweep", [0, 1])
@@ -178,6 +250,8 @@ def test_interrupted_with_what_is_there(head, sweep):
     )
     assert len(animation.frames) == (6 if sweep == 0 else 12)
     assert animation.found.all()
+    assert animation.interrupted
+    assert "interrupted" in animation.summary()
 
 
 def test_one_frame():
@@ -227,11 +301,16 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
     surface = tmp_path / "head.obj"
     io.write_obj(surface, io.MeshData(V, F))
     np.save(tmp_path / "short.npy", np.zeros((3, 7, 2)))
+    np.save(tmp_path / "none.npy", np.zeros((0, 60, 2)))
     (tmp_path / "no.npy").write_bytes(b"nothing")
     (tmp_path / "empty").mkdir()
     for frames, options, words in (
         ("short.npy", [], "must be real numbers of shape"),
+        ("none.npy", [], "must be real numbers of shape"),
         ("no.npy", [], "no array of numbers"),
+        ("missing.npy", [], "missing.npy: there is no such file"),
+        ("short.npy", ["-o", tmp_path / "out"], "the same output is named twice"),
+        ("short.npy", ["-o", tmp_path / "f.gif", "--frames-per-second", 60], "of a GIF must be at most 50"),
         ("empty", [], "no mesh in this folder"),
         ("short.npy", ["--limit", 2], "--limit belongs to --polish"),
         ("short.npy", ["--frames-per-second", 2], "belongs to a moving picture"),
@@ -240,6 +319,20 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
         assert words in capsys.readouterr().err
     assert run("animate", surface, tmp_path / "short.npy", "-o", tmp_path / "out.avi") == 2
     assert "neither a moving picture" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_film_that_cannot_be_written_is_told_before_the_work(head, tmp_path, capsys, monkeypatch):
+    V, F, loop = head
+    io.write_obj(tmp_path / "head.obj", io.MeshData(V, F))
+    (tmp_path / "held.txt").write_text("\n".join(map(str, loop)))
+    np.save(tmp_path / "frames.npy", turning_stars(len(loop), 3))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    frames = [tmp_path / "frames.npy", "--fixed", tmp_path / "held.txt"]
+    assert run("animate", tmp_path / "head.obj", *frames, "-o", tmp_path / "out", "-o", tmp_path / "film.mp4") == 2
+    assert "quasiharmonic[video]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys):
@@ -255,3 +348,7 @@ def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys)
     assert len(list((tmp_path / "out").iterdir())) == len(targets) - 1
     assert run("animate", surface, *frames, "-o", tmp_path / "out", "--bridge") == 0
     assert len(list((tmp_path / "out").iterdir())) == len(targets)
+    # A frame that is there from another run is told.
+    assert "not of this run" not in capsys.readouterr().out
+    assert run("animate", surface, *frames, "-o", tmp_path / "out") == 1
+    assert "out: 0004.obj" in capsys.readouterr().out

@@ -308,6 +308,28 @@ def test_animation(planar, tmp_path, suffix):
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
+def test_an_animation_shows_all_of_every_frame(planar, tmp_path):
+    """One that leaves the first one's window, and inverted triangles that only a frame in the middle has."""
+    V, F, folded = planar
+    path = tmp_path / "a.gif"
+    frames = [("small", V), ("folded", folded), ("large", 2 * V), ("apart", V + 0.7 * np.ptp(V))]
+    save_animation(path, V, F, frames, frames_per_second=30)
+    with Image.open(path) as image:
+        shown, durations = [], []
+        for t in range(image.n_frames):
+            image.seek(t)
+            shown.append(np.asarray(image.convert("RGB"), dtype=float) / 255)
+            durations.append(image.info["duration"])
+    assert [bool(red(picture).sum() > 50) for picture in shown] == [False, True, False, False]
+    for picture in shown:
+        rim = np.concatenate(
+            [picture[-5:].reshape(-1, 3), picture[:, :5].reshape(-1, 3), picture[:, -5:].reshape(-1, 3)]
+        )
+        assert (rim == 1).all()
+    # Hundredths of a second is all there is: 30 a second on the whole, not 33.
+    assert durations == [30, 40, 30, 30 + 1000]
+
+
 def test_animation_says_what_is_wrong(planar, tmp_path):
     V, F, _ = planar
     with pytest.raises(ValueError, match=r"as \.gif or \.mp4"):
@@ -316,6 +338,8 @@ def test_animation_says_what_is_wrong(planar, tmp_path):
         save_animation(tmp_path / "a.gif", V, F, [])
     with pytest.raises(ValueError, match="frames_per_second"):
         save_animation(tmp_path / "a.gif", V, F, [("one", V)], frames_per_second=0)
+    with pytest.raises(ValueError, match="of a GIF must be at most 50, not 60"):
+        save_animation(tmp_path / "a.gif", V, F, [("one", V)], frames_per_second=60)
     lost = V.copy()
     lost[3] = np.nan
     with pytest.raises(ValueError, match="second is not finite at vertex 3"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,13 +16,16 @@ from numpy.typing import ArrayLike
 from quasiharmonic.animation.following import Following
 from quasiharmonic.animation.frames import Animation, FrameStep, checked_targets
 from quasiharmonic.animation.smoothing import Smoothing
-from quasiharmonic.arrays import FloatArray, check_callback, true_or_false, whole_number
+from quasiharmonic.arrays import FloatArray, check_callback, kind_of, true_or_false, whole_number
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.hearing import heard
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import Status
+
+# How many times as far as the boundary vertices may move, unless the caller says so.
+_LIMIT = 3.0
 
 
 @heard
@@ -30,7 +34,7 @@ def animate(
     targets: Iterable[ArrayLike],
     *,
     polish: str | Energy | None = None,
-    limit: float = 3.0,
+    limit: float | None = None,
     bridge: bool = False,
     start: ArrayLike | None = None,
     max_iterations: int = 2000,
@@ -48,16 +52,16 @@ def animate(
     polish : str or Energy, optional
         Lower this distortion energy in every frame, as `quasiharmonic.polish` has it, without leaps from one local
         minimum to another.
-    limit : float
-        For ``polish``: as many times as far as the boundary moves at most, a vertex may. 1 at the least, where no
-        more is possible in general; the result says what was reached.
+    limit : float, optional
+        For ``polish``: as many times as far as the boundary moves at most, a vertex may; 3 by default. 1 at the least,
+        where no more is possible in general; the result says what was reached.
     bridge : bool
         Where a target allows no map, or none is found, have the boundary halfway between the frames around it, or
         however many there are to go past. Frames at the ends stay without.
     start : (n, 2) array, optional
         A map to begin the first frame with.
     max_iterations : int
-        Linear solves to spend at most on finding a frame's map.
+        Linear solves to spend at most on finding a frame's map, where the few from the map before it do not do.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
@@ -67,13 +71,15 @@ def animate(
     Returns
     -------
     Animation
-        Ctrl-C ends it with the frames that have a map by then.
+        Ctrl-C ends it with the frames so far, lowered or not.
 
     Raises
     ------
+    TypeError
+        When ``problem`` is no `Problem`, or there is no going through ``targets``.
     ValueError
-        When a target has another size or a place that is not finite (the message names the frame), or an option has no
-        such value.
+        When a target has another size, or what is no finite number (the message names the frame), when an option has no
+        such value, or ``limit`` is given and nothing to polish with.
 
     Examples
     --------
@@ -92,8 +98,12 @@ def animate(
     (True, True)
     """
     energy = None if polish is None else energy_named(polish)
-    if not limit >= 1:
-        raise ValueError(f"limit must be at least 1, not {limit}: the boundary itself moves as far")
+    if not isinstance(problem, Problem):
+        raise TypeError(f"animate takes a Problem, not {kind_of(problem)}")
+    if limit is not None and (not isinstance(limit, Real) or not limit >= 1):
+        raise ValueError(f"limit must be a number of at least 1, not {limit!r}: the boundary itself moves as far")
+    if limit is not None and energy is None:
+        raise ValueError("limit is for frames that are polished: name an energy for that too")
     whole_number("max_iterations", max_iterations, least=1)
     true_or_false("bridge", bridge)
     check_callback(callback)
@@ -103,17 +113,28 @@ def animate(
     asked, bridged = places[: len(frames)], np.zeros(len(frames), dtype=bool)
     if bridge and not following.interrupted:
         asked, bridged = following.bridge()
+    interrupted = following.interrupted
+    if energy is None:
+        return Animation(frames, asked, bridged, np.full(len(frames), np.nan), interrupted=interrupted)
+    limit = _LIMIT if limit is None else float(limit)
     energies = np.full(len(frames), np.nan)
-    if energy is not None and not following.interrupted:
+    if not interrupted:
         smoothing = Smoothing(problem.domain, energy, limit, linear_solver)
-        energies = _smoothed(smoothing, following, asked, callback)
-    return Animation(frames, asked, bridged, energies, float(limit))
+        energies, interrupted = _smoothed(smoothing, following, asked, callback)
+    return Animation(frames, asked, bridged, energies, limit, interrupted)
 
 
 def _smoothed(
     smoothing: Smoothing, following: Following, targets: FloatArray, callback: Callable[[FrameStep], object] | None
-) -> FloatArray:
-    """Lower the distortion of the frames that have a map, in place; their mean energies (t,), NaN of the others."""
+) -> tuple[FloatArray, bool]:
+    """Lower the distortion of the frames that have a map, in place.
+
+    Returns
+    -------
+    energies : (t,) float64
+        Their mean energies, NaN of the others.
+    interrupted : bool
+    """
     began = time.perf_counter()
     frames = following.frames
     # Frames with one target after another are one.
@@ -131,8 +152,11 @@ def _smoothed(
                 continue
             if not which or not np.array_equal(targets[t], targets[which[-1]]):
                 # The last map is another than when this frame was searched for, since it has been lowered.
-                near = following.found(targets[t], smoothing.maps[-1] if which else frames[t].uv)
-                smoothing.append(near.uv if near.injective else frames[t].uv)
+                uv = frames[t].uv
+                if which:
+                    near = following.found(targets[t], smoothing.maps[-1], targets[which[-1]])
+                    uv = near.uv if near.injective else uv
+                smoothing.append(uv)
                 which.append(t)
                 told(0, len(which) - 1)
             of[t] = len(which) - 1
@@ -141,11 +165,14 @@ def _smoothed(
         status = Status.INTERRUPTED
     energies = np.full(len(frames), np.nan)
     seconds = (time.perf_counter() - began) / max(len(which), 1)
-    for t in np.flatnonzero(of >= 0).tolist():
-        frame, uv = frames[t], smoothing.maps[of[t]]
-        energies[t] = smoothing.energies[of[t]]
-        certificate = certify(smoothing.domain.F, uv, loops=smoothing.domain.loops)
-        frames[t] = replace(
-            frame, uv=uv, status=status, certificate=certificate, seconds=frame.seconds + seconds, mu=None
-        )
-    return energies
+    try:
+        for t in np.flatnonzero(of >= 0).tolist():
+            uv = smoothing.maps[of[t]]
+            certificate = certify(smoothing.domain.F, uv, loops=smoothing.domain.loops)
+            frames[t] = replace(
+                frames[t], uv=uv, status=status, certificate=certificate, seconds=frames[t].seconds + seconds, mu=None
+            )
+            energies[t] = smoothing.energies[of[t]]
+    except KeyboardInterrupt:
+        status = Status.INTERRUPTED
+    return energies, status is Status.INTERRUPTED

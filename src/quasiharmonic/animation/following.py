@@ -1,4 +1,9 @@
-"""Frames, each searched for from the map of the one before, and what becomes of those that have none."""
+"""Frames, each searched for from the map of the one before, and what becomes of those that have none.
+
+A search that goes far finds a map far from the last one: vertices leap though the boundary has hardly moved. So each
+frame is first tried by a few short steps of the tensors from those of the last map, then by way of boundaries halfway
+to it, and only then by whatever finds a map (`quasiharmonic.solve`).
+"""
 
 from __future__ import annotations
 
@@ -10,12 +15,18 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.animation.frames import FrameStep, farthest
 from quasiharmonic.arrays import BoolArray, FloatArray
+from quasiharmonic.descent import VectorAdam
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status
 from quasiharmonic.search.solving import solve
+from quasiharmonic.search.stages import Stages
 
 # Iterations that a frame near to the last hardly ever needs: if they do not do, it is asked first whether any could.
 _SOON = 6
+# How long steps are, a fifth of those with which a search begins: where these do not do, short ones lead less far away.
+_SHORT = ((0, 0.1),)
+# How often the way from the last boundary to the next is halved.
+_HALVINGS = 3
 
 
 class Following:
@@ -59,7 +70,7 @@ class Following:
                 if before is not None and np.array_equal(target, self._targets[before]):
                     self.frames.append(self.frames[before])
                     continue
-                frame = self.found(target, last)
+                frame = self.found(target, last, None if before is None else self._targets[before])
                 self.frames.append(frame)
                 if frame.injective:
                     if before is not None:
@@ -72,8 +83,16 @@ class Following:
             self.interrupted = True
         return self.frames
 
-    def found(self, target: FloatArray, start: ArrayLike | None) -> MapResult:
-        """The map for a target, beginning with another.
+    def found(self, target: FloatArray, start: ArrayLike | None, last: FloatArray | None = None) -> MapResult:
+        """The map for a target.
+
+        Parameters
+        ----------
+        target : (k, 2) float64
+        start : (n, 2) array, optional
+            A map to begin with.
+        last : (k, 2) float64, optional
+            The target whose map, an injective one, ``start`` is.
 
         Raises
         ------
@@ -82,16 +101,42 @@ class Following:
         """
         problem = self._problem.moved(target)
         if start is not None:
-            soon = self._solve(problem, start, min(_SOON, self._max_iterations))
-            forbidden = soon.diagnosis is not None and soon.diagnosis.forbids_injective
-            if soon.injective:
-                return soon
-            if forbidden:
-                return replace(soon, status=Status.IMPOSSIBLE)
+            near = self._nearby(problem, start)
+            if near.injective:
+                return near
+            if near.diagnosis is not None and near.diagnosis.forbids_injective:
+                return replace(near, status=Status.IMPOSSIBLE)
+            by_halves = None if last is None else self._by_halves(target, start, last, _HALVINGS)
+            if by_halves is not None:
+                return by_halves
         return self._solve(problem, start, self._max_iterations)
 
-    def _solve(self, problem: Problem, start: ArrayLike | None, iterations: int) -> MapResult:
-        result = solve(problem, start=start, max_iterations=iterations, linear_solver=self._linear_solver)
+    def _by_halves(self, target: FloatArray, start: ArrayLike, last: FloatArray, times: int) -> MapResult | None:
+        """The map for a target by way of that for the boundary halfway from the last, if short steps find both."""
+        if times == 0:
+            return None
+        between = target / 2 + last / 2
+        here = self._nearby(self._problem.moved(between), start)
+        middle = here if here.injective else self._by_halves(between, start, last, times - 1)
+        if middle is None:
+            return None
+        end = self._nearby(self._problem.moved(target), middle.uv)
+        return end if end.injective else self._by_halves(target, middle.uv, between, times - 1)
+
+    def _nearby(self, problem: Problem, start: ArrayLike) -> MapResult:
+        """What a few short steps from a map come to."""
+        few = min(_SOON, self._max_iterations)
+        # As in any search, pins want si-log.
+        parameterisation = "si-log" if problem.domain.pins.size else "tanh"
+        short = VectorAdam(parameterisation=parameterisation, schedule=_SHORT, iterations=few)
+        return self._solve(problem, start, few, [short])
+
+    def _solve(
+        self, problem: Problem, start: ArrayLike | None, iterations: int, strategy: str | Stages = "speed"
+    ) -> MapResult:
+        result = solve(
+            problem, strategy=strategy, start=start, max_iterations=iterations, linear_solver=self._linear_solver
+        )
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         return result
@@ -111,7 +156,7 @@ class Following:
                 share = (t - first) / (last - first)
                 between = (1 - share) * self._targets[first] + share * self._targets[last]
                 near = t - 1 if self.frames[t - 1].injective else first
-                frame = self.found(between, self.frames[near].uv)
+                frame = self.found(between, self.frames[near].uv, targets[near])
                 if frame.injective:
                     self.frames[t], targets[t], bridged[t] = frame, between, True
         except KeyboardInterrupt:

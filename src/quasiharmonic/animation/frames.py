@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import BoolArray, FloatArray, counted, named
+from quasiharmonic.arrays import BoolArray, FloatArray, check_finite, counted, kind_of, named, real_array
 from quasiharmonic.result import MapResult
 
 
@@ -50,20 +50,27 @@ class Animation:
         Frames whose target allows no map or none was found, and which lie between their neighbours instead.
     energies : (t,) float64
         The mean energy of each polished frame; NaN of all others.
-    limit : float
-        How many times as far as the boundary a vertex was to move at most, if the frames were polished.
+    limit : float or None
+        How many times as far as the boundary a vertex was to move at most; None where the frames were not polished.
+    interrupted : bool
+        Whether Ctrl-C ended the work before all was done that was asked for.
     """
 
     frames: list[MapResult]
     targets: FloatArray
     bridged: BoolArray
     energies: FloatArray
-    limit: float
+    limit: float | None = None
+    interrupted: bool = False
+
+    def __repr__(self) -> str:
+        frames = counted("frame", "frames", len(self.frames))
+        return f"<Animation: {frames}, {np.count_nonzero(self.found)} injective, largest move {self.largest_move:.3g}>"
 
     @property
     def uv(self) -> FloatArray:
-        """Every frame's map; (t, n, 2) float64."""
-        return np.stack([frame.uv for frame in self.frames])
+        """Every frame's map; (t, n, 2) float64, of no vertices where there is no frame."""
+        return np.stack([frame.uv for frame in self.frames]) if self.frames else np.empty((0, 0, 2))
 
     @property
     def found(self) -> BoolArray:
@@ -85,7 +92,7 @@ class Animation:
             NaN where the boundary rests, or one of the two frames has no map.
         """
         found = self.found
-        ratio = np.full(len(self.frames) - 1, np.nan)
+        ratio = np.full(max(len(self.frames) - 1, 0), np.nan)
         for t in np.flatnonzero(found[1:] & found[:-1]):
             boundary = farthest(self.targets[t + 1] - self.targets[t])
             if boundary > 0:
@@ -102,6 +109,8 @@ class Animation:
         """Say how many frames are certified, which are not and why, and how far vertices move."""
         found, count = self.found, counted("frame", "frames", len(self.frames))
         lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, decided exactly"]
+        if self.interrupted:
+            lines.append("interrupted before all was done")
         if self.bridged.any():
             lines.append(f"between their neighbours: {named('frame', 'frames', np.flatnonzero(self.bridged))}")
         overlapping = np.flatnonzero(found & ~self.bijective)
@@ -125,6 +134,7 @@ class Animation:
             "overlapping": np.flatnonzero(self.found & ~self.bijective).tolist(),
             "missing": np.flatnonzero(~self.found).tolist(),
             "bridged": np.flatnonzero(self.bridged).tolist(),
+            "interrupted": self.interrupted,
             "largest_move": self.largest_move,
             "moves": [None if np.isnan(move) else float(move) for move in self.moves],
             "mean_energies": [None if np.isnan(energy) else float(energy) for energy in self.energies],
@@ -147,17 +157,21 @@ def checked_targets(targets: Iterable[ArrayLike], count: int) -> FloatArray:
 
     Raises
     ------
+    TypeError
+        When there is no going through them.
     ValueError
-        When there is none, or one has another shape or a place that is not finite: names the first such frame.
+        When there is none, or one has another shape, no real numbers or a place that is not finite: names the first
+        such frame.
     """
+    if not isinstance(targets, Iterable) or isinstance(targets, str | bytes):
+        raise TypeError(f"targets must be a sequence of arrays ({count}, 2), not {kind_of(targets)}")
     checked = []
     for t, target in enumerate(targets):
-        array = np.asarray(target, dtype=np.float64)
+        name = f"targets: frame {t}"
+        array = real_array(name, target)
         if array.shape != (count, 2):
-            raise ValueError(f"targets: frame {t} must have shape ({count}, 2), not {array.shape}")
-        wrong = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        if wrong.size:
-            raise ValueError(f"targets: frame {t} has no finite place in {named('row', 'rows', wrong)}")
+            raise ValueError(f"{name} must have shape ({count}, 2), not {array.shape}")
+        check_finite(name, "row", "rows", array)
         checked.append(array)
     if not checked:
         raise ValueError("targets: there is no frame")

@@ -101,7 +101,7 @@ class Smoothing:
         told : callable
             Is called with each sweep's number, from 1 on, and frame.
         """
-        weight = _SOFT * _HARD * max(_LEAST, float(np.mean(self.energies)))
+        weight = _SOFT * _HARD * max(_LEAST, sum(self.energies) / max(len(self.energies), 1))
         for sweep in range(1, _SWEEPS + 1):
             if self.largest_move() <= self._limit:
                 return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,20 +79,26 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.animation.animated import animate
     from quasiharmonic.cli import arguments, progress, report
     from quasiharmonic.mesh.topology import boundary_edges
+    from quasiharmonic.plot.animation import check_animation
     from quasiharmonic.problem import Problem
 
-    arguments.settle(options, "limit", 3.0, asked=options.polish is not None, belongs="--polish")
+    arguments.settle(options, "limit", None, asked=options.polish is not None, belongs="--polish")
     drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
     arguments.settle(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
     targets = _files(options.targets)
     inputs = (options.input, options.fixed, *targets)
+    for path in drawn:
+        check_animation(path, options.frames_per_second)
     report.check_new({f"-o {path}": path for path in drawn}, options.json, inputs=inputs)
     folders = [_checked_folder(path, inputs) for path in options.output if path not in drawn]
+    if len(set(options.output)) < len(options.output):
+        raise ValueError("-o: the same output is named twice")
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
         held = np.unique(boundary_edges(mesh.F, len(mesh.V))) if fixed is None else fixed
-        places = _targets(targets, mesh, held)
+    places = _targets(targets, mesh, held)
+    with report.about(options.input):
         problem = Problem(mesh.V, mesh.F, held, places[0])
     with report.about(options.input), progress.line(_words) as show:
         animation = animate(
@@ -104,11 +111,16 @@ def run(options: argparse.Namespace) -> int:
             linear_solver=options.linear_solver,
             callback=show,
         )
-    certified = [_write_frames(folder, mesh, animation) for folder in folders]
-    with report.after_writing(options.output[0]):
-        for path in drawn:
+    if not animation.frames:
+        raise KeyboardInterrupt
+    written = {folder: _write_frames(folder, mesh, animation) for folder in folders}
+    for t, path in enumerate(drawn):
+        # What could not be drawn is wrong output, unless something is written already.
+        before = [*folders, *drawn[:t]]
+        with report.after_writing(before[0]) if before else nullcontext():
             _draw(path, problem, animation, options.frames_per_second)
-        complete = len(animation.frames) == len(places)
+    with report.after_writing(options.output[0]):
+        missing = len(places) - len(animation.frames)
         facts: dict[str, Any] = {
             **animation.to_dict(),
             "asked": len(places),
@@ -116,10 +128,15 @@ def run(options: argparse.Namespace) -> int:
             "outputs": [str(path) for path in options.output],
         }
         lines = [f"wrote {', '.join(map(str, options.output))}", animation.summary()]
-        if not complete:
-            lines.append(f"interrupted: {len(places) - len(animation.frames)} further frames were asked for")
+        if missing:
+            lines.append(f"{missing} further frames were asked for")
+        for folder, (_, others) in written.items():
+            if others:
+                names = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
+                lines.append(f"not of this run, but in {folder}: {names}")
         report.emit(facts, options.json, "\n".join(lines))
-    return 0 if complete and all(certified) and animation.found.all() else 1
+    certified = all(every for every, _ in written.values())
+    return 0 if not missing and certified and animation.found.all() else 1
 
 
 def _files(given: list[Path]) -> list[Path]:
@@ -135,12 +152,13 @@ def _files(given: list[Path]) -> list[Path]:
 
 
 def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
-    """A folder that can be written to, with none of the inputs in it."""
+    """A folder that can be written to, or made, with none of the inputs in it."""
     if path.suffix and not path.is_dir():
         raise ValueError(f"-o {path}: neither a moving picture ({', '.join(PICTURES)}) nor the name of a folder")
     if any(source is not None and source.resolve().parent == path.resolve() for source in inputs):
         raise ValueError(f"-o {path}: frames are not written where the input is")
-    path.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"-o {path}: it is no folder")
     return path
 
 
@@ -149,6 +167,7 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
     import numpy as np
 
     from quasiharmonic import io
+    from quasiharmonic.cli import report
 
     if files[0].suffix.lower() == ".npy":
         return _array(files[0], len(mesh.V), held)
@@ -157,7 +176,8 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
         frame = io.read_mesh(path)
         if len(frame.V) != len(mesh.V):
             raise ValueError(f"{path}: {len(frame.V)} vertices, where the surface has {len(mesh.V)}")
-        mapped = io.mapped(frame)
+        with report.about(path):
+            mapped = io.mapped(frame)
         opened = mapped.opened()
         if opened.uv is None or not mapped.seamless:
             raise ValueError(f"{path}: its map has seams, and frames are of a surface without")
@@ -168,11 +188,16 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
 def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
     import numpy as np
 
+    from quasiharmonic import io
+
     try:
         array = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise io.MeshFileError(path, "there is no such file") from error
     except (ValueError, EOFError) as error:
         raise ValueError(f"{path}: no array of numbers in NumPy's format: {error}") from error
-    if array.ndim != 3 or array.shape[2] != 2 or array.shape[1] not in (n, held.size) or array.dtype.kind not in "iuf":
+    shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, held.size) and array.shape[2] == 2
+    if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(
             f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {held.size}, 2) for fixed vertices "
             f"only, not {array.dtype} {array.shape}"
@@ -180,19 +205,31 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.asarray(array if array.shape[1] == held.size else array[:, held], dtype=np.float64)
 
 
-def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> bool:
-    """Write every frame that has a map, and say whether all are certified as a reader gets them."""
+def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[bool, list[str]]:
+    """Write every frame that has a map.
+
+    Returns
+    -------
+    certified : bool
+        Whether all are as a reader gets them.
+    others : list of str
+        Frames in the folder that are of another run.
+    """
     from quasiharmonic import io
     from quasiharmonic.cli import judging
 
     certified = True
+    folder.mkdir(parents=True, exist_ok=True)
     digits = max(4, len(str(len(animation.frames) - 1)))
+    written = set()
     for t, frame in enumerate(animation.frames):
         if frame.injective:
             path = folder / f"{t:0{digits}}.obj"
             io.write_mapped(path, mesh.with_map(frame.uv))
+            written.add(path.name)
             certified &= judging.judge(io.read_mesh(path)).injective
-    return certified
+    others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
+    return certified, sorted(others)
 
 
 def _draw(path: Path, problem: Problem, animation: Animation, rate: int) -> None:

@@ -126,11 +126,21 @@ def paint_surface(ax: Axes, seen: View, F: IntArray, color: FloatArray) -> None:
 
 
 def paint_map(
-    ax: Axes, F: IntArray, uv: FloatArray, color: FloatArray, inverted: IntArray, fixed: ArrayLike | None = None
+    ax: Axes,
+    F: IntArray,
+    uv: FloatArray,
+    color: FloatArray,
+    inverted: IntArray,
+    fixed: ArrayLike | None = None,
+    window: FloatArray | None = None,
 ) -> None:
-    """Paint a map in the given colours (f, 3), inverted triangles in red over all others."""
-    uv = drawable(uv)
-    scale = fit(ax, uv)
+    """Paint a map in the given colours (f, 3), inverted triangles in red over all others.
+
+    All of it is in view, or what lies about the points of a ``window``.
+    """
+    window = uv if window is None else window
+    uv = drawable(uv, window)
+    scale = fit(ax, drawable(window))
     color = color.copy()
     color[inverted] = RED
     height = scale * least_heights(uv[F])

@@ -83,9 +83,12 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     )
 
 
-def drawable(points: FloatArray) -> FloatArray:
-    """Points in a unit in which squares of lengths neither overflow nor vanish: their own, if it will do."""
-    exponent = int(np.frexp(np.abs(points).max(initial=0.0))[1])
+def drawable(points: FloatArray, beside: FloatArray | None = None) -> FloatArray:
+    """Points in a unit in which squares of lengths neither overflow nor vanish: their own, if it will do.
+
+    With others to be drawn beside it is what does for those.
+    """
+    exponent = int(np.frexp(np.abs(points if beside is None else beside).max(initial=0.0))[1])
     return np.ldexp(points, -exponent) if abs(exponent) > 300 else points
 
 
