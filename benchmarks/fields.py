@@ -4,8 +4,8 @@
 
 Each field is a gentle wave with bumps on a jittered lattice, each of which folds a few cells and no two the same: 1, 50
 and 5,000 of them. What is compared is the field's distance from the given one, over all pixels: of
-`quasiharmonic.nearest_invertible`, and of the field smoothed by a Gaussian as narrow as leaves no determinant at or below
-the same bound, found by bisection.
+`quasiharmonic.nearest_invertible`, and of the field smoothed by a Gaussian as narrow as leaves no determinant at or
+below the same bound, found by bisection.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ def main(output: Path, counts: tuple[int, ...] = COUNTS) -> list[dict[str, float
         began = time.process_time()
         mended = nearest_invertible(field, least=LEAST)
         seconds = time.process_time() - began
-        assert fold_free(mended.field).all() and lowest(mended.field) > LEAST
+        assert fold_free(mended.field).all()
+        assert lowest(mended.field) > LEAST
         smooth, deviation = smoothed_until_invertible(field)
         near, smoothing = apart(mended.field, field), apart(smooth, field)
         rows.append(

@@ -5,8 +5,8 @@ where the given field takes them, both in the grid's unit, a patch descends::
 
     ½ Σ |w − a|²  +  κ Σ B((det − δ) / d)        B(s) = −(s − 1)² log s   for s < 1,   0 for s ≥ 1
 
-over its pixels and its cells' corner triangles. The barrier [1]_ is infinite at determinants of δ and vanishes, with two
-derivatives, from δ + d on: pixels whose cells are not nearly folded are pulled by the first term alone, to exactly
+over its pixels and its cells' corner triangles. The barrier [1]_ is infinite at determinants of δ and vanishes, with
+two derivatives, from δ + d on: pixels whose cells are not nearly folded are pulled by the first term alone, to exactly
 where the field takes them. κ is lowered in steps, and what is left of the barrier is then a layer too thin to matter.
 
 All patches at hand share one matrix, which falls apart into a block each, and Newton's direction; how far they go
@@ -172,7 +172,7 @@ class _Batch:
         found = self.system.descent(gradient, _SHIFTS)
         direction = found[0] if found is not None else self.system.solve_diagonal(-gradient)
         fall = -(gradient.real * direction.real + gradient.imag * direction.imag)
-        promise = np.bincount(self.of_pixel, fall, minlength=self.patches)
+        promise = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
         fallen = self._search(direction, promise, value, moving & (promise > 0))
         return (fallen > _IDLE * value) & (0.5 * promise > np.maximum(_TOLERANCE * value, _NOTHING))
 

@@ -62,6 +62,11 @@ class Grid:
         x, y = np.arange(columns) * self.spacing[0], np.arange(rows) * self.spacing[1]
         return np.stack(np.meshgrid(x, y), axis=-1)
 
+    @cached_property
+    def rest(self) -> ComplexArray:
+        """The same in the grid's unit, as complex numbers; (h, w)."""
+        return np.ascontiguousarray(self.points / self.unit).view(np.complex128)[..., 0]
+
     def cells(self, rows: IntArray, columns: IntArray) -> IntArray:
         """The four vertices of some cells, pixels counted row by row; (k, 4) int64."""
         first = rows * self.shape[1] + columns
@@ -118,7 +123,7 @@ def checked_field(field: ArrayLike) -> FloatArray:
             "field must have shape (height, width, 2), a displacement along x and y for each of at least 2 × 2 "
             f"pixels, not {array.shape}{advice}"
         )
-    bad = ~np.isfinite(array).all(axis=2)
+    bad = np.asarray(~np.isfinite(array).all(axis=2))
     if bad.any():
         raise ValueError(f"field is not finite at {named_pixels(bad)}")
     return array

@@ -1,8 +1,8 @@
 """The inverse of a displacement field, on the same grid.
 
 A field without folds maps each cell, bilinearly, onto a convex quadrilateral, and these lie side by side. Which one a
-pixel lies in is decided exactly, and where in it is a quadratic equation. So the inverse is no iteration's limit: at the
-pixels it is right to rounding, as far as the field reaches.
+pixel lies in is decided exactly, and where in it is a quadratic equation. So the inverse is no iteration's limit: at
+the pixels it is right to rounding, as far as the field reaches.
 """
 
 from __future__ import annotations

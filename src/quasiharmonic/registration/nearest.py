@@ -13,7 +13,7 @@ from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.registration.approach import approach
 from quasiharmonic.registration.grid import Grid, checked_field, checked_grid, named_pixels
-from quasiharmonic.registration.patches import NoRoom, filled_in, folded, grown, labelled
+from quasiharmonic.registration.patches import NoRoomError, filled_in, folded, grown, labelled
 
 # Pixels that are this near to where they were, in pixels, are put there.
 _THERE = 1e-6
@@ -55,9 +55,10 @@ class InvertibleField:
         """In a sentence or two."""
         if not self.folds:
             return f"The field does not fold, and is as it was. {self.certificate.summary()}"
+        moved = int(np.count_nonzero(self.moved))
         return (
-            f"{counted('cell', 'cells', self.folds)} folded; {counted('pixel', 'pixels', np.count_nonzero(self.moved))} "
-            f"moved, {self.distance:.3g} away in the root mean square over all. {self.certificate.summary()}"
+            f"{counted('cell', 'cells', self.folds)} folded; {counted('pixel', 'pixels', moved)} moved, "
+            f"{self.distance:.3g} away in the root mean square over all. {self.certificate.summary()}"
         )
 
 
@@ -78,8 +79,8 @@ def nearest_invertible(
     Parameters
     ----------
     field : (h, w, 2) array
-        Displacements along x, to the right, and y, down, of the pixel in row y and column x; in the unit of the spacing.
-        The pixel at the place p goes to ``p + field``.
+        Displacements along x, to the right, and y, down, of the pixel in row y and column x; in the unit of the
+        spacing. The pixel at the place p goes to ``p + field``.
     spacing : float or (float, float)
         From a pixel to the next, along x and along y.
     least : float
@@ -197,29 +198,27 @@ def _descended(grid: Grid, given: ComplexArray, held: BoolArray, least: float) -
     """The nearest map, from one without folds; patches grow until nothing moves at their rims."""
     try:
         w, patch = filled_in(grid, given, held, least)
-    except NoRoom as none:
+    except NoRoomError as none:
         raise RuntimeError(
-            f"no field without folds was found that keeps what is held: {named_pixels(none.mask)} fold still. "
-            "Hold fewer pixels around these"
+            "no field without folds was found that keeps what is held; what folds still has "
+            f"{named_pixels(none.mask)}. Hold fewer pixels around these"
         ) from none
-    todo = patch
+    moving = patch
     for _ in range(_ROUNDS):
-        approach(grid, w, given, todo, least)
-        _put_back(grid, w, given, todo, least)
-        pressing = np.unique(todo[(w != given) & grown(patch == 0, 1, held) & (todo > 0)])
-        if not pressing.size:
-            break
-        free = (patch > 0) | grown(np.isin(todo, pressing) & (todo > 0), _WIDER, held)
+        approach(grid, w, given, moving, least)
+        _put_back(grid, w, given, least)
+        rim = (w != given) & (moving > 0) & grown(patch == 0, 1, held)
+        pressing = np.isin(moving, np.unique(moving[rim])) & rim.any() & (moving > 0)
+        free = (patch > 0) | grown(pressing, _WIDER, held)
         if np.array_equal(free, patch > 0):
             break
-        again = np.isin(todo, pressing) & (todo > 0)
         patch = labelled(free)
-        todo = np.where(np.isin(patch, np.unique(patch[again])), patch, 0)
+        moving = np.where(np.isin(patch, np.unique(patch[pressing])), patch, 0)
     return w
 
 
-def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, patch: object, least: float) -> None:
-    """Put pixels to where they were that are all but there, and do no fold with that."""
+def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, least: float) -> None:
+    """Put pixels to where they were that are all but there, if nothing folds with that."""
     there = (w != given) & (np.abs(w - given) < _THERE)
     before = w[there]
     w[there] = given[there]

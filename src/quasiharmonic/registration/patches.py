@@ -8,12 +8,16 @@ the end: far enough smoothed it is a translation.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.linsolve import make_solver
-from quasiharmonic.registration.approach import touched_cells
 from quasiharmonic.registration.grid import Grid
+
+if TYPE_CHECKING:
+    from scipy.sparse import dia_array
 
 # How far around folded cells pixels are freed, and by what factor patches that fold still grow.
 _REACH, _GROWTH = 2, 2
@@ -22,7 +26,7 @@ _SMOOTHER = 1.2
 _EIGHT = np.ones((3, 3), dtype=bool)
 
 
-class NoRoom(Exception):
+class NoRoomError(Exception):
     """Pixels that are held leave no map without folds that could be found; ``mask`` (h, w) says where."""
 
     def __init__(self, mask: BoolArray) -> None:
@@ -32,8 +36,7 @@ class NoRoom(Exception):
 
 def folded(grid: Grid, w: ComplexArray, least: float) -> BoolArray:
     """The cells (h − 1, w − 1) of which a corner's determinant is at most ``least``."""
-    cells: BoolArray = (grid.jacobians(w) <= least).any(axis=2)
-    return cells
+    return np.asarray((grid.jacobians(w) <= least).any(axis=2))
 
 
 def corners_of(cells: BoolArray) -> BoolArray:
@@ -81,80 +84,63 @@ def filled_in(grid: Grid, given: ComplexArray, held: BoolArray, least: float) ->
 
     Raises
     ------
-    NoRoom
+    NoRoomError
         When none was found, which only pixels that are held can do.
     """
     w, steps = given.copy(), _REACH
     free = grown(corners_of(folded(grid, given, least)), steps, held)
-    while True:
+    while not free.all():
         patch = labelled(free)
-        _fill(grid, w, given, patch)
+        _fill(grid, w, given, free)
         wrong = folded(grid, w, least)
         if not wrong.any():
             return w, patch
-        if free.all():
-            return _smoothed(grid, given, least), patch
         steps *= _GROWTH
         failed = np.unique(patch[corners_of(wrong)])
         larger = grown(np.isin(patch, failed[failed > 0]) | corners_of(wrong), steps, held) | free
         if np.array_equal(larger, free):
-            raise NoRoom(corners_of(wrong))
+            raise NoRoomError(corners_of(wrong))
         free = larger
+    return _smoothed(grid, given, least), labelled(free)
 
 
-def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray) -> None:
+def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
     """Make the displacements of free pixels harmonic, those of the others given, the grid's border free."""
-    from scipy.sparse import coo_array
+    from scipy.sparse import csr_array, eye_array, kron, triu
 
-    free = patch.ravel() > 0
-    place = np.cumsum(free) - 1
-    size = int(np.count_nonzero(free))
-    rest = (grid.points / grid.unit).view(np.complex128)[..., 0].ravel()
-    moved = given.ravel() - rest
-    pixel = np.arange(free.size).reshape(grid.shape)
-    aspect = grid.spacing[1] / grid.spacing[0]
-    diagonal, load = np.zeros(size), np.zeros(size, dtype=np.complex128)
-    entries = []
-    for tail, head, weight in (
-        (pixel[:, :-1].ravel(), pixel[:, 1:].ravel(), aspect),
-        (pixel[:-1].ravel(), pixel[1:].ravel(), 1 / aspect),
-    ):
-        for one, other in ((tail, head), (head, tail)):
-            own = free[one]
-            np.add.at(diagonal, place[one[own]], weight)
-            rim = own & ~free[other]
-            np.add.at(load, place[one[rim]], weight * moved[other[rim]])
-        both = free[tail] & free[head]
-        entries.append((place[tail[both]], place[head[both]], np.full(np.count_nonzero(both), -weight)))
-    if np.all(free):
-        return
-    own = np.arange(size)
-    row, column, value = (np.concatenate(part) for part in zip((own, own, diagonal), *entries, strict=True))
-    matrix = coo_array((value, (row, column)), shape=(size, size)).tocsr()
+    inside, moved = np.flatnonzero(free), (given - grid.rest).ravel()
+    (rows, columns), aspect = grid.shape, grid.spacing[1] / grid.spacing[0]
+    laplacian = aspect * kron(eye_array(rows), _path(columns)) + kron(_path(rows), eye_array(columns)) / aspect
+    own_rows = csr_array(laplacian)[inside]
+    load = -(own_rows @ np.where(free.ravel(), 0, moved))
+    matrix = csr_array(triu(own_rows[:, inside], format="csr"))
     matrix.sort_indices()
     with make_solver(matrix.indptr, matrix.indices) as solver:
         solver.factor(matrix.data)
         answer = solver.solve(np.stack([load.real, load.imag], axis=1))
     w[:] = given
-    w.ravel()[free] = rest[free] + answer[:, 0] + 1j * answer[:, 1]
+    w.ravel()[inside] = grid.rest.ravel()[inside] + answer[:, 0] + 1j * answer[:, 1]
+
+
+def _path(count: int) -> dia_array:
+    """The Laplacian of so many points in a row."""
+    from scipy.sparse import diags_array
+
+    degree = np.full(count, 2.0)
+    degree[[0, -1]] = 1
+    beside = np.full(count - 1, -1.0)
+    return diags_array([beside, degree, beside], offsets=[-1, 0, 1])
 
 
 def _smoothed(grid: Grid, given: ComplexArray, least: float) -> ComplexArray:
     """The map whose displacements are smoothed by a Gaussian, as little as leaves no fold."""
-    rest = (grid.points / grid.unit).view(np.complex128)[..., 0]
-    deviation = 1.0
-    while True:
-        w = rest + smoothed(given - rest, deviation)
+    from scipy.ndimage import gaussian_filter
+
+    moved, deviation = given - grid.rest, 1.0
+    while deviation < max(grid.shape):
+        smooth = [gaussian_filter(part, deviation, mode="nearest") for part in (moved.real, moved.imag)]
+        w: ComplexArray = grid.rest + smooth[0] + 1j * smooth[1]
         if not folded(grid, w, least).any():
             return w
         deviation *= _SMOOTHER
-        if deviation > 10 * max(grid.shape):
-            return rest + (given - rest).mean()
-
-
-def smoothed(moved: ComplexArray, deviation: float) -> ComplexArray:
-    """Displacements (h, w) smoothed by a Gaussian, its standard deviation in pixels."""
-    from scipy.ndimage import gaussian_filter
-
-    parts = [gaussian_filter(part, deviation, mode="nearest") for part in (moved.real, moved.imag)]
-    return np.asarray(parts[0] + 1j * parts[1])
+    return grid.rest + moved.mean()
