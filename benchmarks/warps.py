@@ -2,9 +2,10 @@
 
     python benchmarks/warps.py [-o FOLDER] [--resolutions 16 32 64 128 256]
 
-Three scenes on a picture of 257 × 257 pixels: one landmark that goes 48 pixels, six that go about a circle, a curve that
-bends. *Stretch* is the larger of σ₁ and 1/σ₂, the worst of all triangles. `cusps` is ``smoothness=0``, a deformation energy
-of first derivatives alone, as all landmark warps here were made once; `smooth` is the default. Writes a table and a plot.
+Three scenes on a picture of 257 × 257 pixels: one landmark that goes 48 pixels, six that go about a circle, a curve
+that bends. *Stretch* is the larger of σ₁ and 1/σ₂, the worst of all triangles. `cusps` is ``smoothness=0``, a
+deformation energy of first derivatives alone, as all landmark warps here were made once; `smooth` is the default.
+Writes a table and a plot.
 """
 
 from __future__ import annotations

@@ -66,7 +66,9 @@ def test_one_fold_is_mended_and_the_rest_is_untouched():
     # A Gaussian as narrow as leaves no fold is much further away.
     smooth = next(
         made
-        for made in (np.stack([gaussian_filter(field[..., k], s) for k in (0, 1)], axis=-1) for s in np.arange(0.5, 5, 0.1))
+        for made in (
+            np.stack([gaussian_filter(field[..., k], s) for k in (0, 1)], axis=-1) for s in np.arange(0.5, 5, 0.1)
+        )
         if determinants(made).min() > 0.01
     )
     assert apart < 0.5 * np.sqrt(((smooth - field) ** 2).sum(axis=2).mean())

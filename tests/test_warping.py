@@ -216,7 +216,7 @@ def test_curves_go_to_curves():
     angle = 2 * np.pi * t
     ring = np.stack([45 + 8 * np.cos(angle), 62 + 8 * np.sin(angle)], axis=1)
     ring[-1] = ring[0]
-    curves = [(line[[0, -1]], bow), (ring, ring + (6, 0))]
+    curves = [(line[[0, -1]], bow), (ring, np.add(ring, (6, 0)))]
     warped = warp_by_landmarks(np.zeros((81, 91)), [[20, 20]], [[25, 22]], curves=curves, resolution=32)
     assert warped.result.certificate.bijective
     assert warped.moved[(warped.points == (20, 20)).all(axis=1)].tolist() == [[25, 22]]
