@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import morph, surfaces, warp_along, warp_by_landmarks
+from quasiharmonic import distortion, morph, surfaces, warp_along, warp_by_landmarks
+from quasiharmonic.energy.bending import Plate, Pull
 
 
 def blobs(height, width, centres):
@@ -163,3 +164,108 @@ def test_a_map_with_folds_is_refused():
     points = np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]])
     with pytest.raises(ValueError, match="no inverse"):
         warp_along(np.zeros((4, 4)), points, [[0, 1, 2], [0, 2, 3]], points[::-1])
+
+
+def worst_stretch(warped):
+    measured = distortion(warped.points, warped.F, warped.moved)
+    return np.maximum(measured.sigma1, 1 / measured.sigma2).max()
+
+
+def test_stretch_does_not_grow_with_the_resolution():
+    def stretch(resolution, **options):
+        return worst_stretch(
+            warp_by_landmarks(np.zeros((90, 90)), [[40, 40]], [[55, 45]], resolution=resolution, **options)
+        )
+
+    assert stretch(64) < 1.03 * stretch(16) < 1.8
+    assert stretch(64, smoothness=0) > 1.5 * stretch(16, smoothness=0)
+
+
+def test_a_slight_warp_is_a_thin_plate_with_a_pin():
+    at, by = np.array([40.0, 60.0]), np.array([0.5, 0.2])
+    warped = warp_by_landmarks(np.zeros((101, 101)), [at], [at + by], smoothness=1e4, resolution=48)
+    # Navier's series of a hinged square plate under a force at one point, over its value there.
+    k = np.arange(1, 120)
+    modes = np.sin(np.pi * k * warped.points[:, :, None] / 100)
+    force = np.sin(np.pi * k * at[:, None] / 100)
+    stiff = (k[:, None] ** 2 + k**2) ** 2
+    lift = np.einsum("nk,nl,kl->n", modes[:, 0] * force[0], modes[:, 1] * force[1], 1 / stiff)
+    lift /= np.einsum("k,l,kl->", force[0] ** 2, force[1] ** 2, 1 / stiff)
+    assert warped.moved - warped.points == pytest.approx(lift[:, None] * by, abs=2e-3)
+
+
+def test_soft_landmarks_give_way():
+    before, after = [[30, 30], [50, 30]], [[45, 30], [32, 33]]
+    missed = []
+    for weight in (1, 100, 1e4, np.inf):
+        warped = warp_by_landmarks(np.zeros((61, 81)), before, after, weights=[weight, np.inf], resolution=24)
+        assert warped.result.certificate.bijective
+        assert warped.moved[-1].tolist() == after[1]
+        missed.append(np.hypot(*(warped.moved[-2] - after[0])))
+    assert missed[0] > 1.5 * missed[1] > 20 * missed[2] > missed[3] == 0
+    # Two that want the same place each get near it.
+    both = warp_by_landmarks(np.zeros((61, 81)), before, [[40, 30], [40, 30]], weights=[1e3, 1e3], resolution=24)
+    assert both.result.certificate.bijective
+    assert np.abs(both.moved[-2:] - (40, 30)).max() < 3
+
+
+def test_curves_go_to_curves():
+    t = np.linspace(0, 1, 40)
+    line = np.stack([20 + 50 * t, 0 * t + 40], axis=1)
+    bow = np.stack([25 + 40 * t, 40 - 15 * np.sin(np.pi * t)], axis=1)
+    angle = 2 * np.pi * t
+    ring = np.stack([45 + 8 * np.cos(angle), 62 + 8 * np.sin(angle)], axis=1)
+    ring[-1] = ring[0]
+    curves = [(line[[0, -1]], bow), (ring, np.add(ring, (6, 0)))]
+    warped = warp_by_landmarks(np.zeros((81, 91)), [[20, 20]], [[25, 22]], curves=curves, resolution=32)
+    assert warped.result.certificate.bijective
+    assert warped.moved[(warped.points == (20, 20)).all(axis=1)].tolist() == [[25, 22]]
+    on_line = (warped.points[:, 1] == 40) & (np.abs(warped.points[:, 0] - 45) <= 25)
+    assert np.count_nonzero(on_line) > 15
+    # Equal parts of the one go to equal parts of the other.
+    arc = np.append(0, np.cumsum(np.hypot(*np.diff(bow, axis=0).T)))
+    part = (warped.points[on_line, 0] - 20) / 50 * arc[-1]
+    expected = np.stack([np.interp(part, arc, bow[:, axis]) for axis in (0, 1)], axis=1)
+    assert warped.moved[on_line] == pytest.approx(expected, abs=0.05)
+
+
+def test_one_landmark_or_two_are_enough():
+    for before, after in (([[30, 20]], [[38, 25]]), ([[30, 20], [12, 30]], [[38, 25], [12, 22]])):
+        warped = warp_by_landmarks(np.zeros((41, 51)), before, after, resolution=16)
+        assert warped.result.certificate.bijective
+        assert warped.moved[-len(after) :].tolist() == after
+
+
+def test_the_plate_has_the_gradient_it_says():
+    V, F = surfaces.grid(5, 4)
+    dice = np.random.default_rng(0)
+    plate = Plate(V, F, np.array([7, 8, 13]), 0.3, Pull(np.array([8]), np.array([[0.4, 0.1]]), np.array([2.0])))
+    w, step = dice.normal(size=(2, len(V), 2)).view(np.complex128)[..., 0]
+    slope = (plate.value(w + 1e-3 * step) - plate.value(w - 1e-3 * step)) / 2e-3
+    assert slope == pytest.approx(np.vdot(plate.gradient(w), step).real, rel=1e-9)
+    bend = plate.value(w + step) - 2 * plate.value(w) + plate.value(w - step)
+    assert bend == pytest.approx(2 * np.vdot(step, plate.matrix() @ step).real, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"weights": [1, 1]}, r"weights must have shape \(1,\)"),
+        ({"weights": [0]}, "the weight is not positive at landmark 0"),
+        ({"weights": [1], "smoothness": 0}, "weights need a smoothness that is positive"),
+        ({"smoothness": -1}, "smoothness must be a finite number"),
+        ({"resolution": 1}, "resolution must be a whole number of at least 2"),
+        ({"curves": [([[1, 1]], [[1, 1], [2, 2]])]}, "curve 0 must be two polylines"),
+        ({"curves": [([[1, 1], [np.nan, 2]], [[1, 1], [2, 2]])]}, "curve 0 is not finite at point 1"),
+        ({"curves": [([[1, 1], [1, 1]], [[1, 1], [2, 2]])]}, "curve 0 has no length"),
+        ({"curves": [([[1, 1], [5, 1]], [[1, 1], [2, 20]])]}, "curve 0, after: points .* not inside the picture"),
+    ],
+)
+def test_wrong_landmark_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        warp_by_landmarks(np.zeros((9, 9)), [[4, 4]], [[5, 4]], **options)
+
+
+def test_soft_landmarks_on_the_border_are_refused():
+    with pytest.raises(ValueError, match="weights: landmark 0 on the border"):
+        warp_by_landmarks(np.zeros((9, 9)), [[0, 4]], [[0, 5]], weights=[3])

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from quasiharmonic.ladder.refining import RefinedProblem, refine, refine_problem
     from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.problem import Problem
+    from quasiharmonic.registration.inverse import InverseField, inverse_field
+    from quasiharmonic.registration.nearest import InvertibleField, nearest_invertible
     from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
     from quasiharmonic.search.harmonising import harmonise
     from quasiharmonic.search.many import injective_maps
@@ -59,7 +61,9 @@ _HOME = {
     "Distortion": "energy.measures",
     "Energy": "energy.energies",
     "FrameStep": "animation.frames",
+    "InverseField": "registration.inverse",
     "InverseMap": "apply.inverse",
+    "InvertibleField": "registration.nearest",
     "MapResult": "result",
     "Moment": "apply.airmesh",
     "Morphed": "simulation.morphed",
@@ -89,9 +93,11 @@ _HOME = {
     "harmonise": "search.harmonising",
     "injective_map": "ladder.mapping",
     "injective_maps": "search.many",
+    "inverse_field": "registration.inverse",
     "is_injective": "exact.certificate",
     "keep_distances": "flattening.distance_descent",
     "morph": "simulation.morphing",
+    "nearest_invertible": "registration.nearest",
     "polish": "energy.polishing",
     "polish_derivative": "gradients.polished",
     "quasi_harmonic_derivative": "gradients.tensors",
@@ -115,7 +121,9 @@ __all__ = [
     "Distortion",
     "Energy",
     "FrameStep",
+    "InverseField",
     "InverseMap",
+    "InvertibleField",
     "MapResult",
     "Moment",
     "Morphed",
@@ -145,9 +153,11 @@ __all__ = [
     "harmonise",
     "injective_map",
     "injective_maps",
+    "inverse_field",
     "is_injective",
     "keep_distances",
     "morph",
+    "nearest_invertible",
     "polish",
     "polish_derivative",
     "quasi_harmonic_derivative",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,14 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apply.inverse import InverseMap
-from quasiharmonic.arrays import FloatArray, IntArray, check_finite, map_array, named
+from quasiharmonic.apply.landmarks import CurvePair, carried, landmarks_of, on_border, picture_mesh
+from quasiharmonic.arrays import FloatArray, IntArray, map_array, not_negative, whole_number
+from quasiharmonic.energy.bending import Pull, bend_map
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.ladder.mapping import injective_map
 from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.problem import Domain
 from quasiharmonic.result import MapResult
 
-# Cells along the longer side of a picture, and at least along the shorter, so that there is a way past landmarks.
-_ALONG, _ACROSS = 48, 6
 # Pixels drawn at a time: what is in work stays in the cache.
 _PIXELS = 1 << 15
 # Triangles with more pixels than this on average are filled one by one.
@@ -53,12 +55,16 @@ def warp_by_landmarks(
     landmarks: ArrayLike,
     moved: ArrayLike,
     *,
+    weights: ArrayLike | None = None,
+    curves: Sequence[CurvePair] = (),
+    smoothness: float | None = None,
+    resolution: int = 48,
     energy: str | Energy = "symmetric-dirichlet",
 ) -> Warped:
     """Warp a picture such that landmarks go where they are told and nothing folds.
 
     The border stays, unless landmarks are on it: then it goes along, straight between one and the next. Corners count
-    as landmarks that stay, if they are not given.
+    as landmarks that stay, if they are not given. So any number of landmarks will do, also one or none.
 
     Parameters
     ----------
@@ -69,6 +75,18 @@ def warp_by_landmarks(
         (width − 1, height − 1).
     moved : (k, 2) array
         Where they go. The picture keeps its size: what goes beyond is cut off, what nothing comes to is 0.
+    weights : (k,) array, optional
+        How much landmarks inside the picture count: each is missed where that costs less than getting there. To miss
+        one of weight 1 by a pixel costs as much as a unit of energy on a pixel. Those of infinite weight arrive
+        exactly, as all do by default.
+    curves : sequence of pairs of (a, 2) and (b, 2) arrays, optional
+        Polylines inside the picture and those that they go to, equal parts of the length to equal parts.
+    smoothness : float, optional
+        A length in pixels: as far around landmarks the warp is smooth as a thin plate is
+        (`quasiharmonic.energy.bending`), and stretches no more, however fine the mesh is. A quarter of the picture's
+        longer side by default. With 0 a landmark is a cusp, the sharper the finer the mesh.
+    resolution : int
+        Cells of the mesh along the longer side.
     energy : str or Energy
         Distortion that is lowered once the map is free of folds; see `quasiharmonic.polish`.
 
@@ -80,7 +98,7 @@ def warp_by_landmarks(
     ------
     ValueError
         When an array has the wrong shape, a landmark is outside of the picture, before or after, or stands for two,
-        or the moved border meets itself.
+        a number is out of its range, or the moved border meets itself.
     RuntimeError
         When no map without folds was found.
 
@@ -96,21 +114,22 @@ def warp_by_landmarks(
     """
     picture = _picture(image)
     height, width = picture.shape[:2]
-    before, after = _landmarks(landmarks, "landmarks"), _landmarks(moved, "moved")
-    if before.shape != after.shape:
-        raise ValueError(f"moved must have as many rows as landmarks, {len(before)}, not {len(after)}")
     size = np.array((width - 1, height - 1))
-    _check_inside("landmarks", before, ((before >= 0) & (before <= size)).all(axis=1), size)
-    edge = ((before == 0) | (before == size)).any(axis=1)
-    if np.array_equal(before[edge], after[edge]):
-        _check_inside("moved", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
-    points, F = _mesh(before, width, height)
+    whole_number("resolution", resolution, least=2)
+    length = 0.25 * float(size.max()) if smoothness is None else smoothness
+    not_negative("smoothness", length)
+    given = landmarks_of(landmarks, moved, weights, curves, float(size.max()) / resolution, size)
+    if not length and not given.hard.all():
+        raise ValueError("weights need a smoothness that is positive: without, a point pulls nothing along")
+    before, after, edge = given.before, given.after, on_border(given.before, size)
+    points, F = picture_mesh(before, width, height, resolution)
     own = len(points) - len(before) + np.arange(len(before))
     border = np.setdiff1d(boundary_edges(F, len(points)), own)
-    target = np.concatenate([points[border] + _carried(points[border], before[edge], after[edge], size), after])
+    held = given.hard
+    target = np.concatenate([points[border] + carried(points[border], before[edge], after[edge], size), after[held]])
+    fixed = np.concatenate([border, own[held]])
     # Landmarks can pass each other: on the picture's own triangles what that costs is spread from the start.
-    fixed = np.concatenate([border, own])
-    result = injective_map(points, F, fixed, target, reference="corrected", polish=energy)
+    result = injective_map(points, F, fixed, target, reference="corrected", polish=None if length else energy)
     if result.certificate.crossings.size:
         raise ValueError("moved: the border that goes along with the landmarks on it crosses itself")
     if not result.injective:
@@ -118,6 +137,9 @@ def warp_by_landmarks(
             "no warp without folds was found: landmarks that go far past each other or the border leave no room "
             f"between them. Move them less far, or give more of them along the way. ({result.status.value})"
         )
+    if length:
+        pull = Pull(own[~held], after[~held], given.weights[~held])
+        result = bend_map(Domain(points, F, fixed), result, energy=energy, length=length, pull=pull)
     return Warped(warp_along(picture, points, F, result.uv), points, F, result.uv, result)
 
 
@@ -228,71 +250,3 @@ def _fill(inverse: InverseMap, source: FloatArray) -> None:
 def _drawable(kind: np.dtype[Any]) -> np.dtype[Any]:
     """A type that SciPy draws from, without loss."""
     return kind if kind.kind in "iu" or kind in (np.float32, np.float64) else np.dtype(np.float64)
-
-
-def _landmarks(points: ArrayLike, name: str) -> FloatArray:
-    """Landmarks, checked to be points apart."""
-    array = map_array(name, points if np.size(points) else np.empty((0, 2)), finite=False)
-    check_finite(name, "point", "points", array)
-    _, first, count = np.unique(array, axis=0, return_index=True, return_counts=True)
-    if (count > 1).any():
-        place = array[first[count > 1][0]]
-        same = np.flatnonzero((array == place).all(axis=1))
-        raise ValueError(f"{name}: {named('point', 'points', same)} are at the same place, {tuple(place.tolist())}")
-    return array
-
-
-def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) -> None:
-    """Refuse landmarks outside of a picture."""
-    outside = np.flatnonzero(~inside)
-    if outside.size:
-        raise ValueError(
-            f"{name}: {named('point', 'points', outside)} not inside the picture, 0 < x < {size[0]} to the right and "
-            f"0 < y < {size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
-        )
-
-
-def _carried(border: FloatArray, before: FloatArray, after: FloatArray, size: IntArray) -> FloatArray:
-    """How far points of a picture's border go along with landmarks on it; (m, 2)."""
-    corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=np.float64)
-    given = (corners[:, None] == before).all(axis=2).any(axis=1)
-    knots = np.concatenate([corners[~given], before])
-    way = np.concatenate([np.zeros((np.count_nonzero(~given), 2)), after - before])
-    around = 2.0 * size.sum()
-    at, where = _along(knots, size), _along(border, size)
-    return np.stack([np.interp(where, at, way[:, axis], period=around) for axis in (0, 1)], axis=1)
-
-
-def _along(border: FloatArray, size: IntArray) -> FloatArray:
-    """How far around a picture points of its border are, from the first pixel to the right; (m,)."""
-    (x, y), (width, height) = border.T, size
-    return np.select(
-        [y == 0, x == width, y == height], [x, width + y, 2 * width + height - x], 2 * (width + height) - y
-    )
-
-
-def _mesh(landmarks: FloatArray, width: int, height: int) -> tuple[FloatArray, IntArray]:
-    """Triangulate a picture by a grid that makes room for landmarks, which come last."""
-    from scipy.spatial import Delaunay, cKDTree
-
-    spacing = max(width - 1, height - 1) / _ALONG
-    size = (width - 1, height - 1)
-    x, y = (np.linspace(0, side, max(_ACROSS, round(side / spacing)) + 1) for side in size)
-    grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
-    sides, landmark_sides = ((p == 0) | (p == size) for p in (grid, landmarks))
-    near = np.zeros(len(grid), dtype=bool)
-    if len(landmarks):
-        near = cKDTree(landmarks).query(grid)[0] < 0.5 * spacing
-    # Points of the border make room only for landmarks that are on it themselves, corners only for one at the corner.
-    if landmark_sides.any():
-        distance = cKDTree(landmarks[landmark_sides.any(axis=1)]).query(grid)[0]
-        near &= ~sides.any(axis=1) | (distance < np.where(sides.all(axis=1), 1e-300, 0.5 * spacing))
-    else:
-        near &= ~sides.any(axis=1)
-    kept = grid[~near]
-    points = np.concatenate([kept, landmarks])
-    F = Delaunay(points).simplices.astype(np.int64)
-    a, b, c = points[F].transpose(1, 0, 2)
-    turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
-    F[turned] = F[turned, ::-1]
-    return points, F

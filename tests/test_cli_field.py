@@ -1,0 +1,72 @@
+"""The command ``qhm field``."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic import inverse_field, nearest_invertible
+from quasiharmonic.cli import main
+
+
+@pytest.fixture
+def field(tmp_path):
+    y, x = np.mgrid[:30, :40]
+    bump = np.exp(-((x - 20) ** 2 + (y - 15) ** 2) / 10)
+    array = np.stack([5 * bump, 1 * bump], axis=-1)
+    np.save(tmp_path / "field.npy", array)
+    return array
+
+
+def test_a_field_and_its_inverse(tmp_path, field, capsys):
+    paths = [str(tmp_path / name) for name in ("field.npy", "mended.npy", "back.npy")]
+    options = ["--spacing", "0.5", "2", "--hold-border", "--least", "0.02", "--json", str(tmp_path / "report.json")]
+    assert main(["field", paths[0], "-o", paths[1], "--inverse", paths[2], *options]) == 0
+    border = np.ones(field.shape[:2], dtype=bool)
+    border[1:-1, 1:-1] = False
+    mended = nearest_invertible(field, spacing=(0.5, 2), least=0.02, held=border)
+    assert mended.folds > 0
+    assert np.array_equal(np.load(paths[1]), mended.field)
+    back = inverse_field(mended.field, spacing=(0.5, 2)).field
+    assert np.array_equal(np.load(paths[2]), back, equal_nan=True)
+    told = json.loads((tmp_path / "report.json").read_text())
+    assert told["bijective"]
+    assert told["folds"] == mended.folds
+    assert "lie outside" in capsys.readouterr().out
+
+
+def test_a_field_without_an_inverse(tmp_path, capsys):
+    """Its border is folded over, and no cell is."""
+    t, r = np.meshgrid(np.linspace(0, 7, 80), np.linspace(20, 30, 6))
+    ring = np.stack([r * np.sin(t), r * np.cos(t)], axis=-1)[:, ::-1]
+    x, y = np.meshgrid(np.arange(80), np.arange(6))
+    np.save(tmp_path / "ring.npy", ring * (1, -1) - np.stack([x, y], axis=-1))
+    before = np.load(tmp_path / "ring.npy")
+    status = main(["field", f"{tmp_path}/ring.npy", "-o", f"{tmp_path}/a.npy", "--inverse", f"{tmp_path}/b.npy"])
+    assert status == 1
+    assert np.array_equal(np.load(tmp_path / "a.npy"), before)
+    assert not (tmp_path / "b.npy").exists()
+    assert "b.npy is not written" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["field.npy", "-o", "a.obj"], "fields are written as .npy"),
+        (["field.npy", "-o", "field.npy"], "would replace an input file"),
+        (["field.npy", "-o", "a.npy", "--spacing", "0"], "field.npy: spacing must be a positive number"),
+        (["lost.npy", "-o", "a.npy"], r"lost.npy: field is not finite at pixel (2, 3), row and column"),
+        (["words.npy", "-o", "a.npy"], "no array of numbers in NumPy's format"),
+        (["none.npy", "-o", "a.npy"], "none.npy"),
+    ],
+)
+def test_wrong_calls(tmp_path, monkeypatch, field, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    field[2, 3, 0] = np.nan
+    np.save("lost.npy", field)
+    (tmp_path / "words.npy").write_text("words")
+    assert main(["field", *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.npy").exists()

@@ -1,0 +1,227 @@
+"""Displacement fields: when they fold, the nearest one that does not, and inverses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.optimize import minimize
+
+from quasiharmonic import certify, inverse_field, nearest_invertible
+from quasiharmonic.energy.derivatives import check_energy
+from quasiharmonic.registration.approach import ThinBarrier
+from quasiharmonic.registration.nearest import fold_free
+
+
+def pixels(h, w):
+    return np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).astype(float)
+
+
+def bump(h, w, x, y, width, push):
+    """A field that pushes pixels about one place."""
+    at = pixels(h, w) - (x, y)
+    return np.exp(-(at**2).sum(axis=2) / (2 * width**2))[..., None] * np.array(push, dtype=float)
+
+
+def wobble(h, w, size, seed=0):
+    """A smooth random field."""
+    dice = np.random.default_rng(seed)
+    return np.stack([gaussian_filter(dice.normal(size=(h, w)), 4) for _ in range(2)], axis=-1) * size
+
+
+def determinants(field):
+    """At the four corners of each cell, by what a determinant is; (4, h - 1, w - 1)."""
+    places = pixels(*field.shape[:2]) + field
+    along, down = np.diff(places, axis=1), np.diff(places, axis=0)
+    pairs = [(a, d) for a in (along[:-1], along[1:]) for d in (down[:, :-1], down[:, 1:])]
+    return np.stack([a[..., 0] * d[..., 1] - a[..., 1] * d[..., 0] for a, d in pairs])
+
+
+def test_a_field_without_folds_is_handed_back():
+    field = wobble(30, 40, 10)
+    mended = nearest_invertible(field)
+    assert np.array_equal(mended.field, field)
+    assert (mended.folds, mended.patches, mended.distance) == (0, 0, 0)
+    assert not mended.moved.any()
+    assert mended.certificate.bijective
+    assert "does not fold" in mended.summary()
+
+
+def test_one_fold_is_mended_and_the_rest_is_untouched():
+    field = wobble(50, 60, 10) + bump(50, 60, 30, 25, 2.5, (6, 1))
+    kept = field.copy()
+    mended = nearest_invertible(field)
+    assert np.array_equal(field, kept)
+    assert determinants(field).min() < -0.3
+    assert fold_free(mended.field).all()
+    assert determinants(mended.field).min() > 0.01
+    assert fold_free(mended.field.astype(np.float32)).all()
+    assert mended.certificate.bijective
+    assert mended.patches == 1
+    assert np.array_equal(mended.field[~mended.moved], field[~mended.moved])
+    away = np.hypot(*(pixels(50, 60) - (30, 25)).transpose(2, 0, 1)) > 12
+    assert not mended.moved[away].any()
+    apart = np.sqrt(((mended.field - field) ** 2).sum(axis=2).mean())
+    assert mended.distance == pytest.approx(apart, rel=1e-12)
+    # A Gaussian as narrow as leaves no fold is much further away.
+    smooth = next(
+        made
+        for made in (
+            np.stack([gaussian_filter(field[..., k], s) for k in (0, 1)], axis=-1) for s in np.arange(0.5, 5, 0.1)
+        )
+        if determinants(made).min() > 0.01
+    )
+    assert apart < 0.5 * np.sqrt(((smooth - field) ** 2).sum(axis=2).mean())
+
+
+@pytest.mark.parametrize("push", [(2.4, 0.3), (-0.9, 2.2)])
+def test_no_nearer_field_is_found_by_other_means(push):
+    field = bump(7, 7, 3.1, 2.9, 1.1, push)
+    mended = nearest_invertible(field)
+    assert mended.folds > 0
+
+    def apart(x):
+        return ((x - field.ravel()) ** 2).sum(), 2 * (x - field.ravel())
+
+    bound = {"type": "ineq", "fun": lambda x: determinants(x.reshape(field.shape)).ravel() - 0.01}
+    for start in (mended.field, 0 * field):
+        found = minimize(apart, start.ravel(), jac=True, method="SLSQP", constraints=bound, options={"maxiter": 200})
+        other = np.sqrt(found.fun / 49)
+        assert mended.distance == pytest.approx(other, rel=0.005)
+        assert mended.distance > 0.99 * other
+
+
+def test_folds_are_what_bilinear_interpolation_makes_of_a_cell():
+    dice = np.random.default_rng(4)
+    field = dice.normal(size=(25, 25, 2)) * 0.35
+    corners = determinants(field)
+    # Corners (first, below, right, last) of each cell; the determinant is bilinear with no mixed term.
+    s, t = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
+    places = pixels(25, 25) + field
+    a, b, c, d = places[:-1, :-1], places[:-1, 1:], places[1:, :-1], places[1:, 1:]
+    lowest = np.full(corners.shape[1:], np.inf)
+    for one, other in zip(s.ravel(), t.ravel(), strict=True):
+        along, down = (1 - other) * (b - a) + other * (d - c), (1 - one) * (c - a) + one * (d - b)
+        lowest = np.minimum(lowest, along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0])
+    assert 0.2 < fold_free(field).mean() < 0.9
+    assert np.array_equal(fold_free(field), lowest > 0)
+
+
+def test_a_fold_that_one_diagonal_does_not_see():
+    field = np.zeros((4, 4, 2))
+    field[1, 1] = 0.7
+    seen = [[5, 6, 10], [5, 10, 9]]
+    assert certify(seen, (pixels(4, 4) + field).reshape(-1, 2), boundary=False).injective
+    assert np.argwhere(~fold_free(field)).tolist() == [[1, 1]]
+    assert fold_free(nearest_invertible(field).field).all()
+
+
+def test_pixels_that_are_held_stay():
+    field = bump(24, 24, 3, 12, 2.0, (-4, 2))
+    border = np.ones((24, 24), dtype=bool)
+    border[1:-1, 1:-1] = False
+    field[border] = 0
+    mended = nearest_invertible(field, held=border)
+    assert not mended.moved[border].any()
+    assert fold_free(mended.field).all()
+    assert mended.distance > nearest_invertible(field).distance
+    with pytest.raises(ValueError, match=r"all held; the first of each is pixels \("):
+        nearest_invertible(field, held=np.ones((24, 24), dtype=bool))
+    swapped = np.zeros((5, 7, 2))
+    swapped[2, 2, 0], swapped[2, 4, 0] = 2, -2
+    with pytest.raises(RuntimeError, match=r"keeps what is held; what folds still has pixels \(1, 2\), "):
+        nearest_invertible(swapped, held=np.hypot(swapped[..., 0], swapped[..., 1]) > 0)
+
+
+def test_units_do_not_matter():
+    field = bump(30, 30, 15, 15, 2.0, (5, 2))
+    one, other = nearest_invertible(field), nearest_invertible(4 * field, spacing=4)
+    assert np.array_equal(4 * one.field, other.field)
+    stretched = nearest_invertible(field * (0.5, 2), spacing=(0.5, 2))
+    assert stretched.folds == one.folds
+    assert fold_free(stretched.field, spacing=(0.5, 2)).all()
+
+
+def test_a_field_turned_inside_out_has_a_nearest_one():
+    places = pixels(12, 12)
+    field = np.stack([11 - 2 * places[..., 0], 0.1 * places[..., 1]], axis=-1)
+    mended = nearest_invertible(field)
+    assert mended.folds == 121
+    assert mended.certificate.injective
+    assert fold_free(mended.field).all()
+
+
+def test_the_barrier_has_the_derivatives_it_says():
+    assert check_energy(ThinBarrier(0.05, 3.0)).passed
+
+
+@pytest.mark.parametrize("spacing", [1.0, (0.5, 3.0)])
+def test_there_and_back(spacing):
+    field = nearest_invertible(wobble(40, 50, 25) * spacing, spacing=spacing).field
+    back = inverse_field(field, spacing=spacing)
+    inside = ~back.outside
+    assert 0.8 < inside.mean() < 1
+    assert np.isnan(back.field[back.outside]).all()
+    assert back.error < 1e-12
+    grid = pixels(40, 50) * spacing
+    source = (grid + back.field)[inside]
+    x, y = (source / spacing).T
+    there = np.stack([map_coordinates(field[..., k], (y, x), order=1, mode="nearest") for k in (0, 1)], axis=-1)
+    assert source + there == pytest.approx(grid[inside], abs=1e-12)
+    assert "% of the pixels lie outside" in back.summary()
+
+
+def test_the_inverse_of_what_has_one_in_closed_form():
+    A = np.array([[0.9, 0.2], [-0.1, 1.1]])
+    grid = pixels(20, 30)
+    middle = np.array((14.5, 9.5))
+    back = inverse_field((grid - middle) @ A.T + middle - grid)
+    inverse = (grid - middle) @ np.linalg.inv(A).T + middle
+    inside = ((inverse >= 0) & (inverse <= (29, 19))).all(axis=2)
+    assert np.array_equal(back.outside, ~inside)
+    assert (grid + back.field)[inside] == pytest.approx(inverse[inside], abs=1e-12)
+
+
+def test_what_has_no_inverse_is_refused():
+    with pytest.raises(ValueError, match=r"folds.*pixels \(\d+, \d+\).*nearest_invertible"):
+        inverse_field(bump(20, 20, 10, 10, 2, (5, 0)))
+    # A strip rolled up past its own beginning: no cell folds, the ends lie on each other.
+    x, y = pixels(6, 60).transpose(2, 0, 1)
+    angle, radius = x * 2 * np.pi / 50, 30 - y
+    rolled = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)[:, ::-1]
+    field = rolled - pixels(6, 60)
+    if not fold_free(field).all():
+        field = rolled * (1, -1) - pixels(6, 60)
+    assert fold_free(field).all()
+    with pytest.raises(ValueError, match=r"no inverse\. Injective.*Not bijective"):
+        inverse_field(field)
+
+
+WRONG = np.zeros((5, 6, 2))
+LOST = WRONG.copy()
+LOST[1, 4, 0], LOST[3, 2, 1] = np.nan, np.inf
+
+
+@pytest.mark.parametrize("function", [nearest_invertible, inverse_field, fold_free])
+@pytest.mark.parametrize(
+    ("field", "options", "message"),
+    [
+        (LOST, {}, r"field is not finite at pixels \(1, 4\), \(3, 2\), row and column"),
+        (np.zeros((2, 5, 6)), {}, r"not \(2, 5, 6\): hand over numpy.moveaxis\(field, 0, -1\)"),
+        (np.zeros((4, 5, 6, 3)), {}, "fields of volumes are not handled"),
+        (np.zeros((1, 6, 2)), {}, "at least 2 × 2 pixels"),
+        (WRONG + 1j, {}, "field must hold real numbers"),
+        (WRONG, {"spacing": (1, 0)}, "spacing must be a positive number, or two"),
+        (WRONG, {"spacing": (1, 1, 1)}, "spacing must be a positive number, or two"),
+    ],
+)
+def test_wrong_fields(function, field, options, message):
+    with pytest.raises(ValueError, match=message):
+        function(field, **options)
+
+
+def test_wrong_options():
+    with pytest.raises(ValueError, match="least must be at least 0 and less than 1, not 1"):
+        nearest_invertible(WRONG, least=1)
+    with pytest.raises(ValueError, match=r"held must be an array of bool of shape \(5, 6\)"):
+        nearest_invertible(WRONG, held=[0, 1])
