@@ -142,6 +142,15 @@ def test_units_do_not_matter():
     assert fold_free(stretched.field, spacing=(0.5, 2)).all()
 
 
+def test_noise_far_away_is_mended_as_doubles_have_it():
+    field = np.random.default_rng(3).normal(size=(14, 15, 2)) * 0.3 + 1e6
+    assert not fold_free(field, spacing=0.1).all()
+    mended = nearest_invertible(field, spacing=0.1, least=0)
+    assert fold_free(mended.field, spacing=0.1).all()
+    with pytest.raises(RuntimeError, match="rounding folds the field"):
+        nearest_invertible(field + 1e16, spacing=0.1)
+
+
 def test_a_field_turned_inside_out_has_a_nearest_one():
     places = pixels(12, 12)
     field = np.stack([11 - 2 * places[..., 0], 0.1 * places[..., 1]], axis=-1)

@@ -83,7 +83,7 @@ def warp_by_landmarks(
         Polylines inside the picture and those that they go to, equal parts of the length to equal parts.
     smoothness : float, optional
         A length in pixels: as far around landmarks the warp is smooth as a thin plate is
-        (`quasiharmonic.energy.bending`), and stretches no more, however fine the mesh is. A quarter of the picture's
+        (`quasiharmonic.energy.bending`), and stretches no more, however fine the mesh is. An eighth of the picture's
         longer side by default. With 0 a landmark is a cusp, the sharper the finer the mesh.
     resolution : int
         Cells of the mesh along the longer side.
@@ -116,7 +116,7 @@ def warp_by_landmarks(
     height, width = picture.shape[:2]
     size = np.array((width - 1, height - 1))
     whole_number("resolution", resolution, least=2)
-    length = 0.25 * float(size.max()) if smoothness is None else smoothness
+    length = 0.125 * float(size.max()) if smoothness is None else smoothness
     not_negative("smoothness", length)
     given = landmarks_of(landmarks, moved, weights, curves, float(size.max()) / resolution, size)
     if not length and not given.hard.all():

@@ -84,8 +84,9 @@ def nearest_invertible(
     spacing : float or (float, float)
         From a pixel to the next, along x and along y.
     least : float
-        What the determinants of the derivative are above, all four of each cell; at least 0 and less than 1. Cells that
-        have less are folds. What is above by a little survives being stored in single precision.
+        What the determinants of the derivative are above, all four of each cell; at least 0 and less than 1, and taken
+        to be what rounding does to a determinant where it is less. Cells that have less are folds. What is above by a
+        little survives being stored in single precision.
     held : (h, w) array of bool, optional
         Pixels that keep their displacements; none by default, those of the border neither.
 
@@ -100,7 +101,8 @@ def nearest_invertible(
         When an array has the wrong shape, the field is not finite, or another option has no such value. The message
         names the pixels.
     RuntimeError
-        When no field was found, because of pixels that are held.
+        When no field was found, because of pixels that are held, or of displacements so large that nothing is left of
+        a pixel when they are rounded.
 
     Notes
     -----
@@ -124,6 +126,7 @@ def nearest_invertible(
         raise ValueError(f"least must be at least 0 and less than 1, not {least!r}")
     kept = _held(held, grid)
     w = _map(grid, given)
+    least = max(least, _rounding(w))
     wrong = folded(grid, w, least)
     mended = given.copy()
     if wrong.any():
@@ -132,6 +135,8 @@ def nearest_invertible(
         moved = here != w
         places = np.stack([here.real, here.imag], axis=-1) * grid.unit
         mended[moved] = (places - grid.points)[moved]
+        if not _fold_free(grid, mended).all():
+            raise RuntimeError("rounding folds the field that was found: displacements are too large for its spacing")
     certificate = certify(grid.triangles(), (grid.points + mended).reshape(-1, 2))
     moved = (mended != given).any(axis=2)
     return InvertibleField(
@@ -165,8 +170,11 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
         As `nearest_invertible`.
     """
     given = checked_field(field)
-    grid = checked_grid(given.shape, spacing)
-    places = (grid.points + given).reshape(-1, 2)
+    return _fold_free(checked_grid(given.shape, spacing), given)
+
+
+def _fold_free(grid: Grid, field: FloatArray) -> BoolArray:
+    places = (grid.points + field).reshape(-1, 2)
     rows, columns = np.indices((grid.shape[0] - 1, grid.shape[1] - 1)).reshape(2, -1)
     a, b, c = places[grid.corner_triangles(grid.cells(rows, columns))].swapaxes(0, 1)
     positive = (orientation(a, b, c) > 0).reshape(grid.shape[0] - 1, grid.shape[1] - 1, 4)
@@ -176,6 +184,12 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
 def _map(grid: Grid, field: FloatArray) -> ComplexArray:
     """Where pixels go, in the grid's unit; (h, w)."""
     return np.ascontiguousarray((grid.points + field) / grid.unit).view(np.complex128)[..., 0]
+
+
+def _rounding(w: ComplexArray) -> float:
+    """What rounding may do to a determinant of a map (h, w), generously."""
+    side = max(float(np.abs(np.diff(w, axis=axis)).max()) for axis in (0, 1))
+    return 64 * float(np.finfo(np.float64).eps) * float(np.abs(w).max()) * max(side, 1)
 
 
 def _held(held: ArrayLike | None, grid: Grid) -> BoolArray:
