@@ -1,0 +1,189 @@
+"""Placing: the vertices of the last inverted triangles, each where the triangles around it have most room.
+
+With all other vertices held, the height of a triangle over the edge opposite to a vertex is linear in where that vertex
+lies, and so the place at which the least of these heights is greatest solves a linear programme of three unknowns, the
+place and that height. (Freitag and Plassmann 2000 untangle meshes so, with areas for heights.) At its solution three
+heights are alike: for the six triangles or so around a vertex all places where three are alike are looked at, and the
+best is taken. Vertices that share no triangle are placed at the same time.
+
+Where a descent has come so far that few triangles are inverted this often does what it would take many more steps
+for, in less time than one of them. It is tried in passing: where it leaves anything inverted, nothing has happened.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+
+from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.energy.deformation import signed_areas
+
+# Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step of the descent.
+MOST_FLIPS = 12
+# After a try in vain the next is made when so large a part of the inverted triangles is left, or after as many steps
+# again and two more.
+_FEWER = 0.75
+# Times that the vertices of what is inverted are placed anew at most, and how often that may right no triangle.
+_SWEEPS, _IN_VAIN = 8, 2
+# Triangles around a vertex that is placed at most: of 16 there are 560 threes.
+_MOST_AROUND = 16
+
+
+class Placing:
+    """Tries to right the last inverted triangles while a descent goes on.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    fixed : (k,) int64
+        Vertices that stay; all those of the boundary are among them.
+    """
+
+    def __init__(self, F: IntArray, fixed: IntArray) -> None:
+        self._F = F
+        self._fixed = fixed
+        self._seen = self._next = 0
+        self._few_enough = float(MOST_FLIPS)
+
+    def of(self, w: ComplexArray, flipped: int) -> ComplexArray | None:
+        """The next map of the descent with some vertices moved, if this is the time for a try and it succeeds.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+        flipped : int
+            How many of its triangles are inverted.
+
+        Returns
+        -------
+        (n,) complex128 or None
+            A map without inverted triangles, in floating point.
+        """
+        seen, self._seen = self._seen, self._seen + 1
+        if not 0 < flipped <= MOST_FLIPS or (flipped > self._few_enough and seen < self._next):
+            return None
+        self._few_enough, self._next = _FEWER * flipped, 2 * seen + 2
+        return placed(self._F, w, self._fixed)
+
+
+def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None:
+    """Place the vertices of inverted triangles until none is left.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    w : (n,) complex128
+    fixed : (k,) int64
+        Vertices that stay; all those of the boundary are among them.
+
+    Returns
+    -------
+    (n,) complex128 or None
+        None where triangles stay inverted.
+    """
+    moves = np.ones(len(w), dtype=bool)
+    moves[fixed] = False
+    w = w.copy()
+    left = _inverted(F, w)
+    fewest, in_vain = left.size, 0
+    for _ in range(_SWEEPS):
+        vertices = np.unique(F[left])
+        vertices = vertices[moves[vertices]]
+        if not vertices.size:
+            return None
+        for some in _apart(F, vertices, len(w)):
+            w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
+        left = _inverted(F, w)
+        if not left.size:
+            return w
+        in_vain = 0 if left.size < fewest else in_vain + 1
+        fewest = min(fewest, left.size)
+        if in_vain == _IN_VAIN:
+            return None
+    return None
+
+
+class _Stars:
+    """Some vertices and the edges opposite to them, (m,) and twice (m, k) int64; shorter rows repeat their last."""
+
+    def __init__(self, vertices: IntArray, tails: IntArray, heads: IntArray) -> None:
+        self.vertices, self.tails, self.heads = vertices, tails, heads
+
+
+def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
+    """Vertices, interior ones in ascending order, in groups of such as share no triangle."""
+    number = np.full(n, -1)
+    number[vertices] = np.arange(vertices.size)
+    around = F[(number[F] >= 0).any(axis=1)]
+    triangle, corner = np.nonzero(number[around] >= 0)
+    own = number[around[triangle, corner]]
+    order = np.argsort(own, kind="stable")
+    triangle, corner, own = triangle[order], corner[order], own[order]
+    tails, heads = around[triangle, (corner + 1) % 3], around[triangle, (corner + 2) % 3]
+    count = np.bincount(own, minlength=vertices.size)
+    first = np.cumsum(count) - count
+    # In each of the triangles around a vertex the next corner is another neighbour: they are all neighbours.
+    neighbours = np.split(number[tails], first[1:])
+    groups: list[list[int]] = []
+    group = np.full(vertices.size + 1, -1)
+    for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
+        taken = set(group[neighbours[vertex]].tolist())
+        chosen = next(k for k in range(len(groups) + 1) if k not in taken)
+        if chosen == len(groups):
+            groups.append([])
+        groups[chosen].append(vertex)
+        group[vertex] = chosen
+    stars = []
+    for members in map(np.array, groups):
+        rows = first[members, None] + np.minimum(np.arange(count[members].max()), count[members, None] - 1)
+        stars.append(_Stars(vertices[members], tails[rows], heads[rows]))
+    return stars
+
+
+def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
+    """Where the least height of the triangles around a vertex is greatest, for many vertices.
+
+    Parameters
+    ----------
+    w : (m,) complex128
+        Where the vertices are.
+    tails, heads : (m, k) complex128
+        The edges opposite to each of them, which run round it counterclockwise; some may be there twice.
+
+    Returns
+    -------
+    (m,) complex128
+        ``w`` where rounding or an edge of no length leaves no such place.
+    """
+    first, second, third = _threes(tails.shape[1])
+    with np.errstate(all="ignore"):
+        along = heads - tails
+        normal = 1j * along / np.abs(along)
+        # The height of x over an edge is Re(conj(normal) x) less that of the edge itself.
+        level = (normal.conj() * tails).real
+        a, b = normal[:, first] - normal[:, second], normal[:, first] - normal[:, third]
+        p, q = level[:, first] - level[:, second], level[:, first] - level[:, third]
+        place = 1j * (q * a - p * b) / (a.conj() * b).imag
+        least = np.full(place.shape, np.inf)
+        for k in range(tails.shape[1]):
+            np.minimum(least, (normal[:, k, None].conj() * place).real - level[:, k, None], out=least)
+        least[~np.isfinite(least)] = -np.inf
+    best = least.argmax(axis=1)
+    rows = np.arange(len(w))
+    return np.where(np.isfinite(least[rows, best]), place[rows, best], w)
+
+
+@cache
+def _threes(count: int) -> IntArray:
+    """All threes out of so many; (3, …) int64."""
+    threes: IntArray = np.array(list(combinations(range(count), 3)), dtype=np.int64).T
+    return threes
+
+
+def _inverted(F: IntArray, w: ComplexArray) -> IntArray:
+    """Triangles whose signed area is not positive, in floating point."""
+    area: FloatArray = signed_areas(F, w)
+    inverted: IntArray = np.flatnonzero(~(area > 0))
+    return inverted
