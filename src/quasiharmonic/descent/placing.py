@@ -1,32 +1,35 @@
 """Placing: the vertices of the last inverted triangles, each where the triangles around it have most room.
 
-With all other vertices held, the height of a triangle over the edge opposite to a vertex is linear in where that vertex
-lies, and so the place at which the least of these heights is greatest solves a linear programme of three unknowns, the
-place and that height. (Freitag and Plassmann 2000 untangle meshes so, with areas for heights.) At its solution three
-heights are alike: for the six triangles or so around a vertex all places where three are alike are looked at, and the
-best is taken. Vertices that share no triangle are placed at the same time.
+With all other vertices held, the signed area of a triangle is linear in where one of its corners lies, and so the place
+at which the least area around a vertex is greatest solves a linear programme of three unknowns, the place and that
+area: the local untangling of Freitag and Plassmann (2000). At its solution three areas are alike: for the six triangles
+or so around a vertex all places where three are alike are looked at, and the best is taken. Vertices that share no
+triangle are placed at the same time.
 
 Where a descent has come so far that few triangles are inverted this often does what it would take many more steps
-for, in less time than one of them. It is tried in passing: where it leaves anything inverted, nothing has happened.
+for, in no more time than one or two of them. It is tried in passing: where it leaves anything inverted, nothing has
+happened.
 """
 
 from __future__ import annotations
 
 from functools import cache
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.energy.deformation import signed_areas
 
-# Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step of the descent.
-MOST_FLIPS = 12
+# Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step of the descent. The
+# first map, from which the way may be far, is tried with more.
+_MOST_FLIPS, _MOST_AT_FIRST = 12, 100
 # After a try in vain the next is made when so large a part of the inverted triangles is left, or after as many steps
 # again and two more.
 _FEWER = 0.75
-# Times that the vertices of what is inverted are placed anew at most, and how often that may right no triangle.
-_SWEEPS, _IN_VAIN = 8, 2
+# Times that the vertices of what is inverted are placed anew at most, and how often in a row that may be in vain.
+_SWEEPS, _IN_VAIN = 16, 4
 # Triangles around a vertex that is placed at most: of 16 there are 560 threes.
 _MOST_AROUND = 16
 
@@ -45,7 +48,7 @@ class Placing:
         self._F = F
         self._fixed = fixed
         self._seen = self._next = 0
-        self._few_enough = float(MOST_FLIPS)
+        self._few_enough = 0.0
 
     def of(self, w: ComplexArray, flipped: int) -> ComplexArray | None:
         """The next map of the descent with some vertices moved, if this is the time for a try and it succeeds.
@@ -62,7 +65,9 @@ class Placing:
             A map without inverted triangles, in floating point.
         """
         seen, self._seen = self._seen, self._seen + 1
-        if not 0 < flipped <= MOST_FLIPS or (flipped > self._few_enough and seen < self._next):
+        if not 0 < flipped <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
+            return None
+        if flipped > self._few_enough and seen < self._next:
             return None
         self._few_enough, self._next = _FEWER * flipped, 2 * seen + 2
         return placed(self._F, w, self._fixed)
@@ -86,14 +91,16 @@ def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None
     moves = np.ones(len(w), dtype=bool)
     moves[fixed] = False
     w = w.copy()
-    left = _inverted(F, w)
+    left, vertices, groups = _inverted(F, w), np.empty(0, dtype=np.int64), list[_Stars]()
     fewest, in_vain = left.size, 0
     for _ in range(_SWEEPS):
-        vertices = np.unique(F[left])
+        before, vertices = vertices, np.unique(F[left])
         vertices = vertices[moves[vertices]]
         if not vertices.size:
             return None
-        for some in _apart(F, vertices, len(w)):
+        if not np.array_equal(vertices, before):
+            groups = _apart(F, vertices, len(w))
+        for some in groups:
             w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
         left = _inverted(F, w)
         if not left.size:
@@ -105,15 +112,16 @@ def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None
     return None
 
 
-class _Stars:
-    """Some vertices and the edges opposite to them, (m,) and twice (m, k) int64; shorter rows repeat their last."""
+class _Stars(NamedTuple):
+    """Some vertices and the edges opposite to each, (m,) and twice (m, k) int64; shorter rows repeat their last."""
 
-    def __init__(self, vertices: IntArray, tails: IntArray, heads: IntArray) -> None:
-        self.vertices, self.tails, self.heads = vertices, tails, heads
+    vertices: IntArray
+    tails: IntArray
+    heads: IntArray
 
 
 def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
-    """Vertices, interior ones in ascending order, in groups of such as share no triangle."""
+    """Interior vertices, in ascending order, in groups of such as share no triangle."""
     number = np.full(n, -1)
     number[vertices] = np.arange(vertices.size)
     around = F[(number[F] >= 0).any(axis=1)]
@@ -127,6 +135,7 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     # In each of the triangles around a vertex the next corner is another neighbour: they are all neighbours.
     neighbours = np.split(number[tails], first[1:])
     groups: list[list[int]] = []
+    # What has no group, or is none of the vertices and so has the last place, is in group -1.
     group = np.full(vertices.size + 1, -1)
     for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
         taken = set(group[neighbours[vertex]].tolist())
@@ -143,32 +152,31 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
 
 
 def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
-    """Where the least height of the triangles around a vertex is greatest, for many vertices.
+    """Where the least signed area of the triangles around a vertex is greatest, for many vertices.
 
     Parameters
     ----------
     w : (m,) complex128
         Where the vertices are.
     tails, heads : (m, k) complex128
-        The edges opposite to each of them, which run round it counterclockwise; some may be there twice.
+        The edges opposite to each of them, which make a closed loop; some may be there twice.
 
     Returns
     -------
     (m,) complex128
-        ``w`` where rounding or an edge of no length leaves no such place.
+        ``w`` where rounding leaves no such place.
     """
     first, second, third = _threes(tails.shape[1])
     with np.errstate(all="ignore"):
-        along = heads - tails
-        normal = 1j * along / np.abs(along)
-        # The height of x over an edge is Re(conj(normal) x) less that of the edge itself.
-        level = (normal.conj() * tails).real
-        a, b = normal[:, first] - normal[:, second], normal[:, first] - normal[:, third]
+        # Twice the area at x is Re(conj(inward) x) - level.
+        inward = 1j * (heads - tails)
+        level = (inward.conj() * tails).real
+        a, b = inward[:, first] - inward[:, second], inward[:, first] - inward[:, third]
         p, q = level[:, first] - level[:, second], level[:, first] - level[:, third]
         place = 1j * (q * a - p * b) / (a.conj() * b).imag
         least = np.full(place.shape, np.inf)
         for k in range(tails.shape[1]):
-            np.minimum(least, (normal[:, k, None].conj() * place).real - level[:, k, None], out=least)
+            np.minimum(least, (inward[:, k, None].conj() * place).real - level[:, k, None], out=least)
         least[~np.isfinite(least)] = -np.inf
     best = least.argmax(axis=1)
     rows = np.arange(len(w))
@@ -184,6 +192,5 @@ def _threes(count: int) -> IntArray:
 
 def _inverted(F: IntArray, w: ComplexArray) -> IntArray:
     """Triangles whose signed area is not positive, in floating point."""
-    area: FloatArray = signed_areas(F, w)
-    inverted: IntArray = np.flatnonzero(~(area > 0))
+    inverted: IntArray = np.flatnonzero(~(signed_areas(F, w) > 0))
     return inverted
