@@ -133,12 +133,12 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     count = np.bincount(own, minlength=vertices.size)
     first = np.cumsum(count) - count
     # In each of the triangles around a vertex the next corner is another neighbour: they are all neighbours.
-    neighbours = np.split(number[tails], first[1:])
+    neighbours, start = number[tails].tolist(), [*first.tolist(), own.size]
     groups: list[list[int]] = []
     # What has no group, or is none of the vertices and so has the last place, is in group -1.
-    group = np.full(vertices.size + 1, -1)
+    group = [-1] * (vertices.size + 1)
     for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
-        taken = set(group[neighbours[vertex]].tolist())
+        taken = {group[other] for other in neighbours[start[vertex] : start[vertex + 1]]}
         chosen = next(k for k in range(len(groups) + 1) if k not in taken)
         if chosen == len(groups):
             groups.append([])
@@ -166,21 +166,20 @@ def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> Compl
     (m,) complex128
         ``w`` where rounding leaves no such place.
     """
-    first, second, third = _threes(tails.shape[1])
+    edge = heads - tails
+    # Twice the area at (x, y) is the first times x and the second times y less the third.
+    area = np.empty((3, *edge.shape))
+    area[0], area[1] = -edge.imag, edge.real
+    area[2] = area[0] * tails.real + area[1] * tails.imag
+    three = area[:, :, _threes(edge.shape[1])]
+    (ax, ay, p), (bx, by, q) = three[:, :, 0] - three[:, :, 1], three[:, :, 0] - three[:, :, 2]
     with np.errstate(all="ignore"):
-        # Twice the area at x is Re(conj(inward) x) - level.
-        inward = 1j * (heads - tails)
-        level = (inward.conj() * tails).real
-        a, b = inward[:, first] - inward[:, second], inward[:, first] - inward[:, third]
-        p, q = level[:, first] - level[:, second], level[:, first] - level[:, third]
-        place = 1j * (q * a - p * b) / (a.conj() * b).imag
-        least = np.full(place.shape, np.inf)
-        for k in range(tails.shape[1]):
-            np.minimum(least, (inward[:, k, None].conj() * place).real - level[:, k, None], out=least)
-        least[~np.isfinite(least)] = -np.inf
-    best = least.argmax(axis=1)
-    rows = np.arange(len(w))
-    return np.where(np.isfinite(least[rows, best]), place[rows, best], w)
+        place = np.stack([p * by - q * ay, ax * q - bx * p], axis=1) / (ax * by - ay * bx)[:, None]
+        least = (area[:2].transpose(1, 2, 0) @ place - area[2][:, :, None]).min(axis=1)
+    least[~np.isfinite(least)] = -np.inf
+    best, rows = least.argmax(axis=1), np.arange(len(w))
+    found = place[rows, 0, best] + 1j * place[rows, 1, best]
+    return np.where(np.isfinite(least[rows, best]), found, w)
 
 
 @cache
