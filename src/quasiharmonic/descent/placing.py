@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, IntArray
+from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.energy.deformation import signed_areas
 
 # Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step of the descent. The
@@ -34,43 +34,22 @@ _SWEEPS, _IN_VAIN = 16, 4
 _MOST_AROUND = 16
 
 
-class Placing:
-    """Tries to right the last inverted triangles while a descent goes on.
+class Tries:
+    """When it is time for a try, while a descent goes on."""
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-    fixed : (k,) int64
-        Vertices that stay; all those of the boundary are among them.
-    """
-
-    def __init__(self, F: IntArray, fixed: IntArray) -> None:
-        self._F = F
-        self._fixed = fixed
+    def __init__(self) -> None:
         self._seen = self._next = 0
         self._few_enough = 0.0
 
-    def of(self, w: ComplexArray, flipped: int) -> ComplexArray | None:
-        """The next map of the descent with some vertices moved, if this is the time for a try and it succeeds.
-
-        Parameters
-        ----------
-        w : (n,) complex128
-        flipped : int
-            How many of its triangles are inverted.
-
-        Returns
-        -------
-        (n,) complex128 or None
-            A map without inverted triangles, in floating point.
-        """
+    def due(self, flipped: int) -> bool:
+        """Whether to try the next map of the descent, of which so many triangles are inverted."""
         seen, self._seen = self._seen, self._seen + 1
         if not 0 < flipped <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
-            return None
+            return False
         if flipped > self._few_enough and seen < self._next:
-            return None
+            return False
         self._few_enough, self._next = _FEWER * flipped, 2 * seen + 2
-        return placed(self._F, w, self._fixed)
+        return True
 
 
 def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None:
@@ -86,30 +65,48 @@ def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None
     Returns
     -------
     (n,) complex128 or None
-        None where triangles stay inverted.
+        A map without inverted triangles, in floating point; None where some stay inverted.
+    """
+    moved, righted = placed_each(F, w, fixed, np.zeros(len(F), dtype=np.int64))
+    return moved if righted.all() else None
+
+
+def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -> tuple[ComplexArray, BoolArray]:
+    """As `placed`, for many meshes side by side.
+
+    Parameters
+    ----------
+    F, w, fixed
+        Of all meshes, none joined to another.
+    mesh : (f,) int64
+        Which mesh a triangle belongs to.
+
+    Returns
+    -------
+    w : (n,) complex128
+    righted : (m,) bool
+        Of which meshes no triangle is inverted any more.
     """
     moves = np.ones(len(w), dtype=bool)
     moves[fixed] = False
     w = w.copy()
-    left, vertices, groups = _inverted(F, w), np.empty(0, dtype=np.int64), list[_Stars]()
-    fewest, in_vain = left.size, 0
-    for _ in range(_SWEEPS):
-        before, vertices = vertices, np.unique(F[left])
+    fewest, in_vain = np.full(int(mesh.max()) + 1, len(F) + 1), np.zeros(int(mesh.max()) + 1, dtype=np.int64)
+    vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
+    for sweep in range(_SWEEPS + 1):
+        left = np.flatnonzero(~(signed_areas(F, w) > 0))
+        count = np.bincount(mesh[left], minlength=fewest.size)
+        in_vain = np.where(count < fewest, 0, in_vain + 1)
+        fewest = np.minimum(count, fewest)
+        tried = in_vain < _IN_VAIN
+        before, vertices = vertices, np.unique(F[left[tried[mesh[left]]]])
         vertices = vertices[moves[vertices]]
-        if not vertices.size:
-            return None
+        if not vertices.size or sweep == _SWEEPS:
+            break
         if not np.array_equal(vertices, before):
             groups = _apart(F, vertices, len(w))
         for some in groups:
             w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
-        left = _inverted(F, w)
-        if not left.size:
-            return w
-        in_vain = 0 if left.size < fewest else in_vain + 1
-        fewest = min(fewest, left.size)
-        if in_vain == _IN_VAIN:
-            return None
-    return None
+    return w, fewest == 0
 
 
 class _Stars(NamedTuple):
@@ -187,9 +184,3 @@ def _threes(count: int) -> IntArray:
     """All threes out of so many; (3, …) int64."""
     threes: IntArray = np.array(list(combinations(range(count), 3)), dtype=np.int64).T
     return threes
-
-
-def _inverted(F: IntArray, w: ComplexArray) -> IntArray:
-    """Triangles whose signed area is not positive, in floating point."""
-    inverted: IntArray = np.flatnonzero(~(signed_areas(F, w) > 0))
-    return inverted

@@ -14,7 +14,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.descent.base import FunctionalDescent, Iterates
-from quasiharmonic.descent.placing import Placing
+from quasiharmonic.descent.placing import Tries, placed
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.reference import blocks
 
@@ -82,12 +82,12 @@ class VectorAdam(FunctionalDescent):
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""
         pace = self.pace(start.xi.size)
-        tries = Placing(objective.problem.F, objective.problem.fixed) if self.placing else None
-        here = start
+        problem, tries, here = objective.problem, Tries(), start
         for _ in range(self.iterations):
-            w = None if tries is None else tries.of(here.w, here.flipped)
-            if w is not None:
-                yield objective.of_map(w)
+            if self.placing and tries.due(here.flipped):
+                w = placed(problem.F, here.w, problem.fixed)
+                if w is not None:
+                    yield objective.of_map(w)
             here = objective.step(here, pace.step(here.gradient))
             yield here
         return False
