@@ -32,17 +32,18 @@ def stirred(rng, V, F, share=0.1):
 
 
 @pytest.mark.parametrize("corners", [3, 4, 6, 9])
-def test_the_least_area_is_greatest(rng, corners):
+def test_the_least_height_is_greatest(rng, corners):
     tails = rings(rng, 30, corners)
     heads = np.roll(tails, -1, axis=1)
     found = roomiest(np.zeros(30, dtype=complex), tails, heads)
     for place, ring in zip(found, tails, strict=True):
         F = np.stack([np.full(corners, corners), np.arange(corners), np.roll(np.arange(corners), -1)], axis=1)
-        origin, right, up = (signed_areas(F, np.append(ring, at)) for at in (0, 1, 1j))
-        # The greatest t with area(x, y) ≥ t.
+        length = np.abs(np.roll(ring, -1) - ring)
+        origin, right, up = (2 * signed_areas(F, np.append(ring, at)) / length for at in (0, 1, 1j))
+        # The greatest t with height(x, y) ≥ t.
         A = np.stack([origin - right, origin - up, np.ones(corners)], axis=1)
         best = linprog([0, 0, -1], A_ub=A, b_ub=origin, bounds=[(None, None)] * 3)
-        assert signed_areas(F, np.append(ring, place)).min() == pytest.approx(-best.fun, abs=1e-12)
+        assert (2 * signed_areas(F, np.append(ring, place)) / length).min() == pytest.approx(-best.fun, abs=1e-12)
 
 
 def test_edges_that_are_there_twice_are_no_matter(rng):
@@ -53,18 +54,13 @@ def test_edges_that_are_there_twice_are_no_matter(rng):
     np.testing.assert_allclose(roomiest(np.zeros(10, dtype=complex), tails[:, last], heads[:, last]), once, atol=1e-12)
 
 
-def test_any_affine_map_of_the_surroundings_moves_the_place_alike(rng):
-    """A target that is flat is like any other."""
+def test_what_turns_and_grows_takes_the_place_with_it(rng):
     tails = rings(rng, 10, 6)
     heads = np.roll(tails, -1, axis=1)
-
-    def flat(z):
-        return 3 * z.real + 1 + 1e-5j * (z.imag + 0.4 * z.real)
-
-    there = roomiest(np.zeros(10, dtype=complex), flat(tails), flat(heads))
-    before = flat(roomiest(np.zeros(10, dtype=complex), tails, heads))
-    np.testing.assert_allclose(there.real, before.real, atol=1e-9)
-    np.testing.assert_allclose(there.imag, before.imag, atol=1e-14)
+    before = roomiest(np.zeros(10, dtype=complex), tails, heads)
+    turn, shift = 1e-6 * np.exp(0.7j), 3 - 2j
+    there = roomiest(np.zeros(10, dtype=complex), turn * tails + shift, turn * heads + shift)
+    np.testing.assert_allclose((there - shift) / turn, before, atol=1e-8)
 
 
 def test_without_room_at_all_a_vertex_stays():
@@ -73,16 +69,18 @@ def test_without_room_at_all_a_vertex_stays():
 
 
 def test_vertices_thrown_elsewhere_come_back(rng):
-    V, F = random_delaunay(300, rng)
-    w, loop = stirred(rng, V, F)
+    V, F = random_delaunay(900, rng)
+    w, loop = stirred(rng, V, F, 0.01)
     given, inverted = w.copy(), signed_areas(F, w) <= 0
-    assert inverted.sum() > 50
+    assert inverted.sum() > 10
     there = placed(F, w, loop)
     assert signed_areas(F, there).min() > 0
     assert np.array_equal(w, given)
     assert np.array_equal(there[loop], w[loop])
     # What is far from anything inverted has no reason to move.
-    near = np.isin(F, F[inverted]).any(axis=1)
+    near = inverted
+    for _ in range(4):
+        near = np.isin(F, F[near]).any(axis=1)
     far = np.setdiff1d(np.arange(len(V)), F[near])
     assert far.size > 20
     assert np.array_equal(there[far], w[far])

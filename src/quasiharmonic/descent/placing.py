@@ -1,13 +1,14 @@
 """Placing: the vertices of the last inverted triangles, each where the triangles around it have most room.
 
-With all other vertices held, the signed area of a triangle is linear in where one of its corners lies, and so the place
-at which the least area around a vertex is greatest solves a linear programme of three unknowns, the place and that
-area: the local untangling of Freitag and Plassmann (2000). At its solution three areas are alike: for the six triangles
-or so around a vertex all places where three are alike are looked at, and the best is taken. Vertices that share no
-triangle are placed at the same time.
+With all other vertices held, the signed height of a triangle over the edge opposite to a corner is linear in where that
+corner lies, and so the place at which the least height around a vertex is greatest solves a linear programme of three
+unknowns, the place and that height. (The local untangling of Freitag and Plassmann 2000 does so with areas; heights
+leave maps that are less distorted.) At its solution three heights are alike: for the six triangles or so around a
+vertex all places where three are alike are looked at, and the best is taken. Vertices that share no triangle are
+placed at the same time.
 
 Where a descent has come so far that few triangles are inverted this often does what it would take many more steps
-for, in no more time than one or two of them. It is tried in passing: where it leaves anything inverted, nothing has
+for, in no more time than two or three of them. It is tried in passing: where it leaves anything inverted, nothing has
 happened.
 """
 
@@ -30,6 +31,8 @@ _MOST_FLIPS, _MOST_AT_FIRST = 12, 100
 _FEWER = 0.75
 # Times that the vertices of what is inverted are placed anew at most, and how often in a row that may be in vain.
 _SWEEPS, _IN_VAIN = 16, 4
+# Times that what has been righted is placed once more, with its neighbours, so that the room is shared.
+_SHARING = 2
 # Triangles around a vertex that is placed at most: of 16 there are 560 threes.
 _MOST_AROUND = 16
 
@@ -89,7 +92,7 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
     """
     moves = np.ones(len(w), dtype=bool)
     moves[fixed] = False
-    w = w.copy()
+    given, w = w, w.copy()
     fewest, in_vain = np.full(int(mesh.max()) + 1, len(F) + 1), np.zeros(int(mesh.max()) + 1, dtype=np.int64)
     vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
     for sweep in range(_SWEEPS + 1):
@@ -104,9 +107,27 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
             break
         if not np.array_equal(vertices, before):
             groups = _apart(F, vertices, len(w))
-        for some in groups:
-            w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
-    return w, fewest == 0
+        _place(w, groups)
+    righted = fewest == 0
+    if righted.any():
+        # What has moved is placed again, together with its neighbours.
+        near = np.zeros(len(w), dtype=bool)
+        near[F[righted[mesh] & (w != given)[F].any(axis=1)]] = True
+        groups, there = _apart(F, np.flatnonzero(near & moves), len(w)), w.copy()
+        for _ in range(_SHARING):
+            _place(there, groups)
+        # No height falls below the least of those around it, but for rounding.
+        spoilt = np.bincount(mesh[~(signed_areas(F, there) > 0)], minlength=righted.size) > 0
+        back = F[spoilt[mesh]]
+        there[back] = w[back]
+        w = there
+    return w, righted
+
+
+def _place(w: ComplexArray, groups: list[_Stars]) -> None:
+    """Place vertices, in their array, group after group."""
+    for some in groups:
+        w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
 
 
 class _Stars(NamedTuple):
@@ -149,7 +170,7 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
 
 
 def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
-    """Where the least signed area of the triangles around a vertex is greatest, for many vertices.
+    """Where the least signed height of the triangles around a vertex is greatest, for many vertices.
 
     Parameters
     ----------
@@ -163,16 +184,16 @@ def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> Compl
     (m,) complex128
         ``w`` where rounding leaves no such place.
     """
-    edge = heads - tails
-    # Twice the area at (x, y) is the first times x and the second times y less the third.
-    area = np.empty((3, *edge.shape))
-    area[0], area[1] = -edge.imag, edge.real
-    area[2] = area[0] * tails.real + area[1] * tails.imag
-    three = area[:, :, _threes(edge.shape[1])]
-    (ax, ay, p), (bx, by, q) = three[:, :, 0] - three[:, :, 1], three[:, :, 0] - three[:, :, 2]
+    height = np.empty((3, *tails.shape))
     with np.errstate(all="ignore"):
+        along = (heads - tails) / np.abs(heads - tails)
+        # The height of (x, y) is the first times x and the second times y less the third.
+        height[0], height[1] = -along.imag, along.real
+        height[2] = height[0] * tails.real + height[1] * tails.imag
+        three = height[:, :, _threes(tails.shape[1])]
+        (ax, ay, p), (bx, by, q) = three[:, :, 0] - three[:, :, 1], three[:, :, 0] - three[:, :, 2]
         place = np.stack([p * by - q * ay, ax * q - bx * p], axis=1) / (ax * by - ay * bx)[:, None]
-        least = (area[:2].transpose(1, 2, 0) @ place - area[2][:, :, None]).min(axis=1)
+        least = (height[:2].transpose(1, 2, 0) @ place - height[2][:, :, None]).min(axis=1)
     least[~np.isfinite(least)] = -np.inf
     best, rows = least.argmax(axis=1), np.arange(len(w))
     found = place[rows, 0, best] + 1j * place[rows, 1, best]
