@@ -30,7 +30,7 @@ _MOST_FLIPS, _MOST_AT_FIRST = 12, 100
 # again and two more.
 _FEWER = 0.75
 # Times that the vertices of what is inverted are placed anew at most, and how often in a row that may be in vain.
-_SWEEPS, _IN_VAIN = 16, 4
+_SWEEPS, _IN_VAIN = 8, 3
 # Times that what has been righted is placed once more, with its neighbours, so that the room is shared.
 _SHARING = 2
 # Triangles around a vertex that is placed at most: of 16 there are 560 threes.
