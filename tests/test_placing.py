@@ -113,7 +113,7 @@ def test_side_by_side_each_is_as_by_itself(rng):
 def test_tries_are_made_when_fewer_are_left_and_ever_more_rarely():
     tries = Tries()
     assert not tries.due(0)
-    counts = [200, 13, 12, 12, 10, 9, 9, 9, 9, 9, 9, 9, 9, 9, 9]
+    counts = [200, 7, 6, 6, 5, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4]
     assert [k for k, flipped in enumerate(counts) if tries.due(flipped)] == [2, 5, 13]
     # The first map is tried with more.
     assert Tries().due(100)
