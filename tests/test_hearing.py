@@ -128,7 +128,7 @@ def test_interrupted_in_between(impatient):
     V, F, fixed, target = star_problem()
     start = injective_map(V, F, fixed, target).uv
     for solved in (
-        lambda stop: solve(Problem(V, F, fixed, target), callback=stop),
+        lambda stop: solve(Problem(V, F, fixed, target), strategy="paper", callback=stop),
         lambda stop: polish(V, F, start, fixed=fixed, callback=stop),
     ):
         seen = []

@@ -78,6 +78,7 @@ class Composite(VectorAdam):
             iterations=left,
             schedule=self.schedule or NEARBY_STEPS,
             momenta=self.momenta,
+            placing=self.placing,
         )
         return (yield from nearby.iterates(objective, there))
 

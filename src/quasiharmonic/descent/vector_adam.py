@@ -14,6 +14,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, IntArray
 from quasiharmonic.descent.base import FunctionalDescent, Iterates
+from quasiharmonic.descent.placing import Tries, placed
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.reference import blocks
 
@@ -40,10 +41,14 @@ class VectorAdam(FunctionalDescent):
         Of the mean gradient and of its mean square, Adam's β₁ and β₂; at least 0 and below 1. The paper names none;
         Adam's own are 0.9 and 0.999. With those and the paper's steps it is
         ``VectorAdam(schedule=[(0, 0.1)], momenta=(0.9, 0.999))``.
+    placing : bool
+        Try now and then to right the last inverted triangles at once, by moving their vertices
+        (`quasiharmonic.descent.placing`); where that fails the descent goes on as if it had not been tried.
     """
 
     schedule: Sequence[tuple[int, float]] = ()
     momenta: tuple[float, float] = MOMENTA
+    placing: bool = False
 
     word: ClassVar[str] = "vector-adam"
 
@@ -77,8 +82,12 @@ class VectorAdam(FunctionalDescent):
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""
         pace = self.pace(start.xi.size)
-        here = start
+        problem, tries, here = objective.problem, Tries(), start
         for _ in range(self.iterations):
+            if self.placing and tries.due(here.flipped):
+                w = placed(problem.F, here.w, problem.fixed)
+                if w is not None:
+                    yield objective.of_map(w)
             here = objective.step(here, pace.step(here.gradient))
             yield here
         return False

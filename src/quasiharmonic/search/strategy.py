@@ -49,15 +49,15 @@ def speed(problem: Problem) -> Stages:
     """
     other: Stages = ()
     if problem.domain.pins.size:
-        first: Descent = VectorAdam(parameterisation="si-log", iterations=400)
+        first: Descent = VectorAdam(parameterisation="si-log", iterations=400, placing=True)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
-        first, newton = VectorAdam(iterations=100), Newton(iterations=300, resume=True)
+        first, newton = VectorAdam(iterations=100, placing=True), Newton(iterations=300, resume=True)
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
     repair: Stages = (Combing(resume=True), Patches(tries=15, resume=True))
     if len(problem.domain.loops) == 1 and not problem.domain.pins.size:
         # From one of the two starts or the other.
-        composite = Composite(iterations=100)
+        composite = Composite(iterations=100, placing=True)
         soonest = len(problem.F) > max(_SMALL, _SLIM * problem.domain.loops[0].size)
         first, second = (composite, first) if soonest else (first, composite)
         other = (second, *repair)

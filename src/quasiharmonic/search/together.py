@@ -19,9 +19,10 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.descent import VectorAdam
+from quasiharmonic.descent.placing import Tries, placed_each
 from quasiharmonic.exact.side_by_side import certify_each
 from quasiharmonic.field.functionals import beltrami_terms
-from quasiharmonic.field.tensor import PARAMETERISATIONS
+from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.reference import ReferenceMesh, blocks
@@ -63,14 +64,20 @@ class _Member:
     problem : Problem
     live : bool
         Whether the stage has anything left to do for it.
+    tries : Tries
+        When the vertices of its last inverted triangles are placed.
     found : MapResult, Begun or None
         What has come of it.
+    placed_mu : (f,) complex128 or None
+        The tensors of its best map where that was not descended to, but had vertices placed.
     """
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.live = True
+        self.tries = Tries()
         self.found: MapResult | Begun | None = None
+        self.placed_mu: ComplexArray | None = None
         self.history: list[Step] = []
         self.best, self._deepest = (len(problem.F) + 1, np.inf), np.inf
         self.best_map = self._deepest_map = np.empty(0, dtype=np.complex128)
@@ -83,6 +90,15 @@ class _Member:
             self.best, self.best_map, self.best_xi = (flipped, energy), w.copy(), xi.copy()
         if energy < self._deepest or not self._deepest_map.size:
             self._deepest, self._deepest_map, self._deepest_xi = energy, w.copy(), xi.copy()
+
+    def note_placed(self, w: ComplexArray) -> None:
+        """Take note of a map with vertices placed, none of whose triangles is inverted, at its own tensors."""
+        mesh = self.problem.domain.mesh("equilateral")
+        dw = mesh.derivatives(w)
+        field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
+        energy = 2 * float(beltrami_terms(mesh, field, dw)[0].sum()) / float(dw.area.sum())
+        self.history.append(Step(len(self.history), 0, energy))
+        self.best, self.best_map, self.placed_mu = (0, energy), w, field.mu
 
     def stage(self, descent: VectorAdam, seconds: float) -> Stage:
         """What reports say of what was done."""
@@ -160,6 +176,19 @@ class _SideBySide:
             energy = np.where(covered > 0, 2 * np.add.reduceat(density, self.triangles[:-1]) / covered, np.inf)
         return _Maps(w, gradient, flipped, energy)
 
+    def placed(self, some: Sequence[int], w: ComplexArray) -> list[ComplexArray | None]:
+        """Of some of the meshes the maps with the vertices of inverted triangles placed, or None where some stay so."""
+        problems = [self.members[k].problem for k in some]
+        starts = np.cumsum([0, *(problem.n for problem in problems)]).tolist()
+        moved, righted = placed_each(
+            np.concatenate([problem.F + start for problem, start in zip(problems, starts[:-1], strict=True)]),
+            np.concatenate([w[self.vertices_of(k)] for k in some]),
+            np.concatenate([problem.fixed + start for problem, start in zip(problems, starts[:-1], strict=True)]),
+            np.repeat(np.arange(len(some)), [len(problem.F) for problem in problems]),
+        )
+        maps = np.split(moved, starts[1:-1])
+        return [one if good else None for one, good in zip(maps, righted.tolist(), strict=True)]
+
     def bounded(self, xi: ComplexArray) -> ComplexArray:
         """ξ with moduli clipped, in place, to where the rounded tensor is still positive definite."""
         bound = self._parameterisation.bound
@@ -220,7 +249,8 @@ def _descend(
     side = _SideBySide(members, descent, patterns)
     xi = np.zeros(int(side.triangles[-1]), dtype=np.complex128)
     pace, spent, since = descent.pace(xi.size), 0.0, time.perf_counter()
-    for iteration in range(min(descent.iterations, budget) + 1):
+    last = min(descent.iterations, budget)
+    for iteration in range(last + 1):
         still_wanted()
         if iteration:
             side.bounded(xi)
@@ -229,10 +259,17 @@ def _descend(
         flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
         for k in live:
             side.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], xi[side.triangles_of(k)])
+        ready = [side.members[k] for k in live if flipped[k] == 0]
+        due = [k for k in live if flipped[k] and iteration < last and side.members[k].tries.due(flipped[k])]
+        if descent.placing and due:
+            for k, w in zip(due, side.placed(due, maps.w), strict=True):
+                if w is not None:
+                    side.members[k].note_placed(w)
+                    ready.append(side.members[k])
         # Nobody knows what an iteration takes for one of them alone: all are charged alike.
         now = time.perf_counter()
         spent, since = spent + (now - since) / len(live), now
-        _judge([side.members[k] for k in live if flipped[k] == 0], descent, side.laplacian.solver.name, spent)
+        _judge(ready, descent, side.laplacian.solver.name, spent)
         live = [k for k in live if side.members[k].live]
         if not live:
             return
@@ -258,6 +295,7 @@ def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: fl
     for member, places, certificate in zip(members, uv, verdicts, strict=True):
         member.live = False
         if certificate.injective:
+            mu = member.placed_mu
             member.found = MapResult(
                 uv=places,
                 status=Status.INJECTIVE,
@@ -266,6 +304,6 @@ def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: fl
                 history=member.history,
                 linear_solver=solver,
                 seconds=seconds,
-                mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu,
+                mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu if mu is None else mu,
                 V=member.problem.V,
             )

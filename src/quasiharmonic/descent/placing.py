@@ -1,0 +1,207 @@
+"""Placing: the vertices of the last inverted triangles, each where the triangles around it have most room.
+
+With all other vertices held, the signed height of a triangle over the edge opposite to a corner is linear in where that
+corner lies, and so the place at which the least height around a vertex is greatest solves a linear programme of three
+unknowns, the place and that height. (The local untangling of Freitag and Plassmann 2000 does so with areas; heights
+leave maps that are less distorted.) At its solution three heights are alike: for the six triangles or so around a
+vertex all places where three are alike are looked at, and the best is taken. Vertices that share no triangle are
+placed at the same time.
+
+Where a descent has come so far that few triangles are inverted this often does what it would take many more steps
+for, in no more time than two or three of them. It is tried in passing: where it leaves anything inverted, nothing has
+happened.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray
+from quasiharmonic.energy.deformation import signed_areas
+
+# Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step of the descent. The
+# first map, from which the way may be far, is tried with more.
+_MOST_FLIPS, _MOST_AT_FIRST = 6, 100
+# After a try in vain the next is made when so large a part of the inverted triangles is left, or after as many steps
+# again and two more.
+_FEWER = 0.75
+# Times that the vertices of what is inverted are placed anew at most, and how often in a row that may be in vain.
+_SWEEPS, _IN_VAIN = 8, 3
+# Times that what has been righted is placed once more, with its neighbours, so that the room is shared.
+_SHARING = 2
+# Triangles around a vertex that is placed at most: of 16 there are 560 threes.
+_MOST_AROUND = 16
+
+
+class Tries:
+    """When it is time for a try, while a descent goes on."""
+
+    def __init__(self) -> None:
+        self._seen = self._next = 0
+        self._few_enough = 0.0
+
+    def due(self, flipped: int) -> bool:
+        """Whether to try the next map of the descent, of which so many triangles are inverted."""
+        seen, self._seen = self._seen, self._seen + 1
+        if not 0 < flipped <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
+            return False
+        if flipped > self._few_enough and seen < self._next:
+            return False
+        self._few_enough, self._next = _FEWER * flipped, 2 * seen + 2
+        return True
+
+
+def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None:
+    """Place the vertices of inverted triangles until none is left.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    w : (n,) complex128
+    fixed : (k,) int64
+        Vertices that stay; all those of the boundary are among them.
+
+    Returns
+    -------
+    (n,) complex128 or None
+        A map without inverted triangles, in floating point; None where some stay inverted.
+    """
+    moved, righted = placed_each(F, w, fixed, np.zeros(len(F), dtype=np.int64))
+    return moved if righted.all() else None
+
+
+def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -> tuple[ComplexArray, BoolArray]:
+    """As `placed`, for many meshes side by side.
+
+    Parameters
+    ----------
+    F, w, fixed
+        Of all meshes, none joined to another.
+    mesh : (f,) int64
+        Which mesh a triangle belongs to.
+
+    Returns
+    -------
+    w : (n,) complex128
+    righted : (m,) bool
+        Of which meshes no triangle is inverted any more.
+    """
+    moves = np.ones(len(w), dtype=bool)
+    moves[fixed] = False
+    given, w = w, w.copy()
+    fewest, in_vain = np.full(int(mesh.max()) + 1, len(F) + 1), np.zeros(int(mesh.max()) + 1, dtype=np.int64)
+    vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
+    for sweep in range(_SWEEPS + 1):
+        left = np.flatnonzero(~(signed_areas(F, w) > 0))
+        count = np.bincount(mesh[left], minlength=fewest.size)
+        in_vain = np.where(count < fewest, 0, in_vain + 1)
+        fewest = np.minimum(count, fewest)
+        tried = in_vain < _IN_VAIN
+        before, vertices = vertices, np.unique(F[left[tried[mesh[left]]]])
+        vertices = vertices[moves[vertices]]
+        if not vertices.size or sweep == _SWEEPS:
+            break
+        if not np.array_equal(vertices, before):
+            groups = _apart(F, vertices, len(w))
+        _place(w, groups)
+    righted = fewest == 0
+    if righted.any():
+        # What has moved is placed again, together with its neighbours.
+        near = np.zeros(len(w), dtype=bool)
+        near[F[righted[mesh] & (w != given)[F].any(axis=1)]] = True
+        groups, there = _apart(F, np.flatnonzero(near & moves), len(w)), w.copy()
+        for _ in range(_SHARING):
+            _place(there, groups)
+        # No height falls below the least of those around it, but for rounding.
+        spoilt = np.bincount(mesh[~(signed_areas(F, there) > 0)], minlength=righted.size) > 0
+        back = F[spoilt[mesh]]
+        there[back] = w[back]
+        w = there
+    return w, righted
+
+
+def _place(w: ComplexArray, groups: list[_Stars]) -> None:
+    """Place vertices, in their array, group after group."""
+    for some in groups:
+        w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
+
+
+class _Stars(NamedTuple):
+    """Some vertices and the edges opposite to each, (m,) and twice (m, k) int64; shorter rows repeat their last."""
+
+    vertices: IntArray
+    tails: IntArray
+    heads: IntArray
+
+
+def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
+    """Interior vertices, in ascending order, in groups of such as share no triangle."""
+    number = np.full(n, -1)
+    number[vertices] = np.arange(vertices.size)
+    around = F[(number[F] >= 0).any(axis=1)]
+    triangle, corner = np.nonzero(number[around] >= 0)
+    own = number[around[triangle, corner]]
+    order = np.argsort(own, kind="stable")
+    triangle, corner, own = triangle[order], corner[order], own[order]
+    tails, heads = around[triangle, (corner + 1) % 3], around[triangle, (corner + 2) % 3]
+    count = np.bincount(own, minlength=vertices.size)
+    first = np.cumsum(count) - count
+    # In each of the triangles around a vertex the next corner is another neighbour: they are all neighbours.
+    neighbours, start = number[tails].tolist(), [*first.tolist(), own.size]
+    groups: list[list[int]] = []
+    # What has no group, or is none of the vertices and so has the last place, is in group -1.
+    group = [-1] * (vertices.size + 1)
+    for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
+        taken = {group[other] for other in neighbours[start[vertex] : start[vertex + 1]]}
+        chosen = next(k for k in range(len(groups) + 1) if k not in taken)
+        if chosen == len(groups):
+            groups.append([])
+        groups[chosen].append(vertex)
+        group[vertex] = chosen
+    stars = []
+    for members in map(np.array, groups):
+        rows = first[members, None] + np.minimum(np.arange(count[members].max()), count[members, None] - 1)
+        stars.append(_Stars(vertices[members], tails[rows], heads[rows]))
+    return stars
+
+
+def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
+    """Where the least signed height of the triangles around a vertex is greatest, for many vertices.
+
+    Parameters
+    ----------
+    w : (m,) complex128
+        Where the vertices are.
+    tails, heads : (m, k) complex128
+        The edges opposite to each of them, which make a closed loop; some may be there twice.
+
+    Returns
+    -------
+    (m,) complex128
+        ``w`` where rounding leaves no such place.
+    """
+    height = np.empty((3, *tails.shape))
+    with np.errstate(all="ignore"):
+        along = (heads - tails) / np.abs(heads - tails)
+        # The height of (x, y) is the first times x and the second times y less the third.
+        height[0], height[1] = -along.imag, along.real
+        height[2] = height[0] * tails.real + height[1] * tails.imag
+        three = height[:, :, _threes(tails.shape[1])]
+        (ax, ay, p), (bx, by, q) = three[:, :, 0] - three[:, :, 1], three[:, :, 0] - three[:, :, 2]
+        place = np.stack([p * by - q * ay, ax * q - bx * p], axis=1) / (ax * by - ay * bx)[:, None]
+        least = (height[:2].transpose(1, 2, 0) @ place - height[2][:, :, None]).min(axis=1)
+    least[~np.isfinite(least)] = -np.inf
+    best, rows = least.argmax(axis=1), np.arange(len(w))
+    found = place[rows, 0, best] + 1j * place[rows, 1, best]
+    return np.where(np.isfinite(least[rows, best]), found, w)
+
+
+@cache
+def _threes(count: int) -> IntArray:
+    """All threes out of so many; (3, …) int64."""
+    threes: IntArray = np.array(list(combinations(range(count), 3)), dtype=np.int64).T
+    return threes
