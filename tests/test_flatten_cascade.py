@@ -86,7 +86,7 @@ def test_a_wary_way_back_stays_bijective(surface):
 def test_what_is_affine_is_carried_back_as_it_is():
     V, F = random_delaunay(800)
     loops = boundary_loops(F, len(V))
-    hierarchy = Hierarchy(in_space(V), F, loops, 60)
+    hierarchy = Hierarchy(in_space(V), F, loops, 100)
     stop = hierarchy.stops[-1]
     image = V @ [[1.1, 0.2], [-0.1, 0.9]] + (3, 4)
     w = np.zeros(len(V), dtype=np.complex128)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -150,6 +152,33 @@ class TestTopology:
         assert [0, 3] in found.boundary.tolist()
         assert [2, 0] in found.boundary.tolist()
         assert edges(np.array([[0, 1, 2], [0, 1, 3]]), 4).inconsistent.tolist() == [[0, 1]]
+
+    @pytest.mark.parametrize("loaded", [True, False])
+    def test_of_many_triangles_are_those_that_a_dictionary_finds(self, loaded, monkeypatch, rng):
+        """Whichever way they are sorted, also where triangles are anything but a surface's."""
+        import scipy.sparse
+
+        if loaded:
+            monkeypatch.setitem(sys.modules, "scipy.sparse", scipy.sparse)
+        else:
+            monkeypatch.delitem(sys.modules, "scipy.sparse")
+        _, F = grid(50, 40)
+        F = np.concatenate([F, rng.integers(0, 2091, (40, 3)), F[:20, ::-1], F[50:60]])
+        found, met = edges(F, 2091), {}
+        for triangle in F.tolist():
+            for i, j in zip(triangle, triangle[1:] + triangle[:1], strict=True):
+                met.setdefault((min(i, j), max(i, j)), []).append((i, j))
+        kinds = {"interior": [], "boundary": [], "inconsistent": [], "nonmanifold": []}
+        for edge, ways in sorted(met.items()):
+            if len(ways) == 1:
+                kinds["boundary"].append(ways[0])
+            elif len(ways) > 2:
+                kinds["nonmanifold"].append(edge)
+            else:
+                # A triangle that uses a vertex twice has an edge from it to itself, which has no sense.
+                kinds["inconsistent" if ways[0] == ways[1] else "interior"].append(edge)
+        for kind, expected in kinds.items():
+            assert getattr(found, kind).tolist() == [list(edge) for edge in expected], kind
 
     def test_loops_keep_the_surface_to_their_left(self):
         V, F = annulus(6)

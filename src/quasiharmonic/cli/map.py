@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from quasiharmonic.cli.judging import Judged
     from quasiharmonic.cli.targets import Posed
     from quasiharmonic.curves import Rails
+    from quasiharmonic.mesh.refinement import Refined
     from quasiharmonic.mesh.seams import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.result import MapResult
@@ -75,7 +76,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.atlas.mapped import each_island
     from quasiharmonic.atlas.refined import written_over
     from quasiharmonic.cli import judging, material, report, seams, sliding, targets
-    from quasiharmonic.ladder.climbing import on_refinement
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
@@ -108,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-            fine = on_refinement(problem, result.refined)
+            fine = refined_by(problem, result.refined)
             result = smoothed(fine, result, options.linear_solver, one.slide)
         return result
 
@@ -126,7 +126,7 @@ def run(options: argparse.Namespace) -> int:
     with report.after_writing(options.output):
         if options.plot is not None:
             problems = zip((one.fitted.problem for one in posed), refined, strict=False)
-            draw(options.plot, judged, [on_refinement(*one) for one in problems], mapped, options.plot_kind)
+            draw(options.plot, judged, [refined_by(*one) for one in problems], mapped, options.plot_kind)
         facts = {
             **mapped.to_dict(),
             **judged.to_dict(),
@@ -164,10 +164,13 @@ def search(
 ) -> MapResult:
     """Solve with progress on the terminal."""
     from quasiharmonic.cli import progress
-    from quasiharmonic.ladder.climbing import climb
     from quasiharmonic.search.solving import solve
 
-    way = climb if refine else solve
+    way = solve
+    if refine:
+        from quasiharmonic.ladder.climbing import climb
+
+        way = climb
     with progress.line() as show:
         return way(
             problem,
@@ -178,6 +181,15 @@ def search(
             callback=show,
             slide=slide,
         )
+
+
+def refined_by(problem: Problem, refined: Refined | None) -> Problem:
+    """The problem that a result is of."""
+    if refined is None:
+        return problem
+    from quasiharmonic.ladder.climbing import on_refinement
+
+    return on_refinement(problem, refined)
 
 
 def smoothed(problem: Problem, result: MapResult, linear_solver: str, slide: bool | Rails = False) -> MapResult:

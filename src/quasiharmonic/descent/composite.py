@@ -27,7 +27,7 @@ from quasiharmonic.exact.constrained_delaunay import BlockedError, constrained_d
 from quasiharmonic.exact.loops import judge_loops
 from quasiharmonic.exact.point_location import PointLocator
 from quasiharmonic.field.objective import Iterate, Objective
-from quasiharmonic.mesh.topology import edge_keys
+from quasiharmonic.mesh.topology import edge_keys, linked
 
 # Corners of the disk are spread half by the target's arc length and half evenly: none come too close to each other.
 _EVENLY = 0.5
@@ -155,9 +155,6 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
 
 def _within(F: IntArray, k: int) -> BoolArray:
     """Which triangles lie to the left of the sides 0→1→…→k−1→0: those that no side parts from one that does."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.repeat(np.arange(len(F)), 3)
     corners = (tails < k) & (heads < k)
     forward, backward = corners & (heads == (tails + 1) % k), corners & (tails == (heads + 1) % k)
@@ -166,8 +163,7 @@ def _within(F: IntArray, k: int) -> BoolArray:
     order = np.argsort(keys, kind="stable")
     pair = np.flatnonzero(keys[order][1:] == keys[order][:-1])
     one, other = owner[open_[order[pair]]], owner[open_[order[pair + 1]]]
-    graph = coo_array((np.ones(pair.size), (one, other)), shape=(len(F), len(F)))
-    part = connected_components(graph, directed=False)[1]
+    part = linked(one, other, len(F))
     inside: BoolArray = np.isin(part, part[owner[forward]])
     return inside
 

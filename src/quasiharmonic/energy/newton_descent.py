@@ -186,6 +186,8 @@ class NewtonDescent:
             direction, promise, tried = found
             self._shift = skipped + tried
             return direction, promise, True
+        if shifts is SHIFTS:
+            self._shift = len(SHIFTS) - 1
         direction = self.system.solve_diagonal(-gradient)
         return direction, -work(gradient, direction), False
 

@@ -13,7 +13,6 @@ from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
-from quasiharmonic.ladder.climbing import climb
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Step
@@ -113,7 +112,12 @@ def injective_map(
     began = time.perf_counter()
     true_or_false("refine", refine)
     problem = Problem(V, F, fixed, target, reference=reference)
-    way = climb if refine else solve
+    way = solve
+    if refine:
+        # Only here: it brings the construction and the diagnosis along, which most maps do without.
+        from quasiharmonic.ladder.climbing import climb
+
+        way = climb
     result = way(
         problem,
         strategy=strategy,

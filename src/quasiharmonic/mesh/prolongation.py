@@ -10,17 +10,17 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.hearing import still_at_it
-from quasiharmonic.mesh.coarsening import Coarsening, touching
+from quasiharmonic.mesh.coarsening import Coarsening
 
 # A triangle's squared sides over twice its area are 2√3 = 3.5 when it is equilateral. Below this on average a vertex
 # has a good place.
 _GOOD = 8.0
-# Places to try otherwise: so far from the apex towards the ring's middle, ...
-_TOWARDS_MIDDLE = 1.0, 0.75, 0.5, 0.25, 0.1
-# ... and straight into the ring, in units of the distance to the nearest side, where the last ones are sure to do.
-_INWARDS = 8.0, 4.0, 2.0, 1.0, 0.5, 0.25
-# How far smoothing moves a vertex towards the middle of its neighbours, and how often.
-_SHARE, _SWEEPS = 0.6, 2
+# Places to try otherwise, besides the ring's middle: so far from the apex towards it, and straight into the ring, in
+# units of the distance to the nearest side; and what is tried where none of these will do. The last one is sure to.
+_TOWARDS_MIDDLE, _INWARDS = (0.75, 0.5), (2.0, 1.0, 0.5)
+_LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS = (0.25, 0.1), (8.0, 4.0, 0.25)
+# Rings at a time: what is in work stays in the cache.
+_RINGS = 1024
 
 
 def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> ComplexArray:
@@ -44,7 +44,7 @@ def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> Complex
     for number in reversed(range(len(coarsening.rounds))):
         for vertices, rings in coarsening.rounds[number]:
             still_at_it()
-            w[vertices] = places(w[rings])
+            w[vertices] = places(w.take(rings.T).T)
         if number in coarsening.levels:
             _smooth(w, coarsening.levels[number], held)
     return w
@@ -52,26 +52,54 @@ def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> Complex
 
 def places(ring: ComplexArray) -> ComplexArray:
     """Where to put a vertex into each ring; (r,) from (r, d), the apex first."""
-    place = ring.mean(axis=1)
-    poor = np.flatnonzero(~(_shape(place, ring) < _GOOD * ring.shape[1]))
-    if poor.size:
-        candidates = _candidates(ring[poor], place[poor])
-        best = _shape(candidates, ring[poor]).argmin(axis=0)
-        place[poor] = np.take_along_axis(candidates, best[None], axis=0)[0]
+    place = np.empty(len(ring), dtype=np.complex128)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for start in range(0, len(ring), _RINGS):
+            # Column by column: rows are too short for NumPy to be quick along them.
+            columns = np.ascontiguousarray(ring[start : start + _RINGS].T)
+            place[start : start + _RINGS] = _best(columns)
     return place
 
 
-def _candidates(ring: ComplexArray, middle: ComplexArray) -> ComplexArray:
-    """Places that rings may be seen from; (c, r)."""
-    apex = ring[:, 0]
-    arm = ring[:, 1:] - apex[:, None]
-    left, right = arm[:, 1:], arm[:, :-1]
-    # A fan of positive triangles turns from the first arm to the last; half that turn leads inwards.
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        turn = np.angle(left * right.conj()).sum(axis=1)
-        inwards = arm[:, 0] / np.abs(arm[:, 0]) * np.exp(0.5j * turn)
-        room = ((right.conj() * left).imag / np.abs(left - right)).min(axis=1)
-        return apex + np.concatenate([np.outer(_TOWARDS_MIDDLE, middle - apex), np.outer(_INWARDS, room * inwards)])
+def _best(ring: ComplexArray) -> ComplexArray:
+    """Places for rings (d, r), the apex first; (r,)."""
+    place = ring.mean(axis=0)
+    shape = _shape(place[None], ring)[0]
+    poor = np.flatnonzero(~(shape < _GOOD * len(ring)))
+    for towards, inwards in (
+        (_TOWARDS_MIDDLE, _INWARDS),
+        (_LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS),
+    ):
+        if not poor.size:
+            break
+        around = ring.take(poor, axis=1)
+        candidates = _candidates(around, towards, inwards)
+        shapes = _shape(candidates, around)
+        best, number = shapes.argmin(axis=0), np.arange(poor.size)
+        lowest = shapes[best, number]
+        better = lowest < shape[poor]
+        place[poor[better]], shape[poor[better]] = candidates[best, number][better], lowest[better]
+        poor = poor[np.isinf(shape[poor])]
+    return place
+
+
+def _candidates(ring: ComplexArray, towards: tuple[float, ...], inwards: tuple[float, ...]) -> ComplexArray:
+    """Places that rings (d, r) may be seen from; (c, r)."""
+    apex = ring[0]
+    arm = ring[1:] - apex
+    length = np.abs(arm)
+    left, right = arm[1:], arm[:-1]
+    size = length[1:] * length[:-1]
+    turn = right.conj()
+    turn *= left
+    room = (turn.imag / np.abs(left - right)).min(axis=0)
+    # A fan of positive triangles turns from the first arm to the last; half that turn leads inwards. Half of a
+    # triangle's part of it is where the sum of both its arms' unit vectors points.
+    turn /= size
+    turn += 1
+    turn /= np.abs(turn)
+    step = room / length[0] * arm[0] * np.multiply.reduce(turn, axis=0)
+    return apex + np.concatenate([np.outer(towards, ring.mean(axis=0) - apex), np.outer(inwards, step)])
 
 
 def _shape(place: ComplexArray, ring: ComplexArray) -> FloatArray:
@@ -79,42 +107,55 @@ def _shape(place: ComplexArray, ring: ComplexArray) -> FloatArray:
 
     Parameters
     ----------
-    place : (r,) or (c, r) complex128
-    ring : (r, d) complex128
+    place : (c, r) complex128
+    ring : (d, r) complex128
     """
-    total = np.zeros(place.shape)
-    # Column by column: rows are too short for NumPy to be quick along them.
-    spokes = [column - place for column in ring.T]
-    squares = [spoke.real**2 + spoke.imag**2 for spoke in spokes]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for i, spoke in enumerate(spokes):
-            # |a|² + |b|² + |b − a|² = 2 (|a|² + |b|² − Re āb), and the area is half of Im āb.
-            product = spokes[i - 1].conj() * spoke
-            shape = 2 * (squares[i - 1] + squares[i] - product.real)
-            shape /= product.imag
-            shape[~(product.imag > 0)] = np.inf
-            total += shape
+    # Real numbers take half the time of complex ones here.
+    around = ((ring.real, place.real), (ring.imag, place.imag))
+    spokes = [np.concatenate([corners[-1:], corners])[:, None] - middle for corners, middle in around]
+    square = spokes[0] ** 2
+    square += spokes[1] ** 2
+    (a_x, a_y), (b_x, b_y) = ([spoke[part] for spoke in spokes] for part in (slice(-1), slice(1, None)))
+    # |a|² + |b|² + |b − a|² = 2 (|a|² + |b|² − a·b), and the area is half of a × b.
+    area = a_x * b_y
+    area -= a_y * b_x
+    shape = square[:-1] + square[1:]
+    shape -= a_x * b_x
+    shape -= a_y * b_y
+    shape /= area
+    total: FloatArray = 2 * shape.sum(axis=0)
+    total[~(area.min(axis=0) > 0)] = np.inf
     return total
 
 
-def _smooth(w: ComplexArray, T: IntArray, held: BoolArray) -> None:
-    """Move every vertex towards the middle of its neighbours, and those back that invert a triangle; in place."""
-    tail, head = T.ravel(), np.roll(T, -1, axis=1).ravel()
+def _smooth(w: ComplexArray, F: IntArray, held: BoolArray) -> None:
+    """Move every vertex to the middle of its neighbours, and those back that invert a triangle; in place."""
+    from scipy.sparse import csr_array
+
     # Of an interior vertex every neighbour is once the head of a half-edge.
-    degree = np.bincount(tail, minlength=w.size)
+    degree, total = np.bincount(F.ravel(), minlength=w.size), np.zeros_like(w)
+    for tail, head in ((0, 1), (1, 2), (2, 0)):
+        heads = w.take(F[:, head])
+        total.real += np.bincount(F[:, tail], heads.real, w.size)
+        total.imag += np.bincount(F[:, tail], heads.imag, w.size)
     moving = np.flatnonzero((degree > 0) & ~held)
-    for _ in range(_SWEEPS):
-        real, imag = (np.bincount(tail, part.take(head), w.size)[moving] for part in (w.real, w.imag))
-        new = w.copy()
-        new[moving] += _SHARE * ((real + 1j * imag) / degree[moving] - w[moving])
-        back = np.zeros(w.size, dtype=bool)
-        inverted = T.compress(~positive(new, T), axis=0)
-        while len(inverted) and not back[inverted].all():
-            back[inverted] = True
-            new[inverted] = w[inverted]
-            touched = T.compress(touching(T, back), axis=0)
-            inverted = touched.compress(~positive(new, touched), axis=0)
-        w[:] = new
+    new = w.copy()
+    new[moving] = total[moving] / degree[moving]
+    del degree, total, heads
+    inverted = np.flatnonzero(~positive(new, F))
+    if inverted.size:
+        table = (np.ones(F.size, dtype=np.int8), F.ravel(), np.arange(0, F.size + 1, 3))
+        of_vertex = csr_array(table, shape=(len(F), w.size)).tocsc()
+    back = np.zeros(w.size, dtype=bool)
+    while inverted.size:
+        corners = np.unique(F[inverted])
+        corners = corners[~back[corners]]
+        back[corners] = True
+        new[corners] = w[corners]
+        # Only what is around those that have just gone back may be inverted now and was not before.
+        around = of_vertex[:, corners].indices
+        inverted = around[~positive(new, F[around])]
+    w[:] = new
 
 
 def positive(w: ComplexArray, T: IntArray) -> BoolArray:
