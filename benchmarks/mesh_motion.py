@@ -2,10 +2,10 @@
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/mesh_motion.py [-o FOLDER] [--only SCENE ...]
 
-Six scenes (`moving_scenes`), and in each every method (`mesh_movers`), step by step until a triangle is inverted, exactly, or
-the scene ends. Writes mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last valid step, the
-worst and the mean quality of triangles on the way, and the processor's time for a step, beside that of one solve of linear
-elasticity, which is taken by turns with them. Kratos is left out where it is not installed.
+Six scenes (`moving_scenes`), and in each every method (`mesh_movers`), step by step until a triangle is inverted,
+exactly, or the scene ends. Writes mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last
+valid step, the worst and the mean quality of triangles on the way, and the processor's time for a step, beside that of
+one solve of linear elasticity, which is taken by turns with them. Kratos is left out where it is not installed.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ if importlib.util.find_spec("KratosMultiphysics") is not None:
         ("Kratos, similarity", "own"): partial(Kratos, kind="structural_similarity"),
     }
 METHODS[OURS, "last"] = Ours
+#: Scenes of which something is known that forbids to go on.
+TURNING = ("turning disk", "sliding walls")
 # Of how many steps one is followed by a solve of elasticity, to compare with.
 _YARDSTICK = 8
 
@@ -118,7 +120,9 @@ def forbidden_beyond(scene: Scene) -> float:
     span = 2 * np.arccos(np.abs(z[scene.body]).min() / np.abs(z).max())
     i, j = np.unique(np.sort(np.concatenate([F[:, [0, 1]], F[:, [1, 2]], F[:, [2, 0]]]), axis=1), axis=0).T
     turn = np.angle(z[j] / z[i])
-    weights = csr_array((np.concatenate([span + turn, span - turn]), (np.r_[i, j], np.r_[j, i])), shape=(z.size, z.size))
+    weights = csr_array(
+        (np.concatenate([span + turn, span - turn]), (np.r_[i, j], np.r_[j, i])), shape=(z.size, z.size)
+    )
     still = scene.walls
     if scene.slide:
         still = still[(np.abs(scene.V[still]) == np.abs(scene.V).max(axis=0)).all(axis=1)]
@@ -159,18 +163,27 @@ def table(found: list[dict[str, object]], scenes: dict[str, Scene]) -> str:
     lines = []
     for name, scene in scenes.items():
         about = (SCENES[name].__doc__ or "").split("\n")[0]
-        lines += [f"**{name.capitalize()}.** {about} {len(scene.F):,} triangles, {scene.steps} steps; ends with {scene.end}."]
-        if "turn" in about:
-            lines[-1] += f" By its edges no mesh can turn beyond {forbidden_beyond(scene):,.0f}°; nothing is known to forbid less."
-        lines += ["", "| method | each step from | valid to | worst, mean shape | worst, mean likeness | ms | elasticity solves |"]
+        about += f" {len(scene.F):,} triangles, {scene.steps} steps; ends with {scene.end}."
+        if name in TURNING:
+            about += f" Its edges allow no turn beyond {forbidden_beyond(scene):,.0f}°; no obstruction is known before."
+        lines += [f"**{name.capitalize()}.** {about}", ""]
+        lines += [
+            "| method | each step from | valid to | worst, mean shape | worst, mean likeness | ms | elasticity solves |"
+        ]
         lines += ["|---|---|---|---|---|---|---|"]
         for row in (row for row in found if row["scene"] == name):
+            base = "its own" if row["from"] == "own" else f"the {row['from']} mesh"
             end = "**the end**, " if row["steps"] == row["of"] else ""
-            lines.append(
-                f"| {row['method']} | the {row['from']} mesh | {end}{row['valid to']:.4g} {row['unit']} "
-                f"| {row['worst shape']:.2g}, {row['mean shape']:.2f} | {row['worst likeness']:.2g}, "
-                f"{row['mean likeness']:.2f} | {row['ms a step']:.0f} | {row['elasticity solves']:.2f} |".replace("the own mesh", "its own")
-            )
+            cells = [
+                f"**{row['method']}**" if row["method"] == OURS else row["method"],
+                base,
+                f"{end}{row['valid to']:.4g} {row['unit']}",
+                f"{row['worst shape']:.2g}, {row['mean shape']:.2f}",
+                f"{row['worst likeness']:.2g}, {row['mean likeness']:.2f}",
+                f"{row['ms a step']:.0f}",
+                f"{row['elasticity solves']:.2f}",
+            ]
+            lines.append(f"| {' | '.join(map(str, cells))} |")
         lines.append("")
     lines.append(f"{_versions()}; {platform.processor() or platform.machine()}, one thread.")
     return "\n".join(lines) + "\n"
@@ -191,7 +204,9 @@ def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene],
     from matplotlib.figure import Figure
 
     names = list(dict.fromkeys(method for method, _ in METHODS))
-    colors = dict(zip(names, ["#8c8c8c", "#55a868", "#ccb974", "#c44e52", "#64b5cd", "#8172b3", "#1f3f8f"], strict=False))
+    colors = dict(
+        zip(names, ["#8c8c8c", "#55a868", "#ccb974", "#c44e52", "#64b5cd", "#8172b3", "#1f3f8f"], strict=False)
+    )
     colors[OURS] = "#1f3f8f"
     figure = Figure(figsize=(13, 7.6), layout="constrained")
     axes = figure.subplots(2, (len(races) + 1) // 2, squeeze=False).ravel()
@@ -205,7 +220,14 @@ def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene],
             y = [worst for worst, *_ in run.quality]
             line = "--" if base == "first" else "-"
             width = 2.4 if method == OURS else 1.2
-            ax.plot(x, y, line, color=colors[method], lw=width, label=f"{method}, from the {base}" if base != "own" else method)
+            ax.plot(
+                x,
+                y,
+                line,
+                color=colors[method],
+                lw=width,
+                label=f"{method}, from the {base}" if base != "own" else method,
+            )
             ax.plot(x[-1:], y[-1:], "x" if run.steps < scene.steps else "o", color=colors[method], ms=6)
         ax.set_yscale("log")
         ax.set_ylim(1e-6, 1.2)

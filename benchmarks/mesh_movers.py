@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-import scipy.sparse.linalg as sla
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import cdist
 
@@ -101,7 +100,7 @@ def thin_plate(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way
 
 
 def compact(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: FloatArray) -> FloatArray:
-    """Wendland's C² function over twice the body's way to the walls (de Boer, van der Schoot and Bijl 2007), no polynomial."""
+    """Wendland's C² function (de Boer, van der Schoot and Bijl 2007) of a radius of 2, about the channels' height."""
     radius = 2.0
 
     def kernel(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -124,7 +123,7 @@ class Kratos:
     """
 
     def __init__(self, scene: Scene, kind: str) -> None:
-        import KratosMultiphysics as KM
+        import KratosMultiphysics as KM  # noqa: N817, their own name for it
 
         KM.Logger.GetDefaultOutput().SetSeverity(KM.Logger.Severity.WARNING)
         from KratosMultiphysics.MeshMovingApplication import python_solvers_wrapper_mesh_motion as wrapper

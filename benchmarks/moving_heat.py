@@ -1,16 +1,16 @@
 """Heat around a cylinder that travels through a channel: finite elements on a mesh that moves for 200 steps.
 
-    python benchmarks/moving_heat.py [-o FOLDER] [--mover ours|elasticity|harmonic]
+    python benchmarks/moving_heat.py [-o FOLDER]
 
-The cylinder goes around in the channel without turning, and a fluid of no viscosity gives way: a = ∇φ with φ harmonic and
-its normal derivative that of the walls. A hot spot is carried along and spreads::
+The cylinder goes around in the channel without turning, and a fluid of no viscosity gives way: a = ∇φ with φ harmonic
+and its normal derivative that of the walls. A hot spot is carried along and spreads::
 
     d/dt ∫ u v + ∫ (κ ∇u − u (a − w)) · ∇v = 0      for each v that moves with the mesh, whose velocity is w
 
-in linear elements of scikit-fem, with the middle of the step for all but the masses. No heat crosses a wall, so the sum
-stays; and since a triangle's area is quadratic in time, the middle gives its change exactly, so a uniform temperature
-stays uniform (the geometric conservation law). Both are measured at every step, and the run ends where a triangle of the
-mesh, or of that in the middle of the step, is inverted.
+in linear elements of scikit-fem, with the middle of the step for all but the masses. No heat crosses a wall, so the
+sum stays; and since a triangle's area is quadratic in time, the middle gives its change exactly, so a uniform
+temperature stays uniform (the geometric conservation law). Both are measured at every step, and the run ends where a
+triangle of the mesh, or of that in the middle of the step, is inverted.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def draw(scene: Scene, histories: dict[str, History], steps: int, path: Path) ->
     """Four moments of ours with the mesh, and what was measured over the steps."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 7.5), layout="constrained")
-    grid = figure.add_gridspec(3, 4, height_ratios=[1, 1, 1])
+    figure = Figure(figsize=(13, 6.4), layout="constrained")
+    grid = figure.add_gridspec(3, 4, height_ratios=[0.75, 0.75, 1])
     ours = histories["ours"]
     for i, k in enumerate(np.linspace(0, len(ours.meshes) - 1, 8).astype(int)):
         ax = figure.add_subplot(grid[i // 4, i % 4])

@@ -1,8 +1,8 @@
 """Scenes of moving boundaries: meshes of some thousand triangles, made here, and where their boundaries go.
 
 A scene moves one loop of its mesh, the body's, as a rigid or a bending body; the walls are held, or let their vertices
-glide along them. ``places(t)`` for t from 0 to 1 says where the body's vertices are, ``extent(t)`` how far that is in the
-scene's own unit.
+glide along them. ``places(t)`` for t from 0 to 1 says where the body's vertices are, ``extent(t)`` how far that is in
+the scene's own unit.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def meshed(
 ) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
     """A mesh between two loops, with edges about as long as ``size`` says: vertices, triangles, and the two loops.
 
-    Points that push each other apart along the edges of their Delaunay triangulation (Persson and Strang 2004), those of the
-    boundary at rest.
+    Points that push each other apart along the edges of their Delaunay triangulation (Persson and Strang 2004), those
+    of the boundary at rest.
     """
     boundary = np.concatenate([outer, inner])
     near = cKDTree(_pairs(boundary))
@@ -135,7 +135,9 @@ def meshed(
     F = np.searchsorted(used, F)
     V = _pairs(points[used])
     loops = boundary_loops(F, len(V))
-    assert sorted(map(len, loops)) == sorted([outer.size, inner.size]), "the triangulation lacks an edge of the boundary"
+    assert sorted(map(len, loops)) == sorted([outer.size, inner.size]), (
+        "the triangulation lacks an edge of the boundary"
+    )
     return V, F, np.arange(outer.size, boundary.size), np.arange(outer.size)
 
 
@@ -204,9 +206,7 @@ def bending_beam(step: float = 0.07) -> Scene:
         along = z.real * np.sinc(angle / np.pi) + 1j * z.real * angle / 2 * np.sinc(angle / (2 * np.pi)) ** 2
         return along + 1j * z.imag * np.exp(1j * angle)
 
-    return _scene(
-        box(4, 3, step), beam, _even(step), bent, lambda t: 358 * t, "°", 179, "its ends 2° from meeting"
-    )
+    return _scene(box(4, 3, step), beam, _even(step), bent, lambda t: 358 * t, "°", 179, "its ends 2° from meeting")
 
 
 def closing_gap(step: float = 0.06) -> Scene:

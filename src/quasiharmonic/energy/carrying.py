@@ -1,7 +1,7 @@
 """Fixed vertices that go somewhere else and take the map along, every triangle positive on the way.
 
-A step of Newton's method for the boundary as it will be: with g the energy's gradient by the free vertices, H its second
-derivative, and Δ how far the fixed ones have to go, the free ones go by::
+A step of Newton's method for the boundary as it will be: with g the energy's gradient by the free vertices, H its
+second derivative, and Δ how far the fixed ones have to go, the free ones go by::
 
     d = −H⁻¹ (g + (H Δ)_free)
 
@@ -20,8 +20,8 @@ from quasiharmonic.exact.certificate import is_injective
 
 # Of the way to the first triangle's collapse, what a step takes.
 _FRACTION = 0.8
-# So many steps at most, none a smaller part of what is left of the way.
-_STEPS, _SHORTEST = 25, 1e-4
+# No step is a smaller part of what is left of the way.
+_SHORTEST = 1e-4
 
 
 class CarryingDescent(NewtonDescent):
@@ -32,10 +32,18 @@ class CarryingDescent(NewtonDescent):
         self.w, self._pinned = in_units(uv, self.exponent), uv[self.fixed]
         self._look()
 
-    def carry(self, target: FloatArray, tolerance: float) -> float:
+    def carry(self, target: FloatArray, tolerance: float, steps: int) -> float:
         """Take the fixed vertices to a target (k, 2), or as far as the triangles let them.
 
         A map that had to stop on the way is lowered by one step before it goes on.
+
+        Parameters
+        ----------
+        target : (k, 2) float64
+        tolerance : float
+            As of `NewtonDescent.step`.
+        steps : int
+            To take at most.
 
         Returns
         -------
@@ -43,12 +51,13 @@ class CarryingDescent(NewtonDescent):
             Which share of the way: 1 where they have arrived, to the last bit.
         """
         left = 1.0
-        for _ in range(_STEPS):
+        for k in range(steps):
+            if k > 0:
+                self.step(tolerance)
             t = self._carried(target)
             left *= 1 - t
-            if t == 1 or t < _SHORTEST:
+            if left == 0 or t == 0:
                 break
-            self.step(tolerance)
         return 1 - left
 
     def _look(self) -> None:

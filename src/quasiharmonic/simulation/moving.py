@@ -29,8 +29,8 @@ from quasiharmonic.energy.polishing import at_own_scale, energy_named, polish_ma
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Domain
 
-# What a step down the energy has to promise, relative to it.
-_TOLERANCE = 1e-4
+# What a step down the energy has to promise, relative to it, and how many may bring the boundary where it goes.
+_TOLERANCE, _STEPS = 1e-4, 25
 
 
 class MovingMesh:
@@ -54,7 +54,8 @@ class MovingMesh:
         Newton steps down the energy after each move; 0 saves time and is as valid.
     slide : bool
         Let the boundary vertices that are not moved glide along their outline, its corners held; it takes ``settle``
-        at least 1.
+        at least 1. They follow what the mesh wants, one step behind: moved vertices that come along the same wall stop
+        at them, where `morph` knows better.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
@@ -142,20 +143,20 @@ class MovingMesh:
         """
         there = map_array("positions", positions, self._moved.size, finite=False)
         check_finite("positions", "row", "rows", there)
-        descent = self._descent
-        standing = self.points[self._domain.fixed[self._moved.size :]]
+        goal = np.concatenate([there, self.points[self._domain.fixed[self._moved.size :]]])
         try:
             # Overflow gives inf or NaN, and a step with either is never accepted.
             with np.errstate(all="ignore"):
-                share = descent.carry(np.concatenate([there, standing]), _TOLERANCE)
+                share = self._descent.carry(goal, _TOLERANCE, _STEPS)
             if share < 1:
                 raise RuntimeError(
-                    f"the boundary can be moved there for {share:.1%} of the way only: then triangles leave it no room, "
-                    "or too little for a small step; try shorter ones, or a new mesh"
+                    f"the boundary can be moved there for {share:.1%} of the way only: then triangles leave it no "
+                    "room, or too little for such a step; try shorter ones, or a new mesh"
                 )
             self.points = self._settled()
         finally:
-            descent.place(self.points)
+            # From the mesh there, its walls where they have slid to, or after whatever went wrong from the last.
+            self._descent.place(self.points)
         return self.points
 
     def _settled(self) -> FloatArray:
