@@ -113,7 +113,11 @@ class MovingMesh:
         rest = np.setdiff1d(boundary_edges(F, len(self.points)), self._moved)
         self._domain = Domain(self.points, F, np.concatenate([self._moved, rest]))
         self._linear_solver = linear_solver
-        deformation, exponent = at_own_scale(self._domain, self.points, self._energy)
+        a, b, c = self.points[self._domain.F].transpose(1, 0, 2)
+        area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        # Small triangles are where a simulation looks closely: each counts the same, whatever its area.
+        self._weights = area.mean() / area
+        deformation, exponent = at_own_scale(self._domain, self.points, self._energy, self._weights)
         self._descent = CarryingDescent(deformation, self.points, self._domain.fixed, exponent, linear_solver)
 
     @property
@@ -169,6 +173,7 @@ class MovingMesh:
                 self._domain,
                 here,
                 energy=self._energy,
+                weights=self._weights,
                 max_iterations=self._settle,
                 tolerance=_TOLERANCE,
                 linear_solver=self._linear_solver,
