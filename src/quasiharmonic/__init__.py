@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from quasiharmonic.search.solving import quasi_harmonic_map, solve
     from quasiharmonic.simulation.morphed import Morphed
     from quasiharmonic.simulation.morphing import morph
+    from quasiharmonic.simulation.moving import MovingMesh
 
 __version__ = "0.1.0"
 
@@ -67,6 +68,7 @@ _HOME = {
     "MapResult": "result",
     "Moment": "apply.airmesh",
     "Morphed": "simulation.morphed",
+    "MovingMesh": "simulation.moving",
     "Opened": "apply.cutting",
     "Problem": "problem",
     "Rails": "curves",
@@ -127,6 +129,7 @@ __all__ = [
     "MapResult",
     "Moment",
     "Morphed",
+    "MovingMesh",
     "Opened",
     "Problem",
     "Rails",

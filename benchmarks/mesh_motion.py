@@ -1,0 +1,270 @@
+"""How far a boundary can move before a mesh that follows it is inverted, by method.
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/mesh_motion.py [-o FOLDER] [--only SCENE ...]
+
+Six scenes (`moving_scenes`), and in each every method (`mesh_movers`), step by step until a triangle is inverted,
+exactly, or the scene ends. Writes mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last
+valid step, the worst and the mean quality of triangles on the way, and the processor's time for a step, beside that of
+one solve of linear elasticity, which is taken by turns with them. Kratos is left out where it is not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib.util
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from mesh_movers import Extended, Kratos, Mover, Ours, compact, elasticity, harmonic, thin_plate
+from moving_scenes import SCENES, Scene
+from quasiharmonic import __version__, flipped_triangles
+from quasiharmonic.arrays import FloatArray
+from quasiharmonic.energy.measures import mean_ratio
+
+OURS = "ours"
+#: By name and by what each step begins with. Kratos' solvers have one way only.
+METHODS: dict[tuple[str, str], Callable[[Scene], Mover]] = {
+    (name, base): partial(Extended, extension=extension, from_rest=base == "first")
+    for name, extension in (
+        ("harmonic", harmonic),
+        ("thin plate", thin_plate),
+        ("compact RBF", compact),
+        ("elasticity", elasticity),
+    )
+    for base in ("first", "last")
+}
+if importlib.util.find_spec("KratosMultiphysics") is not None:
+    METHODS |= {
+        ("Kratos, Laplacian", "own"): partial(Kratos, kind="laplacian"),
+        ("Kratos, similarity", "own"): partial(Kratos, kind="structural_similarity"),
+    }
+METHODS[OURS, "last"] = Ours
+#: Scenes of which something is known that forbids to go on.
+TURNING = ("turning disk", "sliding walls")
+# Of how many steps one is followed by a solve of elasticity, to compare with.
+_YARDSTICK = 8
+
+
+@dataclass
+class Run:
+    """What has become of one method in one scene.
+
+    Attributes
+    ----------
+    steps : int
+        Valid ones.
+    quality : list of (4,)
+        At each: worst and mean of the triangles' shape, and of their likeness to the first mesh, as mean ratios.
+    seconds : list of float
+        Of the processor, of each step.
+    """
+
+    steps: int = 0
+    quality: list[tuple[float, float, float, float]] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+
+def likeness(scene: Scene, V: FloatArray) -> FloatArray:
+    """The mean ratio 2 det J / |J|² of each triangle's Jacobian from the first mesh; 1 for a similarity."""
+    now, first = (np.diff(P[scene.F], axis=1).transpose(0, 2, 1) for P in (V, scene.V))
+    J = now @ np.linalg.inv(first)
+    return 2 * np.linalg.det(J) / np.sum(J**2, axis=(1, 2))
+
+
+def race(scene: Scene, steps: int | None = None) -> tuple[dict[tuple[str, str], Run], list[float]]:
+    """Every method's run, taken step by step by turns, and the seconds of single solves of elasticity in between."""
+    runs = {key: Run() for key in METHODS}
+    movers = {key: make(scene) for key, make in METHODS.items()}
+    yardstick: list[float] = []
+    for k in range(1, (scene.steps if steps is None else steps) + 1):
+        target = scene.target(k / scene.steps)
+        for key, mover in list(movers.items()):
+            began = time.process_time()
+            V = mover.step(target)
+            runs[key].seconds.append(time.process_time() - began)
+            if V is None or not np.isfinite(V).all() or flipped_triangles(scene.F, V).size:
+                del movers[key]
+                continue
+            shape, like = mean_ratio(V, scene.F), likeness(scene, V)
+            runs[key].steps = k
+            runs[key].quality.append((shape.min(), shape.mean(), like.min(), like.mean()))
+        if k % _YARDSTICK == 1:
+            way = np.zeros_like(scene.V)
+            way[scene.fixed] = target - scene.V[scene.fixed]
+            began = time.process_time()
+            elasticity(scene.V, scene.F, scene.given(), way)
+            yardstick.append(time.process_time() - began)
+        if not movers:
+            break
+    return runs, yardstick
+
+
+def forbidden_beyond(scene: Scene) -> float:
+    """Degrees by which a body around the origin cannot turn, whatever the mesh does.
+
+    Seen from the origin an edge spans less than 2 arccos(r / R), where r is the radius of a disk inside the body and R
+    that of one around the walls. A chain of edges from the body to a vertex of the walls that stays has to wind by the
+    turn and what it winds at first, and so bounds it.
+    """
+    F, z = scene.F, scene.V @ (1, 1j)
+    span = 2 * np.arccos(np.abs(z[scene.body]).min() / np.abs(z).max())
+    i, j = np.unique(np.sort(np.concatenate([F[:, [0, 1]], F[:, [1, 2]], F[:, [2, 0]]]), axis=1), axis=0).T
+    turn = np.angle(z[j] / z[i])
+    weights = csr_array(
+        (np.concatenate([span + turn, span - turn]), (np.r_[i, j], np.r_[j, i])), shape=(z.size, z.size)
+    )
+    still = scene.walls
+    if scene.slide:
+        still = still[(np.abs(scene.V[still]) == np.abs(scene.V).max(axis=0)).all(axis=1)]
+    return float(np.degrees(dijkstra(weights, indices=scene.body, min_only=True)[still].min()))
+
+
+def rows(name: str, scene: Scene, runs: dict[tuple[str, str], Run], yardstick: list[float]) -> list[dict[str, object]]:
+    """The table's rows for a scene."""
+    unit = float(np.median(yardstick))
+    found = []
+    for (method, base), run in runs.items():
+        quality = np.array(run.quality).reshape(-1, 4)
+        lowest, means = quality.min(axis=0, initial=1), quality.mean(axis=0) if run.steps else np.full(4, np.nan)
+        found.append(
+            {
+                "scene": name,
+                "triangles": len(scene.F),
+                "method": method,
+                "from": base,
+                "valid to": scene.extent(run.steps / scene.steps),
+                "unit": scene.unit,
+                "steps": run.steps,
+                "of": scene.steps,
+                "worst shape": lowest[0],
+                "mean shape": means[1],
+                "worst likeness": lowest[2],
+                "mean likeness": means[3],
+                "ms a step": 1e3 * float(np.mean(run.seconds)),
+                "median ms": 1e3 * float(np.median(run.seconds)),
+                "elasticity solves": float(np.mean(run.seconds)) / unit,
+            }
+        )
+    return found
+
+
+def table(found: list[dict[str, object]], scenes: dict[str, Scene]) -> str:
+    """The rows in Markdown, scene by scene."""
+    lines = []
+    for name, scene in scenes.items():
+        about = (SCENES[name].__doc__ or "").split("\n")[0]
+        about += f" {len(scene.F):,} triangles, {scene.steps} steps; ends with {scene.end}."
+        if name in TURNING:
+            about += f" Its edges allow no turn beyond {forbidden_beyond(scene):,.0f}°; no obstruction is known before."
+        lines += [f"**{name.capitalize()}.** {about}", ""]
+        lines += [
+            "| method | each step from | valid to | worst, mean shape | worst, mean likeness | ms | elasticity solves |"
+        ]
+        lines += ["|---|---|---|---|---|---|---|"]
+        for row in (row for row in found if row["scene"] == name):
+            base = "its own" if row["from"] == "own" else f"the {row['from']} mesh"
+            end = "**the end**, " if row["steps"] == row["of"] else ""
+            cells = [
+                f"**{row['method']}**" if row["method"] == OURS else row["method"],
+                base,
+                f"{end}{row['valid to']:.4g} {row['unit']}",
+                f"{row['worst shape']:.2g}, {row['mean shape']:.2f}",
+                f"{row['worst likeness']:.2g}, {row['mean likeness']:.2f}",
+                f"{row['ms a step']:.0f}",
+                f"{row['elasticity solves']:.2f}",
+            ]
+            lines.append(f"| {' | '.join(map(str, cells))} |")
+        lines.append("")
+    lines.append(f"{_versions()}; {platform.processor() or platform.machine()}, one thread.")
+    return "\n".join(lines) + "\n"
+
+
+def _versions() -> str:
+    known = [f"quasiharmonic {__version__}"]
+    for package in ("scikit-fem", "numpy", "scipy", "KratosMeshMovingApplication", "mkl"):
+        try:
+            known.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            known.append(f"no {package}")
+    return ", ".join([*known, f"Python {platform.python_version()}"])
+
+
+def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene], path: Path) -> None:
+    """The worst quality over the displacement, one panel a scene."""
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(method for method, _ in METHODS))
+    colors = dict(
+        zip(names, ["#8c8c8c", "#55a868", "#ccb974", "#c44e52", "#64b5cd", "#8172b3", "#1f3f8f"], strict=False)
+    )
+    colors[OURS] = "#1f3f8f"
+    figure = Figure(figsize=(13, 7.6), layout="constrained")
+    axes = figure.subplots(2, (len(races) + 1) // 2, squeeze=False).ravel()
+    for ax, (name, runs) in zip(axes, races.items(), strict=False):
+        scene = scenes[name]
+        for (method, base), run in runs.items():
+            if run.steps == 0:
+                continue
+            t = np.arange(1, run.steps + 1) / scene.steps
+            x = np.array([scene.place_on_axis(at) for at in t])
+            y = [worst for worst, *_ in run.quality]
+            line = "--" if base == "first" else "-"
+            width = 2.4 if method == OURS else 1.2
+            ax.plot(
+                x,
+                y,
+                line,
+                color=colors[method],
+                lw=width,
+                label=f"{method}, from the {base}" if base != "own" else method,
+            )
+            ax.plot(x[-1:], y[-1:], "x" if run.steps < scene.steps else "o", color=colors[method], ms=6)
+        ax.set_yscale("log")
+        ax.set_ylim(1e-6, 1.2)
+        if scene.log:
+            ax.set_xscale("log")
+            ax.invert_xaxis()
+        ax.set_title(name, fontsize=10)
+        ax.set_xlabel(scene.axis)
+        ax.grid(alpha=0.25)
+    for ax in axes[:: max(1, len(axes) // 2)]:
+        ax.set_ylabel("worst mean ratio of a triangle")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8)
+    figure.savefig(path, dpi=100)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("figures"))
+    parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES))
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    found, races, scenes = [], {}, {}
+    for name in options.only:
+        scene = scenes[name] = SCENES[name]()
+        races[name], yardstick = race(scene)
+        found += rows(name, scene, races[name], yardstick)
+        text = table(found, scenes)
+        (options.output / "mesh_motion.md").write_text(text, encoding="utf-8")
+        with (options.output / "mesh_motion.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(found[0]))
+            writer.writeheader()
+            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in found)
+        draw(races, scenes, options.output / "mesh_motion.png")
+        print(f"{name}: done", flush=True)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

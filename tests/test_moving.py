@@ -1,0 +1,144 @@
+"""`MovingMesh` and the descent that carries a map along with its boundary."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import MovingMesh, certify
+from quasiharmonic.energy.carrying import CarryingDescent
+from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.energy.polishing import at_own_scale
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.problem import Domain
+from quasiharmonic.surfaces import annulus, disk
+
+
+@pytest.fixture
+def ring():
+    """A square with a square hole: points, triangles, the walls, the hole."""
+    points, F = annulus(12)
+    walls, hole = sorted(boundary_loops(F, len(points)), key=lambda loop: -np.abs(points[loop]).max())
+    return points, F, walls, hole
+
+
+def turned(points, degrees):
+    angle = np.radians(degrees)
+    return points @ np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
+
+
+def winding(mesh, chain):
+    """Degrees by which a chain of vertices winds about the origin."""
+    z = mesh[chain] @ (1, 1j)
+    return np.degrees(np.angle(z[1:] / z[:-1]).sum())
+
+
+def test_a_hole_that_turns_takes_the_mesh_along(ring):
+    points, F, walls, hole = ring
+    mesh = MovingMesh(points, F, hole)
+    chain = np.flatnonzero((points[:, 1] == 0) & (points[:, 0] > 0))
+    chain = chain[np.argsort(points[chain, 0])]
+    assert chain.size > 3
+    for degrees in range(10, 201, 10):
+        there = mesh.advance(turned(points[hole], degrees))
+        assert certify(mesh.F, there).bijective
+        np.testing.assert_array_equal(there[hole], turned(points[hole], degrees))
+        np.testing.assert_array_equal(there[walls], points[walls])
+        np.testing.assert_array_equal(mesh.points, there)
+    # It has not turned the other way around, though that would be the shorter way.
+    assert winding(there, chain) == pytest.approx(-200)
+
+
+def test_no_drift_there_and_back(ring):
+    points, F, _, hole = ring
+    mesh = MovingMesh(points, F, hole, settle=3)
+    for x in (*np.linspace(0, 0.2, 8), *np.linspace(0.2, 0, 8)):
+        mesh.advance(points[hole] + (x, x / 2))
+    assert np.abs(mesh.points - points).max() < 1e-3
+
+
+def test_a_step_is_newtons_for_the_boundary_as_it_will_be():
+    V, F = disk(4)
+    (loop,) = boundary_loops(F, len(V))
+    domain = Domain(V, F, loop)
+    energy, exponent = at_own_scale(domain, V, SymmetricDirichlet())
+
+    def carried(by):
+        descent = CarryingDescent(energy, V, loop, exponent, "auto")
+        assert descent.carry(V[loop] + by * V[loop][:, ::-1] * V[loop][:, :1], 1e-4, 1) == 1
+        return descent.positions(descent.w), descent
+
+    # To first order the energy's gradient stays zero, and an independent one, by differences, says so.
+    errors = []
+    for by in (1e-2, 5e-3):
+        _, descent = carried(by)
+        inner = np.setdiff1d(np.arange(len(V)), loop)
+        slopes = []
+        for v in inner[::5]:
+            for way in (1, 1j):
+                nudge = np.zeros(len(V), dtype=complex)
+                nudge[v] = 1e-5 * way
+                slopes.append((energy.value(descent.w + nudge) - energy.value(descent.w - nudge)) / 2e-5)
+        errors.append(np.abs(slopes).max())
+    assert errors[0] > 1e-9
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_walls_slide(ring):
+    points, F, walls, hole = ring
+    held, sliding = (MovingMesh(points, F, hole, slide=slide) for slide in (False, True))
+    for degrees in range(10, 91, 10):
+        for mesh in (held, sliding):
+            there = mesh.advance(turned(points[hole], degrees))
+    corner = (np.abs(points[walls]) == 1).all(axis=1)
+    assert corner.sum() == 4
+    np.testing.assert_array_equal(there[walls[corner]], points[walls[corner]])
+    # On the walls to the last bit, and along them elsewhere.
+    assert np.all(np.abs(there[walls]).max(axis=1) == 1)
+    assert np.abs(there[walls] - points[walls]).max() > 0.02
+    assert certify(mesh.F, there).bijective
+    assert mean_ratio(there, F).min() > 1.2 * mean_ratio(held.points, F).min()
+
+
+def test_a_boundary_that_cannot_arrive_leaves_the_mesh_as_it_was(ring):
+    points, F, _walls, hole = ring
+    mesh = MovingMesh(points, F, hole)
+    before = mesh.advance(points[hole] + (0.1, 0))
+    with pytest.raises(RuntimeError, match="of the way only"):
+        mesh.advance(points[hole] + (5, 0))
+    np.testing.assert_array_equal(mesh.points, before)
+    after = mesh.advance(points[hole] + (0.12, 0))
+    assert certify(mesh.F, after).bijective
+
+
+def test_triangles_are_wound_either_way(ring):
+    points, F, _walls, hole = ring
+    F = F.copy()
+    F[::2] = F[::2][:, [0, 2, 1]]
+    mesh = MovingMesh(points, F, hole)
+    assert certify(mesh.F, mesh.advance(turned(points[hole], 20))).bijective
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": [[0, 0], [1, 0], [np.nan, 1]]}, "points"),
+        ({"points": [[0, 0], [1, 0], [2, 0]]}, "without area"),
+        ({"moved": [7]}, "moved"),
+        ({"energy": "arap"}, "energy must be"),
+        ({"settle": 0, "slide": True}, "settle"),
+        ({"settle": -1}, "settle"),
+    ],
+)
+def test_bad_input(change, message):
+    given = {"points": [[0, 0], [1, 0], [0, 1]], "F": [[0, 1, 2]], "moved": [0], **change}
+    with pytest.raises(ValueError, match=message):
+        MovingMesh(given.pop("points"), given.pop("F"), given.pop("moved"), **given)
+
+
+@pytest.mark.parametrize(("places", "message"), [([[0, 0], [1, 1]], "positions"), ([[np.inf, 0]], "row 0")])
+def test_bad_positions(places, message):
+    mesh = MovingMesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]], [0])
+    with pytest.raises(ValueError, match=message):
+        mesh.advance(places)
