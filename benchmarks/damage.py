@@ -39,6 +39,7 @@ from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.cli import main as qhm
 from quasiharmonic.io import MeshData, read_mesh, write_map
 from quasiharmonic.io.fem import read_fem
+from quasiharmonic.mesh.elements import covering_triangles
 from quasiharmonic.surfaces import disk
 
 SECONDS, GIGABYTES = 150.0, 1.5
@@ -292,7 +293,7 @@ def _map(written: Path, planar: bool) -> tuple[IntArray, FloatArray]:
     """Triangles and places of a map in a file."""
     if planar:
         moved = read_fem(written)
-        return moved.F, moved.points
+        return covering_triangles(moved.F)[0], moved.points
     mesh = read_mesh(written)
     return (mesh.F, mesh.V[:, :2]) if mesh.FT is None or mesh.vt is None else (mesh.FT, mesh.vt)
 

@@ -63,6 +63,24 @@ def test_a_closed_path_leads_back(flap, slide):
         assert np.abs(here - points).max() < 1e-6
 
 
+@pytest.mark.parametrize("kind", ["quadrilaterals", "second order"])
+def test_chains_of_other_elements_lead_back(flap, kind):
+    if kind == "quadrilaterals":
+        first, F, body = channel(16)
+    else:
+        first, F = second_order(*flap[:2])
+        body = rim(F)[np.abs(first[rim(F)]).max(axis=1) < 0.9]
+    here = first
+    for degrees in (20, 40, 60):
+        morphed = morph(here, F, body, turned(first[body], degrees), rest=first)
+        here = morphed.points
+    assert morphed.valid
+    assert morphed.drift() < 1e-3
+    for degrees in (30, 0):
+        here = morph(here, F, body, turned(first[body], degrees), rest=first).points
+    assert np.abs(here - first).max() < 1e-6
+
+
 def test_a_chain_that_drifts_says_so(flap):
     points, F, body = flap
     # Without an energy a mesh is where its search happened to find it.
@@ -252,3 +270,6 @@ def test_middle_nodes_slide_too(flap, slide):
     assert np.abs(np.abs(morphed.points[walls]).max(axis=1) - 1).max() < 1e-12
     assert morphed.result.history[-1].energy < held.result.history[-1].energy
     assert morphed.drift() < 1e-4
+    # Where nothing has moved nothing slides.
+    still = morph(points, F, body, points[body], slide=square if slide == "rails" else True)
+    assert np.abs(still.points - points).max() < 1e-6

@@ -17,7 +17,7 @@ def quadrilaterals(n, m):
 
 
 def channel(n):
-    """Quadrilaterals of the square from -1 to 1 around a flat body, and the nodes on that."""
+    """Quadrilaterals of the square from -1 to 1 around a flat body, and the nodes on that; n is a multiple of 8."""
     points, F = quadrilaterals(n, n)
     points = 2 * points - 1
     middle = np.abs(points[F].mean(axis=1))

@@ -94,14 +94,13 @@ def covering_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
     return triangles[kept], of[kept]
 
 
-def nets_of(F: IntArray, *, sliding: bool) -> list[IntArray]:
+def nets_of(F: IntArray) -> list[IntArray]:
     """Sets of triangles to search for a map on, one after the other until a map will do.
 
-    Of six-node triangles those between the corners, which see no curved side, and then those that cover them; these at
-    once where the boundary slides, since its mid-side nodes slide too.
+    Of six-node triangles those between the corners, which see no curved side, and then those that cover them.
     """
     covering, _ = covering_triangles(F)
-    return [F[:, :3], covering] if F.shape[1] == 6 and not sliding else [covering]
+    return [F[:, :3], covering] if F.shape[1] == 6 else [covering]
 
 
 def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.curves.curve import Curve
 from quasiharmonic.exact.elements import inverted_elements
 from quasiharmonic.mesh.elements import MIDDLES, SIDES
 from quasiharmonic.mesh.second_order import FORMS, jacobian_coefficients
@@ -14,8 +17,10 @@ _MARGIN = 0.1
 # How dear it is to bend, at first and at each further try, and how many steps a try has.
 _DEAR, _TRIES, _STEPS = 1e-2, 8, 30
 # Tried in turn: the rings of elements around inverted ones whose nodes move, None for no more than their mid-side
-# nodes; and where these begin, as a part of the way from where they should be to where the search has left them.
+# nodes; and where these begin, as a part of the way from where they should be to where the search has left them. Then
+# the best of that is gone on from.
 _ATTEMPTS = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
+_FURTHER = 1, 2, 4, 8
 
 
 def sides(F: IntArray) -> tuple[IntArray, IntArray]:
@@ -55,6 +60,30 @@ def followed(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) 
     return there
 
 
+def centred(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Curve]) -> FloatArray:
+    """Put mid-side nodes that have slid along curves into the middle of their sides again; (n, 2) float64.
+
+    Off the middle half of a straight side such a node turns its element over, wherever the others are.
+
+    Parameters
+    ----------
+    F : (f, 6) int64
+    points : (n, 2) float64
+    slid : (k,) int64
+        Nodes, of which others than mid-side ones are passed over.
+    curves : sequence of Curve
+        Each node stays on the one nearest to it.
+    """
+    middle, ends = sides(F)
+    of = np.isin(middle, slid)
+    nodes, half = middle[of], points[ends[of]].mean(axis=1)
+    own = np.argmin([curve.nearest(points[nodes])[1] for curve in curves], axis=0)
+    there = points.copy()
+    for k, curve in enumerate(curves):
+        there[nodes[own == k]] = curve.position(curve.nearest(half[own == k])[0])
+    return there
+
+
 def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntArray) -> FloatArray:
     """Move nodes aside where elements are inverted, by as little as it takes.
 
@@ -73,18 +102,25 @@ def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntAr
     (n, 2) float64
         Elements may be inverted still.
     """
-    best, least = straight, inverted_elements(F, straight).size
-    for rings, share in _ATTEMPTS:
-        if not least or (share and searched is straight):
+    best, bad = straight, inverted_elements(F, straight)
+    for rings, share in (*_ATTEMPTS, *((rings, None) for rings in _FURTHER)):
+        if not bad.size:
             break
-        begin = straight + share * (searched - straight)
-        bad = inverted_elements(F, begin)
-        movable = F[bad][:, MIDDLES] if rings is None else F[_around(F, bad, rings)]
-        found = _bent(F, begin, np.setdiff1d(movable, held))
-        left = inverted_elements(F, found).size
-        if left < least:
-            best, least = found, left
+        if share and searched is straight:
+            continue
+        begin = best if share is None else straight + share * (searched - straight)
+        found = _righted(F, begin, rings, held)
+        left = inverted_elements(F, found)
+        if left.size < bad.size:
+            best, bad = found, left
     return best
+
+
+def _righted(F: IntArray, points: FloatArray, rings: int | None, held: IntArray) -> FloatArray:
+    """Move nodes around inverted elements, within so many rings of elements; None for their mid-side nodes only."""
+    bad = inverted_elements(F, points)
+    movable = F[bad][:, MIDDLES] if rings is None else F[_around(F, bad, rings)]
+    return _bent(F, points, np.setdiff1d(movable, held))
 
 
 def _around(F: IntArray, which: IntArray, rings: int) -> IntArray:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, check_finite, check_range, index_array, map_array, named
+from quasiharmonic.curves.curve import Curve
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
@@ -27,11 +29,11 @@ from quasiharmonic.mesh.elements import (
     nets_of,
     turned_over,
 )
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.solving import solve
-from quasiharmonic.simulation.midsides import carried, followed, settled, sides
+from quasiharmonic.simulation.midsides import carried, centred, followed, settled, sides
 from quasiharmonic.simulation.morphed import Morphed, forbidden_elements
 from quasiharmonic.simulation.quadrilaterals import made_convex
 from quasiharmonic.simulation.quality import element_quality
@@ -109,8 +111,8 @@ def morph(
     then those at all four corners are righted and their energy lowered. Of six-node triangles those between their
     corners are, and mid-side nodes inside go where they are on their sides at rest, straight if they were, or aside by
     as little as it takes where a curved side would invert an element; if that does not do, corners near by move too,
-    and the search is made once more on the four triangles between the nodes of each. Where the boundary slides it is
-    made on these at once, so that its mid-side nodes slide too.
+    and the search is made once more on the four triangles between the nodes of each. On these the boundary slides, with
+    its mid-side nodes, before all that.
 
     Examples
     --------
@@ -134,7 +136,7 @@ def morph(
     begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
     F = _counterclockwise(F, first)
     fixed, target = _placed(points, F, moved, positions)
-    question = _Question(F, first, fixed, nets_of(F, sliding=slide is not False))
+    question = _Question(F, first, fixed, nets_of(F))
     settings = _Settings(energy, max_iterations, linear_solver, callback, tolerance)
     after, result = _answered(question, points, target, begin, (slide, np.asarray(moved)), settings)
 
@@ -193,6 +195,20 @@ def _answered(
     settings : _Settings
     """
     F, rest, fixed, nets = question
+    if F.shape[1] == 6 and slide[0] is not False:
+        # Mid-side nodes slide as others do, and then stay in the middle of where their sides have come to.
+        there, slid = _searched(question, nets[-1], points, target, begin, slide, settings)
+        has_slid = fixed[(there[fixed] != target).any(axis=1)]
+        before = points.copy()
+        before[fixed] = target
+        there = centred(F, there, has_slid, _curves(slide[0], nets[-1], before))
+        after, result = _answered(question, points, there[fixed], there, (False, fixed), settings)
+        return after, replace(
+            result,
+            stages=slid.stages + result.stages,
+            history=slid.history + result.history,
+            seconds=slid.seconds + result.seconds,
+        )
     best, least = None, np.inf
     for triangles in nets:
         after, result = _searched(question, triangles, points, target, begin, slide, settings)
@@ -314,6 +330,13 @@ def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayL
         follows = np.isin(middle, left)
         there[middle[follows]] = carried(points, there, middle[follows], ends[follows])
     return np.concatenate([given, left]), np.concatenate([target, there[left]])
+
+
+def _curves(slide: bool | Rails, triangles: IntArray, places: FloatArray) -> list[Curve]:
+    """What the boundary of some triangles slides along."""
+    if isinstance(slide, Rails):
+        return slide.curves
+    return [Curve.polygon(places[loop]) for loop in boundary_loops(triangles, len(places))]
 
 
 def _rails(slide: bool | Rails, problem: Problem, used: IntArray, moved: IntArray) -> bool | Rails:
