@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -60,10 +60,16 @@ class Phases:
     """Seconds by phase, and calls by phase, while it is `clocking`.
 
     A function's time is its own: what it calls and is clocked too is charged there and not twice.
+
+    Parameters
+    ----------
+    clocked : sequence of (owner, name, phase)
+        The functions; by default those of a map, whose phases are ``NAMES``.
     """
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = dict.fromkeys(NAMES, 0.0)
+    def __init__(self, clocked: Sequence[tuple[Any, str, str]] = _CLOCKED) -> None:
+        self._functions = clocked
+        self.seconds: dict[str, float] = {phase: 0.0 for *_, phase in clocked}
         self.calls: dict[str, int] = defaultdict(int)
         self._running: list[str] = []
         self._since = 0.0
@@ -73,7 +79,7 @@ class Phases:
         """Clock every call of the library's functions within the block."""
         saved = []
         try:
-            for owner, name, phase in _CLOCKED:
+            for owner, name, phase in self._functions:
                 function = vars(owner)[name]
                 saved.append((owner, name, function))
                 if isinstance(function, cached_property):
