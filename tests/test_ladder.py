@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, certify, injective_map, io
+from quasiharmonic.construction import constructing
 from quasiharmonic.descent import Newton, VectorAdam
+from quasiharmonic.ladder import climbing
 from quasiharmonic.ladder.climbing import climb
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk
 from shared.commands import run
-from shared.outlined import with_holes
+from shared.outlined import onto_polygon, with_holes
 from shared.small_meshes import wheel
 from shared.solvable import star_problem
 
@@ -123,6 +125,53 @@ def test_ctrl_c_on_any_rung():
         result = injective_map(V, F, fixed, target, refine=True, callback=stop)
         assert result.status is Status.INTERRUPTED
         assert len(result.uv) == len(V) + result.added
+
+
+def interrupting(*_):
+    raise KeyboardInterrupt
+
+
+class TestCtrlCWithAMapInHand:
+    """What is handed back is the best so far: not what was tried last, which may invert triangles."""
+
+    haste = (VectorAdam(iterations=1), Newton(iterations=3))
+
+    def check(self, problem, result):
+        assert result.status is Status.INTERRUPTED
+        assert result.certificate.bijective
+        assert certify(result.F, result.uv, loops=problem.domain.loops).bijective
+        assert len(result.uv) == problem.n + result.added
+        assert np.array_equal(result.uv[problem.fixed], problem.target)
+        assert [(rung.name, rung.added) for rung in result.rungs[-1:]] == [("constructed", result.added)]
+
+    def test_after_the_construction(self):
+        problem, first = onto_polygon(1, "grid"), []
+
+        def stop(step):
+            # Of every search the first step is its number 0, and the last one may be told again and again.
+            if step.iteration == 0 and not any(step is other for other in first):
+                first.append(step)
+            if len(first) == 2 and step.iteration == 2:
+                raise KeyboardInterrupt
+
+        result = climb(problem, strategy=self.haste, max_iterations=40, callback=stop)
+        self.check(problem, result)
+        assert first[0] in result.history and first[1] in result.history
+        assert "constructed" in [stage.name for stage in result.stages[:-1]]
+
+    def test_while_vertices_are_taken_out(self, monkeypatch):
+        monkeypatch.setattr(constructing, "thinned", interrupting)
+        problem = onto_polygon(1, "grid")
+        self.check(problem, climb(problem, strategy=self.haste, max_iterations=40))
+
+    def test_while_a_found_map_is_thinned(self, monkeypatch):
+        monkeypatch.setattr(climbing, "thinned", interrupting)
+        monkeypatch.setattr(climbing, "constructions", interrupting)
+        monkeypatch.setattr(climbing, "is_simple", lambda problem: False)
+        result = injective_map(*chevron(), refine=True)
+        assert result.status is Status.INTERRUPTED
+        assert result.certificate.bijective
+        assert result.added
 
 
 def test_an_energy_is_named_for_what_slides():

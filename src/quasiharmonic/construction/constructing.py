@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -42,8 +44,8 @@ class Construction:
     crowded: IntArray
 
 
-def constructed_by_any(problem: Problem, best_map: FloatArray) -> Construction:
-    """The construction that adds fewest vertices, of those near a map at hand and those without one.
+def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Construction]:
+    """Constructions near a map at hand and without one, each better than those before: the last adds fewest vertices.
 
     Parameters
     ----------
@@ -52,26 +54,28 @@ def constructed_by_any(problem: Problem, best_map: FloatArray) -> Construction:
     best_map : (n, 2) float64
         The best map known, though it inverts triangles.
 
-    Returns
-    -------
+    Yields
+    ------
     Construction
+        One at least. A map is there as soon as it is certified, before what it can do without is taken out.
     """
-    found = list[Construction]()
+    least = None
     # Around a bad map walks may grow without end, each along those before it.
     most = _MANY * (problem.n + _MANY)
     for guide, limit in ((best_map, most), (None, most), (best_map, None)):
-        if len(found) and (limit is None or not len(found[-1].refined.parents)):
+        if least is not None and (limit is None or not least[1]):
             break
         try:
-            found.append(construct(problem, guide, most=limit))
+            for made in _constructions(problem, guide, most=limit):
+                rank = not made.certificate.bijective, len(made.refined.parents)
+                if least is None or rank <= least:
+                    least = rank
+                    yield made
         except TooManyError:
             continue
-    return min(found, key=lambda made: (not made.certificate.bijective, len(made.refined.parents)))
 
 
-def construct(
-    problem: Problem, guide: FloatArray | None = None, *, thin: bool = True, most: int | None = None
-) -> Construction:
+def construct(problem: Problem, guide: FloatArray | None = None, *, thin: bool = True) -> Construction:
     """Construct a map onto a simple target.
 
     Parameters
@@ -83,14 +87,19 @@ def construct(
         embedding, and then near the map of the disk that it has become into a circle.
     thin : bool
         Take out again what vertices the map can do without.
-    most : int, optional
-        Vertices to add at most on the way.
 
     Returns
     -------
     Construction
         What the proof says exists; where rounding leaves inverted triangles, with these. Where the target's coordinates
         span so much that no scale bears products of all of them: the mesh as it is.
+    """
+    *_, made = islice(_constructions(problem, guide), None if thin else 1)
+    return made
+
+
+def _constructions(problem: Problem, guide: FloatArray | None, *, most: int | None = None) -> Iterator[Construction]:
+    """A construction as it comes, and, if it is certified, once more with what it can do without taken out.
 
     Raises
     ------
@@ -100,18 +109,23 @@ def construct(
     # Of magnitude about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
-    if np.array_equal(np.ldexp(unit.target, exponent), problem.target) or is_simple(unit):
-        near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
-        refined, uv = _embedded(unit, Cutting(unit, near, most))
-        if thin and certify(refined.F, uv, loops=problem.domain.loops).bijective:
-            refined, uv = thinned(unit, refined, uv)
-    else:
-        refined = as_refined(problem.V, problem.F, problem.F, [])
-        uv = np.zeros((problem.n, 2)) if guide is None else np.ldexp(guide, -exponent)
-    uv = np.ldexp(uv, exponent)
-    uv[problem.fixed] = problem.target
-    certificate = certify(refined.F, uv, loops=problem.domain.loops)
-    return Construction(refined, uv, certificate, _nearest(problem, refined.F, uv, certificate))
+
+    def judged(refined: Refined, uv: FloatArray) -> Construction:
+        uv = np.ldexp(uv, exponent)
+        uv[problem.fixed] = problem.target
+        certificate = certify(refined.F, uv, loops=problem.domain.loops)
+        return Construction(refined, uv, certificate, _nearest(problem, refined.F, uv, certificate))
+
+    if not np.array_equal(np.ldexp(unit.target, exponent), problem.target) and not is_simple(unit):
+        whole = as_refined(problem.V, problem.F, problem.F, [])
+        yield judged(whole, np.zeros((problem.n, 2)) if guide is None else np.ldexp(guide, -exponent))
+        return
+    near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
+    refined, uv = _embedded(unit, Cutting(unit, near, most))
+    made = judged(refined, uv)
+    yield made
+    if len(refined.parents) and certify(refined.F, uv, loops=problem.domain.loops).bijective:
+        yield judged(*thinned(unit, refined, uv))
 
 
 def _embedded(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:

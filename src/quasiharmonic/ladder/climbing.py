@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import IntArray
-from quasiharmonic.construction.constructing import constructed_by_any, refined_problem
+from quasiharmonic.construction.constructing import Construction, constructions, refined_problem
 from quasiharmonic.construction.opening import thinned
 from quasiharmonic.construction.simplicity import is_simple
 from quasiharmonic.curves.rails import Rails
@@ -125,17 +125,20 @@ class _Ladder:
         # Inner edges that a straight side of the target flattens.
         self._flat = flattened_edges(problem.F, problem.fixed, problem.target)
         self._rungs: list[Rung] = []
-        # The latest result, with the stages and the history of all before it.
+        # The latest result, with the stages and the history of all before it; and the best.
         self._last: MapResult | None = None
+        self._best: MapResult | None = None
 
     def climb(self, start: ArrayLike | None, budget: int) -> MapResult:
         """The result of the rung that adds the fewest vertices; where none leads to a map, of the last."""
         try:
             return replace(self._climb(start, budget), rungs=self._rungs)
         except KeyboardInterrupt:
-            if self._last is None:
+            if self._last is None or self._best is None:
                 raise
-            return replace(self._last, status=Status.INTERRUPTED, rungs=self._rungs)
+            best = self._taken(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
+            told = {"stages": self._last.stages, "history": self._last.history, "rungs": self._rungs}
+            return replace(best, status=Status.INTERRUPTED, **told)
 
     def _climb(self, start: ArrayLike | None, budget: int) -> MapResult:
         problem = self._problem
@@ -200,8 +203,11 @@ class _Ladder:
         result = self._search(on_refinement(problem, refined), start, budget, self._some)
         if refined is not None:
             uv = result.uv
-            if result.certificate.bijective:
-                refined, uv = thinned(problem, refined, uv)
+            try:
+                if result.certificate.bijective:
+                    refined, uv = thinned(problem, refined, uv)
+            except KeyboardInterrupt:
+                result = replace(result, status=Status.INTERRUPTED)
             certificate = certify(refined.F, uv, loops=problem.domain.loops)
             result = replace(result, uv=uv, certificate=certificate, mu=None, V=refined.V, refined=_if_any(refined))
         result = self._continued(result)
@@ -212,35 +218,47 @@ class _Ladder:
 
     def _constructed(self, first: MapResult) -> MapResult:
         """A constructed map, certified, or where doubles have no room for one."""
-        began = time.perf_counter()
-        problem = self._problem
-        made = constructed_by_any(problem, first.uv)
+        began, before, result = time.perf_counter(), self._last, first
+        for made in constructions(self._problem, first.uv):
+            # In place of the one before it, and there if an interrupt keeps it from getting better.
+            self._last = before
+            result = self._continued(self._as_result(made, first, time.perf_counter() - began))
+        return result
+
+    def _as_result(self, made: Construction, first: MapResult, seconds: float) -> MapResult:
         bad = made.certificate.flipped.size + made.certificate.degenerate.size
-        stage = Stage(CONSTRUCTED, 0, time.perf_counter() - began, (len(problem.F), bad), (np.inf, np.inf))
-        return self._continued(
-            replace(
-                first,
-                uv=made.uv,
-                status=Status.INJECTIVE if made.certificate.bijective else Status.NO_ROOM,
-                certificate=made.certificate,
-                stages=[stage],
-                history=[],
-                diagnosis=None,
-                mu=None,
-                path=[],
-                V=made.refined.V,
-                refined=_if_any(made.refined),
-                crowded=made.crowded,
-            )
+        stage = Stage(CONSTRUCTED, 0, seconds, (len(self._problem.F), bad), (np.inf, np.inf))
+        return replace(
+            first,
+            uv=made.uv,
+            status=Status.INJECTIVE if made.certificate.bijective else Status.NO_ROOM,
+            certificate=made.certificate,
+            stages=[stage],
+            history=[],
+            diagnosis=None,
+            mu=None,
+            path=[],
+            V=made.refined.V,
+            refined=_if_any(made.refined),
+            crowded=made.crowded,
         )
 
     def _continued(self, result: MapResult) -> MapResult:
         """A result with what was done before it, which is the latest from here on."""
-        last = self._last
+        last, best = self._last, self._best
         if last is not None:
             result = replace(result, stages=last.stages + result.stages, history=last.history + result.history)
         self._last = result
+        if best is None or _rank(result) <= _rank(best):
+            self._best = result
         return result
+
+
+def _rank(result: MapResult) -> tuple[int, bool, int]:
+    """The lower, the better."""
+    certificate = result.certificate
+    bad = certificate.flipped.size + certificate.degenerate.size + certificate.nonfinite.size
+    return bad, not certificate.bijective, result.added
 
 
 def _if_any(refined: Refined) -> Refined | None:
