@@ -19,6 +19,9 @@ from quasiharmonic.construction.sheet import Sheet
 from quasiharmonic.construction.simplicity import is_simple
 from quasiharmonic.construction.thinning import best_triangles, shape
 from quasiharmonic.construction.walks import walk
+from quasiharmonic.descent.patches import remapped
+from quasiharmonic.descent.untangling import untangled
+from quasiharmonic.field.objective import Objective
 from quasiharmonic.mesh.refinement import split_edges
 from quasiharmonic.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.surfaces import disk, grid
@@ -133,6 +136,23 @@ def test_cuts_of_any_length(apart):
     cutting = Cutting(problem)
     # Three of the cuts connect a pin, each of the others makes a piece.
     assert len(cutting.sheet.loops()) == len(cutting.regions.kept) // 2 - 3 + 1
+
+
+@pytest.mark.parametrize("scale", [1e-130, 1e-160, 1e-300])
+def test_patches_whose_areas_underflow_are_left_alone(scale):
+    V, F = disk(2)
+    (loop,) = boundary_loops(F, len(V))
+    w = V @ np.array([1, 1j]) * scale
+    w[np.setdiff1d(np.arange(len(V)), loop)] *= 9
+    steps = list(untangled(F, w, loop, grading=0.0))
+    assert bool(steps) == (scale > 1e-140)
+
+
+def test_other_maps_of_patches_have_a_limit():
+    problem = pinned_near_each_other(1, 1e-3)
+    objective, tried = Objective(problem), []
+    list(remapped(objective, np.zeros(problem.n) + 0j, np.arange(9), lambda *_: tried.append(0), patience=50, tries=3))
+    assert len(tried) == 3
 
 
 def test_what_no_scale_bears_is_told():

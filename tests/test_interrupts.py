@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import quasiharmonic
 from quasiharmonic.cli import main, measure
 
 # Calls the command in a process whose imports are interrupted at a module's name.
@@ -82,6 +84,27 @@ def test_turned_into_another_error(monkeypatch, capsys):
     monkeypatch.setattr(measure, "run", run)
     assert main(["measure", "map.obj"]) == 2
     assert capsys.readouterr().err == "qhm measure: interrupted, nothing was written\n"
+
+
+def test_out_of_code_that_is_made_on_the_way(tmp_path):
+    # As dataclasses make theirs. The interpreter takes such an interrupt for one that nobody has caught.
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'quasiharmonic.io':\n"
+        "            exec('raise KeyboardInterrupt')\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+    )
+    path = os.pathsep.join([str(tmp_path), str(Path(quasiharmonic.__file__).parents[1])])
+    done = subprocess.run(
+        [sys.executable, "-m", "quasiharmonic", "check", "grid.off"],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (2, "qhm check: interrupted, nothing was written\n")
 
 
 def test_not_where_it_is_ignored(monkeypatch):

@@ -9,10 +9,11 @@ import pytest
 
 from quasiharmonic import Problem, Status, certify, injective_map, io
 from quasiharmonic.construction import constructing
-from quasiharmonic.descent import Newton, VectorAdam
+from quasiharmonic.descent import Newton, RandomRestarts, VectorAdam
 from quasiharmonic.ladder import climbing
 from quasiharmonic.ladder.climbing import climb
 from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.search.strategy import soonest, speed, without_restarts
 from quasiharmonic.surfaces import disk
 from shared.commands import run
 from shared.outlined import onto_polygon, with_holes
@@ -131,6 +132,38 @@ def interrupting(*_):
     raise KeyboardInterrupt
 
 
+def test_no_restarts_while_a_constructed_map_is_in_hand(monkeypatch):
+    """First what is quick, then the construction, then all of the search but its random restarts, and not for long."""
+    problem, searches = onto_polygon(1, "grid"), []
+
+    def solve(on, *, strategy, max_iterations, **options):
+        searches.append((len(on.F), strategy, max_iterations))
+        return searching(on, strategy=[VectorAdam(iterations=1)], max_iterations=1, **options)
+
+    searching = climbing.solve
+    monkeypatch.setattr(climbing, "solve", solve)
+    result = climb(problem)
+    assert result.certificate.bijective
+    (triangles, first, whole), *others = searches
+    assert triangles == len(problem.F)
+    assert first == soonest(speed(problem))
+    assert all(stage.coarse or stage.quick for stage in first[1:])
+    assert len(first) < len(speed(problem))
+    assert whole == 2000
+    assert others
+    for finer, stages, few in others:
+        assert finer > triangles
+        assert [stage.name for stage in stages] == [
+            stage.name for stage in speed(problem) if not isinstance(stage, RandomRestarts)
+        ]
+        assert few == 600
+
+
+def test_a_strategy_of_restarts_alone_keeps_them():
+    assert without_restarts([RandomRestarts()]) == [RandomRestarts()]
+    assert without_restarts([RandomRestarts(), Newton()]) == [Newton()]
+
+
 class TestCtrlCWithAMapInHand:
     """What is handed back is the best so far: not what was tried last, which may invert triangles."""
 
@@ -156,7 +189,8 @@ class TestCtrlCWithAMapInHand:
 
         result = climb(problem, strategy=self.haste, max_iterations=40, callback=stop)
         self.check(problem, result)
-        assert first[0] in result.history and first[1] in result.history
+        assert first[0] in result.history
+        assert first[1] in result.history
         assert "constructed" in [stage.name for stage in result.stages[:-1]]
 
     def test_while_vertices_are_taken_out(self, monkeypatch):

@@ -20,6 +20,9 @@ def main() -> int:
 
         # What has been said stays true: all that is left to do is to end.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # An interrupt that came out of an `exec`, as of a dataclass while it is loaded, counts as unhandled, and would
+        # end the process by a signal in place of its status, until another one runs through.
+        exec("")
 
 
 if __name__ == "__main__":

@@ -194,8 +194,10 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
         array = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
         raise io.MeshFileError(path, "there is no such file") from error
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: no array of numbers in NumPy's format: {error}") from error
+    except (ValueError, EOFError, MemoryError) as error:
+        # The first sentence says what is wrong, further ones what a programmer might do about it.
+        said = str(error).partition("\n")[0]
+        raise ValueError(f"{path}: no array of numbers in NumPy's format: {said}") from error
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, held.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(

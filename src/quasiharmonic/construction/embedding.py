@@ -18,8 +18,8 @@ from quasiharmonic.problem import Problem
 
 # How often weights are renewed: as the areas to this power, and no further from each other than by this factor.
 _RENEWALS, _POWER, _SPAN = 4, 0.5, 1e6
-# What rights the last triangles, where vertices on cuts may move too.
-_REPAIRS = Patches(tries=100), Untangling(iterations=200), RandomRestarts(in_vain=20)
+# What rights the last triangles, where vertices on cuts may move too; each has its limit, for doubles may have no room.
+_REPAIRS = Patches(tries=30), Untangling(iterations=200), RandomRestarts(in_vain=20, tries=20)
 
 
 def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:

@@ -100,6 +100,9 @@ def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patc
     inside[problem.F[triangle]] = True
     for _ in range(rings):
         inside[problem.F[inside[problem.F].any(axis=1)]] = True
+        # Triangles that hang together have at most two vertices each, and one more: a hub's need not all be seen.
+        if np.count_nonzero(inside) > 2 * most + 1:
+            return None
     F = problem.F[inside[problem.F].all(axis=1)]
     vertices, renumbered = np.unique(F, return_inverse=True)
     renumbered = renumbered.reshape(-1, 3).astype(np.int64)
@@ -109,7 +112,14 @@ def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patc
 
 
 def remapped(
-    objective: Objective, w: ComplexArray, left: IntArray, other: Attempt, *, patience: int, most: int | None = None
+    objective: Objective,
+    w: ComplexArray,
+    left: IntArray,
+    other: Attempt,
+    *,
+    patience: int,
+    most: int | None = None,
+    tries: int | None = None,
 ) -> Iterator[Iterate]:
     """Take other maps of patches, one after the other, as long as they leave no more inverted triangles.
 
@@ -126,6 +136,8 @@ def remapped(
         So many in a row may right no triangle.
     most : int, optional
         Inverted triangles at most for it to be worth a try.
+    tries : int, optional
+        Patches at most.
 
     Yields
     ------
@@ -133,9 +145,9 @@ def remapped(
         A map after every patch that left fewer inverted triangles.
     """
     problem = objective.problem
-    in_vain = 0
-    while left.size and (most is None or left.size <= most) and in_vain < patience:
-        in_vain += 1
+    in_vain, done = 0, 0
+    while left.size and (most is None or left.size <= most) and in_vain < patience and done != tries:
+        in_vain, done = in_vain + 1, done + 1
         found = other(w, left)
         if found is None:
             continue

@@ -56,14 +56,19 @@ class RandomRestarts(VertexDescent):
     ----------
     in_vain : int
         So many patches in a row may be of no use; ten times as many where next to nothing is left to be righted.
+    tries : int, optional
+        Patches at most, of use or not.
     """
 
     in_vain: int = 30
+    tries: int | None = None
 
     word: ClassVar[str] = "random restarts"
 
     def __post_init__(self) -> None:
         whole_number("in_vain", self.in_vain, least=1)
+        if self.tries is not None:
+            whole_number("tries", self.tries, least=1)
 
     @property
     def patience(self) -> tuple[int, float] | None:
@@ -93,7 +98,7 @@ class RandomRestarts(VertexDescent):
             except NotPositiveDefinite:
                 return None
 
-        yield from remapped(objective, w, left, other, patience=patience, most=MOST_FLIPS)
+        yield from remapped(objective, w, left, other, patience=patience, most=MOST_FLIPS, tries=self.tries)
         return True
 
 

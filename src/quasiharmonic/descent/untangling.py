@@ -45,8 +45,8 @@ _HOPELESS = 5e-3
 _FLAT = 1e-30
 # From a map without inverted triangles: an ε so small that the energy is a barrier; and what a step is to bring.
 _BARRIER, _NOTICEABLE = 1e-9, 1e-2
-# Smallest reference triangle, relative to the largest: their areas must stay within the numbers' range.
-_SMALLEST = 1e-100
+# Smallest reference triangle, relative to the largest, and of all: squared areas must stay within the numbers' range.
+_SMALLEST, _LEAST = 1e-70, 1e-140
 # Raised diagonals, one after the other until a factorisation exists.
 _SHIFTS = 0.0, 1e-10, 1e-6, 1e-3
 # How often a step is halved.
@@ -243,7 +243,7 @@ class _References(NamedTuple):
 
 
 def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _References | None:
-    """Equilateral triangles, or None where the map has no extent.
+    """Equilateral triangles, or None where the map has no extent, or none whose square doubles hold.
 
     The logarithms of the boundary edges' lengths, carried inwards as by Tutte's embedding; in all, the references
     have the area of the map, inverted triangles counted as positive.
@@ -263,8 +263,12 @@ def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _
         unit = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
         log = laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit)).extend(log)
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
+    # Of magnitude about one, so that no square underflows.
+    sizes = np.ldexp(sizes, -int(np.frexp(sizes.max())[1]))
     sizes = np.maximum(sizes, _SMALLEST * sizes.max())
     sizes = sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
+    if not sizes.min() > _LEAST:
+        return None
     corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
     return _References(sizes[:, None, None] * corners, sizes**2)
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 
+# Letters of what is wrong at most: what a file says is told, but not all that it has in place of a number.
+_MOST = 300
+
 
 class MeshFileError(ValueError):
     """A file that cannot be read as what it should be; the message says where, why and what to do.
@@ -22,6 +25,8 @@ class MeshFileError(ValueError):
 
     def __init__(self, path: str | os.PathLike[str], what: str, line: int | None = None, remedy: str = "") -> None:
         # All arguments go to the base class, so that the exception survives pickling between processes.
+        if len(what) > _MOST:
+            what = f"{what[: _MOST // 2]} … {what[-_MOST // 2 :]}"
         super().__init__(path, what, line, remedy)
         self.path = path
         self.what = what

@@ -46,9 +46,9 @@ AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
 )
 _Choice = Callable[[Stages], Stages]
 _Search = Callable[[Problem, ArrayLike | None, int, _Choice], MapResult]
-# Iterations of a search while a construction is there to be taken, and how often edges are split around what such a
-# search leaves inverted; the latter where there is no construction.
-_FEW_ITERATIONS, _FEW_ROUNDS, _ROUNDS = 600, 1, 3
+# Iterations of a search while a construction is there to be taken, and on large meshes so many triangles' iterations;
+# how often edges are split around what such a search leaves inverted; the latter where there is no construction.
+_FEW_ITERATIONS, _FEW_TRIANGLES, _FEW_ROUNDS, _ROUNDS = 600, 1_500_000, 1, 3
 # A construction that adds so few vertices is taken as soon as no map of the mesh as given was found.
 _LEAST = 1
 
@@ -137,12 +137,12 @@ class _Ladder:
             if self._last is None or self._best is None:
                 raise
             best = self._taken(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
-            told = {"stages": self._last.stages, "history": self._last.history, "rungs": self._rungs}
-            return replace(best, status=Status.INTERRUPTED, **told)
+            best = replace(best, stages=self._last.stages, history=self._last.history)
+            return replace(best, status=Status.INTERRUPTED, rungs=self._rungs)
 
     def _climb(self, start: ArrayLike | None, budget: int) -> MapResult:
         problem = self._problem
-        few = min(budget, _FEW_ITERATIONS)
+        few = min(budget, _FEW_ITERATIONS, 1 + _FEW_TRIANGLES // len(problem.F))
         if not is_simple(problem):
             # What a straight side flattens seldom has a map, and then by little more than a rounding error.
             first = self._searched(AS_GIVEN, None, start, few if len(self._flat) else budget)
@@ -223,7 +223,9 @@ class _Ladder:
             # In place of the one before it, and there if an interrupt keeps it from getting better.
             self._last = before
             result = self._continued(self._as_result(made, first, time.perf_counter() - began))
-        return result
+        # Other constructions were tried after the best.
+        *others, last = result.stages
+        return replace(result, stages=[*others, replace(last, seconds=time.perf_counter() - began)])
 
     def _as_result(self, made: Construction, first: MapResult, seconds: float) -> MapResult:
         bad = made.certificate.flipped.size + made.certificate.degenerate.size

@@ -1,0 +1,248 @@
+"""Signals at random times to the command: nothing is written in part, nothing is lost, and it ends in a sentence.
+
+    python benchmarks/signals.py -n 100
+    python benchmarks/signals.py --case polish:41 --keep FOLDER
+
+Each command is run once undisturbed, which tells how long it takes; then again and again, in a session of its own, and
+SIGINT or SIGTERM is sent to it at a time drawn from seed and name. A *failure* is a traceback; an exit status of no
+meaning (SIGTERM may end a process as it does by default); a process left behind; inputs that have changed; output that
+cannot be read to its end, or that is gone; a temporary file left behind by SIGINT; and a batch that does not go on to
+its end when the same command is given again. Needs a system with process groups.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from quasiharmonic import injective_map
+from quasiharmonic.io import MeshData, map_of, read_mesh, write_map
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import cat, disk
+
+# What is interrupted: arguments, and what they write.
+CALLS: dict[str, tuple[str, str]] = {
+    "map": ("map mesh.obj --to star:5 --polish symmetric-dirichlet -o out.obj", "out.obj"),
+    "refine": ("map coarse.obj --refine -o out.ply", "out.ply"),
+    "polish": ("polish flat.obj -o out.obj", "out.obj"),
+    "flatten": ("flatten cat.obj -o out.obj", "out.obj"),
+    "animate": ("animate mesh.obj frames.npy --polish symmetric-dirichlet -o out", "out"),
+    "batch": ("batch set -o out --to disk -j 2 --polish symmetric-dirichlet", "out"),
+}
+_SIGNALS = signal.SIGINT, signal.SIGTERM
+# Seconds that a process has to end in once it was told to, and its children after it, which may still be loading.
+_PATIENCE, _CHILDREN = 60.0, 30.0
+_OLD = b"what was here before"
+
+
+class Trial(NamedTuple):
+    """What became of an interrupted command: ``fault`` says what is wrong, and is empty where nothing is."""
+
+    name: str
+    sent: str
+    after: float
+    status: int
+    ended: float
+    fault: str
+    said: str
+
+
+def prepare(folder: Path) -> None:
+    """Write what the commands read."""
+    V, F = disk(14)
+    (loop,) = boundary_loops(F, len(V))
+    bent = MeshData(np.column_stack([V, 0.4 * (V**2).sum(axis=1)]), F)
+    z = V @ (1, 1j)
+    waves = [V * (1 + 0.03 * k * np.cos(5 * np.angle(z))[:, None]) for k in range(12)]
+    write_map(folder / "mesh.obj", bent, V)
+    write_map(folder / "flat.obj", bent, injective_map(V, F, loop, waves[-1][loop]).uv)
+    np.save(folder / "frames.npy", np.stack(waves))
+    write_map(folder / "cat.obj", MeshData(*cat(40)), np.zeros((len(cat(40)[0]), 2)))
+    # A star whose corners lie where the mesh is a fan of few triangles: edges have to be split.
+    coarse, G = disk(3)
+    (rim,) = boundary_loops(G, len(coarse))
+    star = coarse.copy()
+    star[rim] *= np.where(np.arange(len(rim)) % 2, 1.0, 0.08)[:, None]
+    write_map(folder / "coarse.obj", MeshData(np.column_stack([coarse, np.zeros(len(coarse))]), G), star)
+    (folder / "set").mkdir()
+    for k in range(8):
+        shutil.copy(folder / "mesh.obj", folder / "set" / f"part{k}.obj")
+
+
+def undisturbed(kind: str, given: Path) -> float:
+    """Seconds that a command takes."""
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(given, folder, dirs_exist_ok=True)
+        began = time.monotonic()
+        process = _start(CALLS[kind][0], Path(folder))
+        said, _ = process.communicate()
+        if process.returncode:
+            raise RuntimeError(f"qhm {CALLS[kind][0]} ends in {process.returncode} by itself: {said}")
+        return time.monotonic() - began
+
+
+def attempt(name: str, given: Path, seconds: float, folder: Path) -> Trial:
+    """Interrupt a command, ``kind:seed``, in a folder of its own."""
+    kind, seed = name.split(":")
+    call, written = CALLS[kind]
+    rng = np.random.default_rng([zlib.crc32(kind.encode()), int(seed)])
+    number = _SIGNALS[int(rng.integers(2))]
+    after = float(rng.uniform(0, 1.1 * seconds))
+    shutil.copytree(given, folder, dirs_exist_ok=True)
+    output = folder / written
+    if output.suffix:
+        output.write_bytes(_OLD)
+    process = _start(call, folder)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(after)
+    told = time.monotonic()
+    process.send_signal(number)
+    try:
+        said, _ = process.communicate(timeout=_PATIENCE)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        said, _ = process.communicate()
+    ended = time.monotonic() - told
+    fault = _fault(number, process, ended, said) or _left(given, folder, number, written, process.returncode)
+    if not fault and kind == "batch":
+        fault = _not_resumed(call, folder)
+    return Trial(name, number.name, after, process.returncode, ended, fault, said)
+
+
+def _start(call: str, folder: Path) -> subprocess.Popen[str]:
+    """The command, the leader of a group of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "quasiharmonic", *call.split()],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        # Which shells have ignored by what they start in the background.
+        preexec_fn=_heeding,
+    )
+
+
+def _heeding() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _fault(number: signal.Signals, process: subprocess.Popen[str], ended: float, said: str) -> str:
+    """What is wrong with how it ended."""
+    if ended >= _PATIENCE:
+        return f"not ended after {_PATIENCE:g} s"
+    if "Traceback" in said or "Error" in said:
+        return "a traceback"
+    by_itself = 0, 1, 2, 3
+    if process.returncode not in (by_itself if number is signal.SIGINT else (*by_itself, -signal.SIGTERM)):
+        return f"exit status {process.returncode}"
+    if process.returncode == 2 and "qhm" not in said:
+        return "ended without a word"
+    deadline = time.monotonic() + _CHILDREN
+    while _alive(process.pid):
+        if time.monotonic() > deadline:
+            os.killpg(process.pid, signal.SIGKILL)
+            return "processes left behind"
+        time.sleep(0.05)
+    return ""
+
+
+def _alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _left(given: Path, folder: Path, number: signal.Signals, written: str, status: int) -> str:
+    """What is wrong with what is in the folder."""
+    for path in (path for path in given.rglob("*") if path.is_file()):
+        here = folder / path.relative_to(given)
+        if not here.is_file() or here.read_bytes() != path.read_bytes():
+            return f"{here.name} has changed"
+    parts = list(folder.rglob("*.tmp"))
+    if parts and number is signal.SIGINT:
+        return f"left behind: {parts[0].name}"
+    output = folder / written
+    if not output.suffix:
+        return _unreadable(path for path in output.rglob("*.obj") if path.is_file()) if output.is_dir() else ""
+    if not output.is_file():
+        return "what was there is gone"
+    if output.read_bytes() == _OLD:
+        return "" if status in (2, -signal.SIGTERM) else f"exit status {status}, and nothing written"
+    return "exit status 2, and written" if status == 2 else _unreadable([output])
+
+
+def _unreadable(paths: Iterable[Path]) -> str:
+    """The first of some maps that cannot be read, and why."""
+    for path in paths:
+        try:
+            if map_of(read_mesh(path)) is None:
+                return f"{path.name} has no map"
+        except (ValueError, OSError) as error:
+            return f"{path.name}: {error}"
+    return ""
+
+
+def _not_resumed(call: str, folder: Path) -> str:
+    """What is wrong when a batch is given again."""
+    again = _start(call, folder)
+    said, _ = again.communicate()
+    if again.returncode:
+        return f"given again, it ends in {again.returncode}: {said[-300:]}"
+    records = (folder / "out" / "records.csv").read_text(encoding="utf-8").splitlines()
+    wanted = 1 + len(list((folder / "set").glob("*.obj")))
+    return "" if len(records) == wanted else f"{len(records)} lines of records instead of {wanted}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Interrupt commands and list what went wrong; 1 when anything has."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-n", "--count", type=int, default=60, help="signals (%(default)s)")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="begin with this seed (%(default)s)")
+    parser.add_argument("--kinds", default=",".join(CALLS), help="separated by commas (all)")
+    parser.add_argument("--case", action="append", metavar="NAME", help="interrupt just this, e.g. polish:41")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the files there")
+    options = parser.parse_args(arguments)
+    kinds = options.kinds.split(",")
+    names = options.case or [f"{kinds[i % len(kinds)]}:{options.first + i // len(kinds)}" for i in range(options.count)]
+    if unknown := {name.split(":")[0] for name in names} - set(CALLS):
+        parser.error(f"no kind {', '.join(sorted(unknown))}; there are {', '.join(CALLS)}")
+    ends: Counter[str] = Counter()
+    failures, slowest = 0, 0.0
+    with tempfile.TemporaryDirectory() as given:
+        prepare(Path(given))
+        seconds = {kind: undisturbed(kind, Path(given)) for kind in dict.fromkeys(name.split(":")[0] for name in names)}
+        print("undisturbed: " + ", ".join(f"{kind} {took:.1f} s" for kind, took in seconds.items()), flush=True)
+        for name in names:
+            folder = Path(tempfile.mkdtemp()) if options.keep is None else options.keep / name.replace(":", "-")
+            trial = attempt(name, Path(given), seconds[name.split(":")[0]], folder)
+            ends[f"{trial.sent} → {trial.status}"] += 1
+            failures, slowest = failures + bool(trial.fault), max(slowest, trial.ended)
+            print(f"{trial.name}: {trial.sent} after {trial.after:.2f} s, {trial.fault or 'right'}", flush=True)
+            if trial.fault or options.case:
+                print("    " + trial.said.strip()[-1000:], flush=True)
+            if options.keep is None:
+                shutil.rmtree(folder)
+    print(", ".join(f"{end}: {count}" for end, count in sorted(ends.items())))
+    print(f"{failures} failures among {len(names)} signals, the slowest to end took {slowest:.1f} s")
+    return int(failures > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
