@@ -34,7 +34,7 @@ import numpy as np
 
 from damage import valid_files
 
-SECONDS, GIGABYTES, LETTERS = 10.0, 1.0, 400
+SECONDS, GIGABYTES, LETTERS = 10.0, 1.0, 600
 # Beyond these a process is ended, and fails.
 _MOST_SECONDS, _MOST_BYTES = 60, 6 << 30
 _HUGE = 10**15
