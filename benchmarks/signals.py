@@ -176,7 +176,8 @@ def _left(given: Path, folder: Path, number: signal.Signals, written: str, statu
         if not here.is_file() or here.read_bytes() != path.read_bytes():
             return f"{here.name} has changed"
     parts = list(folder.rglob("*.tmp"))
-    if parts and number is signal.SIGINT:
+    # A batch ends its workers outright, and clears up when it is given again.
+    if parts and number is signal.SIGINT and not (folder / "out").is_dir():
         return f"left behind: {parts[0].name}"
     output = folder / written
     if not output.suffix:
@@ -205,6 +206,8 @@ def _not_resumed(call: str, folder: Path) -> str:
     said, _ = again.communicate()
     if again.returncode:
         return f"given again, it ends in {again.returncode}: {said[-300:]}"
+    if parts := list(folder.rglob("*.tmp")):
+        return f"given again, it leaves {parts[0].name} behind"
     records = (folder / "out" / "records.csv").read_text(encoding="utf-8").splitlines()
     wanted = 1 + len(list((folder / "set").glob("*.obj")))
     return "" if len(records) == wanted else f"{len(records)} lines of records instead of {wanted}"
