@@ -101,6 +101,22 @@ def test_walls_slide(ring):
     assert mean_ratio(there, F).min() > 1.2 * mean_ratio(held.points, F).min()
 
 
+def test_walls_that_are_curved_stay_as_they_were():
+    """A round wall: what glides along the polygon of the first mesh does not cut its corners, however often."""
+    points, F = disk(8)
+    (wall,) = boundary_loops(F, len(points))
+    pin = np.array([0])
+    mesh = MovingMesh(points, F, pin, slide=True)
+    for turn in np.linspace(0, 6 * np.pi, 40):
+        there = mesh.advance([[0.5 * np.sin(turn / 2), 0.4 * np.sin(turn)]])
+    sides = np.abs(points[wall[0]] - points[wall[1]]) @ (1, 1j)
+    lowest = np.sqrt(1 - abs(sides) ** 2 / 4)
+    radius = np.hypot(*there[wall].T)
+    assert np.abs(there[wall] - points[wall]).max() > 1e-3
+    assert radius.min() > lowest - 1e-12
+    assert certify(mesh.F, there).bijective
+
+
 def test_a_boundary_that_cannot_arrive_leaves_the_mesh_as_it_was(ring):
     points, F, _walls, hole = ring
     mesh = MovingMesh(points, F, hole)

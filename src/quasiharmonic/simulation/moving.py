@@ -113,6 +113,9 @@ class MovingMesh:
         rest = np.setdiff1d(boundary_edges(F, len(self.points)), self._moved)
         self._domain = Domain(self.points, F, np.concatenate([self._moved, rest]))
         self._linear_solver = linear_solver
+        still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
+        # Walls that nothing moves are those of the first mesh for good: gliding vertices do not cut their corners.
+        self._walls = Rails.around(still, self.points, held=self._moved) if slide and still else None
         a, b, c = self.points[self._domain.F].transpose(1, 0, 2)
         area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
         # Small triangles are where a simulation looks closely: each counts the same, whatever its area.
@@ -168,7 +171,11 @@ class MovingMesh:
         descent = self._descent
         if self._slide:
             here = descent.positions(descent.w)
-            rails = Rails.around(self._domain.loops, here, held=self._moved)
+            loops = self._domain.loops
+            mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in loops)
+            rails = self._walls
+            if rails is None or mixed:
+                rails = Rails.around(loops, here, held=self._moved)
             return polish_map(
                 self._domain,
                 here,
