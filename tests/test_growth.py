@@ -66,7 +66,7 @@ def test_factorisations(counted, rings, character, most):
         bounds[2 * sizes[0]] = 11
     else:
         assert sizes == [fine]
-        # The start, and the way by a disk, where it is tried, each take one more; a map with vertices placed takes none.
+        # The start, and the way by a disk where it is tried, take one more each; a map with vertices placed takes none.
         assert counted["factor", fine] == counted["solve", fine]
         assert result.iterations <= counted["factor", fine] <= result.iterations + 2
     assert sizes == sorted(bounds)
