@@ -19,6 +19,7 @@ from quasiharmonic.arrays import (
     map_array,
     named,
     triangle_array,
+    true_or_false,
     whole_number,
 )
 from quasiharmonic.curves.rails import Rails
@@ -107,7 +108,8 @@ class MovingMesh:
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         self._moved = index_array("moved", moved)
         check_range("moved", self._moved, len(self.points))
-        self._energy, self._slide = energy_named(energy), bool(slide)
+        true_or_false("slide", slide)
+        self._energy, self._slide = energy_named(energy), slide
         whole_number("settle", settle, least=1 if slide else 0)
         self._settle = settle
         rest = np.setdiff1d(boundary_edges(F, len(self.points)), self._moved)
