@@ -4,6 +4,7 @@
     python benchmarks/speed.py                                  # made problems, 1 000 to 130 000 triangles
     python benchmarks/speed.py --triangles 500000 1000000 3500000 --peers igl.harmonic --memory
     python benchmarks/speed.py FOLDER … --triangles             # problem folders only
+    python benchmarks/speed.py FOLDER … --triangles --halved 2  # with every edge halved, twice
     python benchmarks/speed.py --animation                      # 100 frames of a moving boundary besides
     python benchmarks/speed.py --triangles --join a.csv b.csv   # one table and picture of earlier runs
     python benchmarks/speed.py --fine                           # every iteration on the mesh itself, never a coarse one
@@ -91,15 +92,32 @@ def cat(triangles: int, character: str) -> Arrays:
     return V, F, loop, arc_length(V[loop], letter(character)[0])
 
 
-def problems(sizes: list[int], letters: str, folders: list[Path]) -> Iterator[tuple[str, Arrays]]:
-    """Names and arrays, one problem at a time, the small ones first."""
+def halved(arrays: Arrays) -> Arrays:
+    """The problem with every edge halved, those of the boundary where they go too."""
+    V, F, fixed, target = arrays
+    places = np.full((len(V), 2), np.nan)
+    places[fixed] = target
+    V, F = surfaces.refine(V, F)
+    places = np.concatenate([places, np.full((len(V) - len(places), 2), np.nan)])
+    for loop in boundary_loops(F, len(V)):
+        new = np.flatnonzero(np.isnan(places[loop, 0]))
+        places[loop[new]] = (places[loop[new - 1]] + places[loop[(new + 1) % len(loop)]]) / 2
+    held = np.flatnonzero(~np.isnan(places[:, 0]))
+    return V, F, held, places[held]
+
+
+def problems(sizes: list[int], letters: str, folders: list[Path], times: int = 0) -> Iterator[tuple[str, Arrays]]:
+    """Names and arrays, one at a time, the small ones first; edges of folders' problems halved so many times."""
     for size in sizes:
         for character in letters:
             yield f"cat on {character}", cat(size, character)
     for folder in folders:
         for path in sorted(folder.rglob("input.obj")):
             problem = io.read_problem(path.parent)
-            yield path.parent.name, (problem.V, problem.F, problem.fixed, problem.target)
+            arrays: Arrays = problem.V, problem.F, problem.fixed, problem.target
+            for _ in range(times):
+                arrays = halved(arrays)
+            yield path.parent.name, arrays
 
 
 def measure(
@@ -349,6 +367,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("folders", nargs="*", type=_folder, help="problem folders")
     parser.add_argument("--triangles", nargs="*", type=_count, default=list(SIZES), help="sizes of the made problems")
     parser.add_argument("--letters", default=LETTERS, help="their targets (%(default)s)")
+    parser.add_argument("--halved", type=int, default=0, metavar="N", help="halve folders' edges so many times")
     parser.add_argument("--peers", nargs="*", choices=list(PEERS), default=list(PEERS), help="what to compare with")
     parser.add_argument("--strategy", choices=STRATEGIES, default="speed", help="%(choices)s (%(default)s)")
     parser.add_argument("--fine", action="store_true", help="VectorAdam alone, on the mesh itself")
@@ -373,7 +392,7 @@ def main(arguments: list[str] | None = None) -> None:
     records = [record for joined in options.join for record in joined]
     frames = [record for record in records if record.problem.startswith(_MOVING)]
     records = [record for record in records if record not in frames]
-    for name, arrays in problems(options.triangles, options.letters, options.folders):
+    for name, arrays in problems(options.triangles, options.letters, options.folders, options.halved):
         slow = {
             record.tool for record in records if record.median > options.limit and len(arrays[1]) > record.triangles
         }
