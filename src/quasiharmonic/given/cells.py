@@ -19,6 +19,8 @@ from quasiharmonic.mesh.elements import joined
 # Kinds of cells by how many nodes they have, and those that are no elements of a planar mesh: meshio's, and VTK's.
 _NODES = {"triangle": 3, "quad": 4, "triangle6": 6, 5: 3, 9: 4, 22: 6}
 _PASSED_OVER = ("vertex", "line", "line3", 1, 2, 3, 4, 21)
+# VTK's number of cells of any number of corners, which are cut into triangles.
+_POLYGON = 7
 # From DOLFINx's order of an element's nodes to the one around it, by how many they are.
 _AROUND = {3: [0, 1, 2], 4: [0, 1, 3, 2], 6: [0, 1, 2, 5, 3, 4]}
 _FILES = (".msh", ".vtk", ".vtu")
@@ -88,6 +90,8 @@ def _blocks(mesh: Any) -> list[tuple[Any, Any]] | None:
     cells = getattr(mesh, "cells", None)
     if isinstance(cells, Sequence) and cells and all(hasattr(block, "data") for block in cells):
         return [(block.type, block.data) for block in cells]
+    if _POLYGON in np.asarray(getattr(mesh, "celltypes", ())):
+        return None
     by_kind = getattr(mesh, "cells_dict", None)
     return None if by_kind is None else list(by_kind.items())
 
