@@ -229,12 +229,15 @@ def draw(path: Path, judged: Judged, problems: list[Problem], mapped: MappedAtla
     problem = problems[0]
 
     def framed(uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        # Of unit size, so that a picture of coordinates of 1e300 does not overflow.
         return problem.frame.inward(uv).view(np.float64).reshape(-1, 2)
 
-    rest = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
+    def halved(places: NDArray[np.float64]) -> NDArray[np.float64]:
+        # Of about unit size, so that a picture of coordinates of 1e300 does not overflow, and not rounded.
+        return np.ldexp(places, -int(np.frexp(np.abs(places).max())[1]))
+
+    rest = halved(V)
     if kind == "distortion":
-        return save_distortion_figure(path, rest, F, framed(uv))
+        return save_distortion_figure(path, rest, F, halved(uv))
     if len(problems) > 1:
         return save_map_figure(path, rest, F, framed(uv), flipped=judged.inverted)
     try:
