@@ -80,6 +80,11 @@ class SlidingSystem(NewtonSystem):
         As of `NewtonSystem`; ``fixed`` without those that slide.
     sliding : (k,) int64
         Vertices that do.
+
+    Attributes
+    ----------
+    sliding : (k,) int64
+        As given, in their order.
     """
 
     def __init__(
@@ -87,6 +92,7 @@ class SlidingSystem(NewtonSystem):
     ) -> None:
         super().__init__(F, g, n, fixed, linear_solver)
         size = self.free.size
+        self.sliding = sliding
         self.at: IntArray = np.searchsorted(self.free, sliding)
         place = np.full(size, -1)
         place[self.at] = np.arange(sliding.size)
@@ -146,6 +152,8 @@ class SlidingDescent(NewtonDescent):
     exponent : int
     linear_solver : str
         As of `NewtonDescent`.
+    system : SlidingSystem, optional
+        Of an earlier descent on the same triangles with the same ``fixed``: it is used again if the same vertices slide.
 
     Attributes
     ----------
@@ -165,7 +173,9 @@ class SlidingDescent(NewtonDescent):
         loops: Sequence[IntArray],
         exponent: int,
         linear_solver: str,
+        system: SlidingSystem | None = None,
     ) -> None:
+        self._earlier = system
         self._track, self._s, self._loops = track, track.s, list(loops)
         self.straying = Straying(track, self._loops)
         super().__init__(energy, track.uv, np.setdiff1d(fixed, track.vertices), exponent, linear_solver)
@@ -179,6 +189,9 @@ class SlidingDescent(NewtonDescent):
         self._simple = not judge_loops(self._loops, track.uv)[1]
 
     def _system(self, n: int, linear_solver: str) -> SlidingSystem:
+        if self._earlier is not None and np.array_equal(self._earlier.sliding, self._track.vertices):
+            self._earlier.take_gradients(self.energy.g)
+            return self._earlier
         return SlidingSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver, sliding=self._track.vertices)
 
     @property

@@ -26,7 +26,8 @@ from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.carrying import CarryingDescent
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.measures import mean_ratio
-from quasiharmonic.energy.polishing import at_own_scale, energy_named, polish_map
+from quasiharmonic.energy.polishing import at_own_scale, energy_named
+from quasiharmonic.energy.sliding import SlidingDescent, SlidingSystem, lay_boundary
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Domain
 
@@ -124,6 +125,7 @@ class MovingMesh:
         self._weights = area.mean() / area
         deformation, exponent = at_own_scale(self._domain, self.points, self._energy, self._weights)
         self._descent = CarryingDescent(deformation, self.points, self._domain.fixed, exponent, linear_solver)
+        self._system: SlidingSystem | None = None
 
     @property
     def F(self) -> IntArray:
@@ -170,26 +172,23 @@ class MovingMesh:
 
     def _settled(self) -> FloatArray:
         """The mesh after some steps down the energy."""
-        descent = self._descent
-        if self._slide:
-            here = descent.positions(descent.w)
-            loops = self._domain.loops
-            mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in loops)
-            rails = self._walls
-            if rails is None or mixed:
-                rails = Rails.around(loops, here, held=self._moved)
-            return polish_map(
-                self._domain,
-                here,
-                energy=self._energy,
-                weights=self._weights,
-                max_iterations=self._settle,
-                tolerance=_TOLERANCE,
-                linear_solver=self._linear_solver,
-                slide=rails,
-            ).uv
         with np.errstate(all="ignore"):
+            descent = self._sliding_from(self._descent.positions(self._descent.w)) if self._slide else self._descent
             for _ in range(self._settle):
                 if descent.step(_TOLERANCE) is not None:
                     break
         return descent.positions(descent.w)
+
+    def _sliding_from(self, here: FloatArray) -> SlidingDescent:
+        """A descent from a mesh whose walls slide, by the matrix of the last one while the same vertices do."""
+        domain, rails = self._domain, self._walls
+        mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in domain.loops)
+        if rails is None or mixed:
+            rails = Rails.around(domain.loops, here, held=self._moved)
+        track = lay_boundary(rails, domain, here)
+        deformation, exponent = at_own_scale(domain, track.uv, self._energy, self._weights)
+        descent = SlidingDescent(
+            deformation, track, domain.fixed, domain.loops, exponent, self._linear_solver, self._system
+        )
+        self._system = descent.system
+        return descent
