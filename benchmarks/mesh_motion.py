@@ -25,13 +25,13 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from mesh_movers import Extended, Kratos, Mover, Ours, compact, elasticity, harmonic, thin_plate
+from mesh_movers import Extended, Kratos, Morphed, Mover, Ours, compact, elasticity, harmonic, thin_plate
 from moving_scenes import SCENES, Scene
 from quasiharmonic import __version__, flipped_triangles
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.energy.measures import mean_ratio
 
-OURS = "ours"
+OURS, MORPH = "ours", "morph"
 #: By name and by what each step begins with. Kratos' solvers have one way only.
 METHODS: dict[tuple[str, str], Callable[[Scene], Mover]] = {
     (name, base): partial(Extended, extension=extension, from_rest=base == "first")
@@ -49,6 +49,9 @@ if importlib.util.find_spec("KratosMultiphysics") is not None:
         ("Kratos, similarity", "own"): partial(Kratos, kind="structural_similarity"),
     }
 METHODS[OURS, "last"] = Ours
+METHODS[MORPH, "first"] = Morphed
+#: Methods of which only every so many-th step is taken, and the last: a step of theirs costs as much as many of others.
+SELDOM = {(MORPH, "first"): 8}
 #: Scenes of which something is known that forbids to go on.
 TURNING = ("turning disk", "sliding walls")
 # Of how many steps one is followed by a solve of elasticity, to compare with.
@@ -61,17 +64,25 @@ class Run:
 
     Attributes
     ----------
-    steps : int
-        Valid ones.
+    at : list of int
+        The valid steps that were taken.
     quality : list of (4,)
         At each: worst and mean of the triangles' shape, and of their likeness to the first mesh, as mean ratios.
+    moves : list of float
+        How far a vertex went since the last of these steps, at most, in units of how far the body's went.
     seconds : list of float
         Of the processor, of each step.
     """
 
-    steps: int = 0
+    at: list[int] = field(default_factory=list)
     quality: list[tuple[float, float, float, float]] = field(default_factory=list)
+    moves: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        """The last valid step; 0 where there is none."""
+        return self.at[-1] if self.at else 0
 
 
 def likeness(scene: Scene, V: FloatArray) -> FloatArray:
@@ -85,10 +96,13 @@ def race(scene: Scene, steps: int | None = None) -> tuple[dict[tuple[str, str], 
     """Every method's run, taken step by step by turns, and the seconds of single solves of elasticity in between."""
     runs = {key: Run() for key in METHODS}
     movers = {key: make(scene) for key, make in METHODS.items()}
+    last = dict.fromkeys(METHODS, scene.V)
     yardstick: list[float] = []
     for k in range(1, (scene.steps if steps is None else steps) + 1):
         target = scene.target(k / scene.steps)
         for key, mover in list(movers.items()):
+            if k % SELDOM.get(key, 1) and k < scene.steps:
+                continue
             began = time.process_time()
             V = mover.step(target)
             runs[key].seconds.append(time.process_time() - began)
@@ -96,8 +110,11 @@ def race(scene: Scene, steps: int | None = None) -> tuple[dict[tuple[str, str], 
                 del movers[key]
                 continue
             shape, like = mean_ratio(V, scene.F), likeness(scene, V)
-            runs[key].steps = k
+            runs[key].at.append(k)
             runs[key].quality.append((shape.min(), shape.mean(), like.min(), like.mean()))
+            way = np.linalg.norm(V - last[key], axis=1)
+            runs[key].moves.append(float(way.max() / way[scene.body].max()))
+            last[key] = V
         if k % _YARDSTICK == 1:
             way = np.zeros_like(scene.V)
             way[scene.fixed] = target - scene.V[scene.fixed]
@@ -150,6 +167,7 @@ def rows(name: str, scene: Scene, runs: dict[tuple[str, str], Run], yardstick: l
                 "mean shape": means[1],
                 "worst likeness": lowest[2],
                 "mean likeness": means[3],
+                "largest move": max(run.moves, default=np.nan),
                 "ms a step": 1e3 * float(np.mean(run.seconds)),
                 "median ms": 1e3 * float(np.median(run.seconds)),
                 "elasticity solves": float(np.mean(run.seconds)) / unit,
@@ -205,7 +223,11 @@ def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene],
 
     names = list(dict.fromkeys(method for method, _ in METHODS))
     colors = dict(
-        zip(names, ["#8c8c8c", "#55a868", "#ccb974", "#c44e52", "#64b5cd", "#8172b3", "#1f3f8f"], strict=False)
+        zip(
+            names,
+            ["#8c8c8c", "#55a868", "#ccb974", "#c44e52", "#64b5cd", "#8172b3", "#1f3f8f", "#dd8452"],
+            strict=False,
+        )
     )
     colors[OURS] = "#1f3f8f"
     figure = Figure(figsize=(13, 7.6), layout="constrained")
@@ -215,7 +237,7 @@ def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene],
         for (method, base), run in runs.items():
             if run.steps == 0:
                 continue
-            t = np.arange(1, run.steps + 1) / scene.steps
+            t = np.array(run.at) / scene.steps
             x = np.array([scene.place_on_axis(at) for at in t])
             y = [worst for worst, *_ in run.quality]
             line = "--" if base == "first" else "-"

@@ -184,3 +184,17 @@ class Ours:
             return self._mesh.advance(target[: self._body])
         except RuntimeError:
             return None
+
+
+class Morphed:
+    """`quasiharmonic.morph`, as it comes: each displacement as one step from the first mesh."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def step(self, target: FloatArray) -> FloatArray | None:
+        from quasiharmonic import morph
+
+        scene = self._scene
+        morphed = morph(scene.V, scene.F, scene.body, target[: scene.body.size], slide=scene.slide)
+        return morphed.points if morphed.valid else None

@@ -26,6 +26,9 @@ def test_every_method_moves_a_hole_as_far_as_it_can(hole, monkeypatch):
     assert yardstick
     assert all(run.steps >= 2 for run in runs.values())
     assert runs[mesh_motion.OURS, "last"].steps == 12
+    assert runs[mesh_motion.MORPH, "first"].at == [8]
+    # Nothing leaps.
+    assert all(1 <= move < 5 for move in runs[mesh_motion.OURS, "last"].moves)
     shape = np.array(runs[mesh_motion.OURS, "last"].quality)
     assert np.all((shape > 0) & (shape <= 1))
     (row, *_) = mesh_motion.rows("travelling hole", hole, runs, yardstick)

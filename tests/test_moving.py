@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from quasiharmonic import MovingMesh, certify
+from quasiharmonic.curves.rails import Rails
+from quasiharmonic.energy import sliding
 from quasiharmonic.energy.carrying import CarryingDescent
 from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.energy.polishing import at_own_scale
+from quasiharmonic.io import MeshData, write_obj
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Domain
 from quasiharmonic.surfaces import annulus, disk
@@ -87,9 +92,9 @@ def test_a_step_is_newtons_for_the_boundary_as_it_will_be():
 
 def test_walls_slide(ring):
     points, F, walls, hole = ring
-    held, sliding = (MovingMesh(points, F, hole, slide=slide) for slide in (False, True))
+    held, gliding = (MovingMesh(points, F, hole, slide=slide) for slide in (False, True))
     for degrees in range(10, 91, 10):
-        for mesh in (held, sliding):
+        for mesh in (held, gliding):
             there = mesh.advance(turned(points[hole], degrees))
     corner = (np.abs(points[walls]) == 1).all(axis=1)
     assert corner.sum() == 4
@@ -134,6 +139,64 @@ def test_triangles_are_wound_either_way(ring):
     F[::2] = F[::2][:, [0, 2, 1]]
     mesh = MovingMesh(points, F, hole)
     assert certify(mesh.F, mesh.advance(turned(points[hole], 20))).bijective
+
+
+def test_the_matrix_of_sliding_walls_is_made_once(ring, monkeypatch):
+    points, F, _walls, hole = ring
+    made = []
+
+    class Counted(sliding.SlidingSystem):
+        def __init__(self, *args, **options):
+            made.append(1)
+            super().__init__(*args, **options)
+
+    monkeypatch.setattr(sliding, "SlidingSystem", Counted)
+    mesh = MovingMesh(points, F, hole, slide=True)
+    for k in range(1, 5):
+        mesh.advance(points[hole] + (0.02 * k, 0.01 * k))
+    assert len(made) == 1
+
+
+def test_a_matrix_used_again_is_as_good_as_a_new_one(ring):
+    points, F, walls, hole = ring
+    domain = Domain(points, F, np.concatenate([hole, walls]))
+
+    def descent(mesh, system=None, held=hole):
+        track = sliding.lay_boundary(Rails.around([walls], points, held=held), domain, mesh)
+        # At another scale, so that what is kept has to follow.
+        energy, exponent = at_own_scale(Domain(3 * points, F, walls), track.uv, SymmetricDirichlet())
+        return sliding.SlidingDescent(energy, track, domain.fixed, domain.loops, exponent, "auto", system)
+
+    first = descent(points)
+    first.step(1e-4)
+    inside = np.setdiff1d(np.arange(len(points)), domain.fixed)
+    bent = points.copy()
+    bent[inside] += 0.01 * np.sin(3 * points[inside, ::-1])
+    bent[hole] *= 0.9
+    again, new = descent(bent, first.system), descent(bent)
+    assert again.system is first.system
+    for one in (again, new):
+        one.step(1e-4)
+    assert np.abs(again.positions(again.w) - bent).max() > 1e-3
+    np.testing.assert_array_equal(again.positions(again.w), new.positions(new.w))
+    assert descent(bent, first.system, held=walls[::2]).system is not first.system
+
+
+def test_a_mesh_in_place_of_points_and_triangles(ring, tmp_path):
+    points, F, _walls, hole = ring
+    there = turned(points[hole], 20)
+    expected = MovingMesh(points, F, hole).advance(there)
+    skfem = SimpleNamespace(doflocs=points.T, t=F.T, dofs=SimpleNamespace(element_dofs=F.T))
+    write_obj(tmp_path / "ring.obj", MeshData(np.column_stack([points, np.zeros(len(points))]), F))
+    for mesh in (skfem, SimpleNamespace(points=points, cells=[SimpleNamespace(type="triangle", data=F)])):
+        np.testing.assert_array_equal(MovingMesh(mesh, hole).advance(there), expected)
+        np.testing.assert_array_equal(MovingMesh(mesh, moved=hole, settle=1).F, F)
+    np.testing.assert_allclose(MovingMesh(tmp_path / "ring.obj", hole).advance(there), expected, atol=1e-12)
+    with pytest.raises(TypeError, match="both"):
+        MovingMesh(skfem, F, hole)
+    quadrilaterals = SimpleNamespace(points=points[:4], cells=[SimpleNamespace(type="quad", data=[[0, 1, 2, 3]])])
+    with pytest.raises(ValueError, match=r"\(f, 3\)"):
+        MovingMesh(quadrilaterals, [0])
 
 
 @pytest.mark.parametrize(

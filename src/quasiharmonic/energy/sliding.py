@@ -153,7 +153,7 @@ class SlidingDescent(NewtonDescent):
     linear_solver : str
         As of `NewtonDescent`.
     system : SlidingSystem, optional
-        Of an earlier descent on the same triangles with the same ``fixed``: it is used again if the same vertices slide.
+        Of an earlier descent on the same triangles with the same ``fixed``: used again if the same vertices slide.
 
     Attributes
     ----------

@@ -69,6 +69,12 @@ def made_of_mesh(init: Callable[..., None]) -> Callable[..., None]:
     return made
 
 
+def made_of_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
+    """Let an ``__init__`` whose arguments after ``self`` are ``points`` and ``F`` of a plane take one mesh instead."""
+    made: Callable[..., None] = _taking(init, 1, planar_cells)
+    return made
+
+
 def _taking(
     function: Callable[..., Any], place: int, arrays: Callable[[Any], tuple[FloatArray, IntArray]] = mesh_arrays
 ) -> Any:

@@ -7,6 +7,8 @@ The energy compares with the first mesh, whatever the way that has led to the pr
 
 from __future__ import annotations
 
+from typing import overload
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -28,6 +30,8 @@ from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.energy.polishing import at_own_scale, energy_named
 from quasiharmonic.energy.sliding import SlidingDescent, SlidingSystem, lay_boundary
+from quasiharmonic.given.objects import MeshLike
+from quasiharmonic.given.taking import made_of_planar_mesh
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Domain
 
@@ -44,7 +48,7 @@ class MovingMesh:
 
     Parameters
     ----------
-    points : (n, 2) array
+    points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
         The mesh at the start, valid: shapes and sizes of its triangles are what is kept. Every vertex belongs to one.
     F : (f, 3) array of int
         Triangles, wound either way.
@@ -89,6 +93,30 @@ class MovingMesh:
     True
     """
 
+    @overload
+    def __init__(
+        self,
+        points: ArrayLike,
+        F: ArrayLike,
+        moved: ArrayLike,
+        *,
+        energy: str | Energy = "blend",
+        settle: int = 1,
+        slide: bool = False,
+        linear_solver: str = "auto",
+    ) -> None: ...
+    @overload
+    def __init__(
+        self,
+        points: MeshLike,
+        moved: ArrayLike,
+        *,
+        energy: str | Energy = "blend",
+        settle: int = 1,
+        slide: bool = False,
+        linear_solver: str = "auto",
+    ) -> None: ...
+    @made_of_planar_mesh
     def __init__(
         self,
         points: ArrayLike,
