@@ -3,9 +3,10 @@
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/mesh_motion.py [-o FOLDER] [--only SCENE ...]
 
 Six scenes (`moving_scenes`), and in each every method (`mesh_movers`), step by step until a triangle is inverted,
-exactly, or the scene ends. Writes mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last
-valid step, the worst and the mean quality of triangles on the way, and the processor's time for a step, beside that of
-one solve of linear elasticity, which is taken by turns with them. Kratos is left out where it is not installed.
+exactly, or the scene ends; `morph`, whose steps do not build upon each other, is asked at every eighth. Writes
+mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last valid step, the worst and the mean
+quality of triangles on the way, and the processor's time for a step, beside that of one solve of linear elasticity,
+which is taken by turns with them. Kratos is left out where it is not installed.
 """
 
 from __future__ import annotations
