@@ -110,6 +110,28 @@ def test_side_by_side_each_is_as_by_itself(rng):
         np.testing.assert_allclose(together[starts[k] : starts[k + 1]], alone, atol=1e-12)
 
 
+def test_however_many_are_placed_at_once_and_whatever_is_around_them(rng):
+    """Where vertices are many, those with five triangles around them are placed apart from those with ten."""
+    meshes = [random_delaunay(60, seed=n) for n in range(25)]
+    maps = [stirred(rng, V, F) for V, F in meshes]
+    starts = np.cumsum([0, *(len(V) for V, _ in meshes)])
+    F = np.concatenate([F + start for (_, F), start in zip(meshes, starts[:-1], strict=True)])
+    around = np.bincount(F.ravel())
+    assert {5, 6, 7, 8, 9} <= set(around.tolist())
+    together, righted = placed_each(
+        F,
+        np.concatenate([w for w, _ in maps]),
+        np.concatenate([loop + start for (_, loop), start in zip(maps, starts[:-1], strict=True)]),
+        np.repeat(np.arange(25), [len(F) for _, F in meshes]),
+    )
+    assert righted.sum() > 15
+    for k, (_, F) in enumerate(meshes):
+        alone = placed(F, *maps[k])
+        assert (alone is not None) == righted[k]
+        if righted[k]:
+            np.testing.assert_allclose(together[starts[k] : starts[k + 1]], alone, atol=1e-12)
+
+
 def test_tries_are_made_when_fewer_are_left_and_ever_more_rarely():
     tries = Tries()
     assert not tries.due(0)

@@ -182,9 +182,9 @@ def held_places(target: ArrayLike, k: int) -> FloatArray:
 
 def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
     """Raise a ValueError that names the first rows, such as ``one`` vertex, with NaN or infinite numbers."""
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if bad.size:
-        raise ValueError(f"{name} is not finite at {named(one, many, bad)}")
+    finite = np.isfinite(rows)
+    if not finite.all():
+        raise ValueError(f"{name} is not finite at {named(one, many, np.flatnonzero(~finite.all(axis=1)))}")
 
 
 def check_range(

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import combinations
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,9 @@ _SWEEPS, _IN_VAIN = 8, 3
 _SHARING = 2
 # Triangles around a vertex that is placed at most: of 16 there are 560 threes.
 _MOST_AROUND = 16
+# So many vertices are parted by how many triangles are around them, up to these numbers (6 have 20 threes, 12 have
+# 220), and so that there are so many heights at once: their arrays stay in the processor's cache.
+_MANY, _SIZES, _HEIGHTS = 16, (6, 8), 30_000
 
 
 class Tries:
@@ -95,33 +99,42 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
     given, w = w, w.copy()
     fewest, in_vain = np.full(int(mesh.max()) + 1, len(F) + 1), np.zeros(int(mesh.max()) + 1, dtype=np.int64)
     vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
+    T, of, looked_at = F, mesh, np.ones(fewest.size, dtype=bool)
     for sweep in range(_SWEEPS + 1):
-        left = np.flatnonzero(~(signed_areas(F, w) > 0))
-        count = np.bincount(mesh[left], minlength=fewest.size)
+        left = np.flatnonzero(~(signed_areas(T, w) > 0))
+        count = np.bincount(of[left], minlength=fewest.size)
         in_vain = np.where(count < fewest, 0, in_vain + 1)
-        fewest = np.minimum(count, fewest)
-        tried = in_vain < _IN_VAIN
-        before, vertices = vertices, np.unique(F[left[tried[mesh[left]]]])
+        fewest = np.where(looked_at, np.minimum(count, fewest), fewest)
+        looked_at = (count > 0) & (in_vain < _IN_VAIN)
+        before, vertices = vertices, np.unique(T[left[looked_at[of[left]]]])
         vertices = vertices[moves[vertices]]
         if not vertices.size or sweep == _SWEEPS:
             break
+        T, of = T[looked_at[of]], of[looked_at[of]]
         if not np.array_equal(vertices, before):
-            groups = _apart(F, vertices, len(w))
+            groups = _apart(T, vertices, len(w))
         _place(w, groups)
     righted = fewest == 0
     if righted.any():
         # What has moved is placed again, together with its neighbours.
         near = np.zeros(len(w), dtype=bool)
-        near[F[righted[mesh] & (w != given)[F].any(axis=1)]] = True
-        groups, there = _apart(F, np.flatnonzero(near & moves), len(w)), w.copy()
+        T, of = F[righted[mesh]], mesh[righted[mesh]]
+        near[T[_any_corner((w != given)[T])]] = True
+        groups, there = _apart(T, np.flatnonzero(near & moves), len(w)), w.copy()
         for _ in range(_SHARING):
             _place(there, groups)
         # No height falls below the least of those around it, but for rounding.
-        spoilt = np.bincount(mesh[~(signed_areas(F, there) > 0)], minlength=righted.size) > 0
-        back = F[spoilt[mesh]]
+        spoilt = np.bincount(of[~(signed_areas(T, there) > 0)], minlength=righted.size) > 0
+        back = T[spoilt[of]]
         there[back] = w[back]
         w = there
     return w, righted
+
+
+def _any_corner(marked: BoolArray) -> BoolArray:
+    """Which triangles have a corner that is marked, (f, 3) bool; many times as fast as NumPy's any."""
+    some: BoolArray = marked[:, 0] | marked[:, 1] | marked[:, 2]
+    return some
 
 
 def _place(w: ComplexArray, groups: list[_Stars]) -> None:
@@ -142,7 +155,7 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     """Interior vertices, in ascending order, in groups of such as share no triangle."""
     number = np.full(n, -1)
     number[vertices] = np.arange(vertices.size)
-    around = F[(number[F] >= 0).any(axis=1)]
+    around = F[_any_corner(number[F] >= 0)]
     triangle, corner = np.nonzero(number[around] >= 0)
     own = number[around[triangle, corner]]
     order = np.argsort(own, kind="stable")
@@ -152,21 +165,33 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     first = np.cumsum(count) - count
     # In each of the triangles around a vertex the next corner is another neighbour: they are all neighbours.
     neighbours, start = number[tails].tolist(), [*first.tolist(), own.size]
-    groups: list[list[int]] = []
-    # What has no group, or is none of the vertices and so has the last place, is in group -1.
-    group = [-1] * (vertices.size + 1)
+    # A group is a bit; what has none, or is none of the vertices and so has the last place, has no bit.
+    group = [0] * (vertices.size + 1)
     for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
-        taken = {group[other] for other in neighbours[start[vertex] : start[vertex + 1]]}
-        chosen = next(k for k in range(len(groups) + 1) if k not in taken)
-        if chosen == len(groups):
-            groups.append([])
-        groups[chosen].append(vertex)
-        group[vertex] = chosen
-    stars = []
-    for members in map(np.array, groups):
-        rows = first[members, None] + np.minimum(np.arange(count[members].max()), count[members, None] - 1)
-        stars.append(_Stars(vertices[members], tails[rows], heads[rows]))
-    return stars
+        taken = 0
+        for other in neighbours[start[vertex] : start[vertex + 1]]:
+            taken |= group[other]
+        group[vertex] = ~taken & (taken + 1)
+    bit, groups = np.array(group[:-1]), range(max(group).bit_length())
+    return [
+        _Stars(vertices[alike], tails[rows], heads[rows])
+        for k in groups
+        for alike in _alike(np.flatnonzero(bit == 1 << k), count)
+        for rows in [first[alike, None] + np.minimum(np.arange(count[alike].max()), count[alike, None] - 1)]
+    ]
+
+
+def _alike(members: IntArray, count: IntArray) -> list[IntArray]:
+    """Members of a group, where they are many by how many triangles are around them, and not too many at once."""
+    if members.size < _MANY:
+        return [members]
+    size, some = np.searchsorted(_SIZES, count[members]), list[IntArray]()
+    for k in range(len(_SIZES) + 1):
+        alike = members[size == k]
+        if alike.size:
+            around = int(count[alike].max())
+            some += np.array_split(alike, -(-alike.size * around * comb(around, 3) // _HEIGHTS))
+    return some
 
 
 def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:

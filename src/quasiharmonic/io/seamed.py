@@ -82,5 +82,6 @@ def without_idle(V: FloatArray, F: IntArray, uv: FloatArray) -> tuple[FloatArray
     V, F, uv
         Of the same shapes but for the vertices left out.
     """
-    used = np.unique(F)
-    return V[used], np.searchsorted(used, F), uv[used]
+    used = np.zeros(len(V), dtype=bool)
+    used[F] = True
+    return V[used], (np.cumsum(used) - 1)[F], uv[used]

@@ -42,8 +42,8 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     split = linked(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
     component = linked(one // 3, other // 3, len(F))
     # What is called by its smallest element is in the order of appearance.
-    split, component = (np.unique(label, return_inverse=True)[1] for label in (split, component))
-    return split.reshape(-1, 3), component.ravel()
+    split, component = ((np.cumsum(label == np.arange(label.size)) - 1)[label] for label in (split, component))
+    return split.reshape(-1, 3), component
 
 
 def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:

@@ -101,8 +101,10 @@ def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[I
         rings = starts[alike, None] + np.arange(size)
         cut = rings[:, None] if size == 3 else _ears(V[vertices[rings]], rings)
         T[first[alike, None] + np.arange(size - 2)] = cut
-    # Every corner of a polygon is one of its triangulation's.
-    return T, Polygons(np.unique(T, return_index=True)[1], starts)
+    # Every corner of a polygon is one of its triangulation's; the first of them is written last.
+    corner = np.empty(len(vertices), dtype=np.int64)
+    corner[T.ravel()[::-1]] = np.arange(T.size)[::-1]
+    return T, Polygons(corner, starts)
 
 
 def _check_rings(vertices: IntArray, sizes: IntArray) -> None:

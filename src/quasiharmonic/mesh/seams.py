@@ -113,7 +113,7 @@ class SeamedMesh:
 
     @cached_property
     def _welded(self) -> IntArray:
-        """For every corner of a triangle that has a place, vertex and place in one number; (g, 3) int64."""
+        """For every corner of a triangle that has a place, vertex and place in one number of 0, 1, …; (g, 3) int64."""
         if self.uv is None:
             place: IntArray = np.arange(int(self.FT.max(initial=-1)) + 1)
         else:
@@ -131,7 +131,9 @@ class SeamedMesh:
     @cached_property
     def seamless(self) -> bool:
         """Whether every triangle and no vertex has more than one place."""
-        return len(self.mapped) == len(self.F) and len(np.unique(self._welded)) == len(np.unique(self.F))
+        if len(self.mapped) < len(self.F):
+            return False
+        return bool(self._welded.max(initial=-1) + 1 == np.count_nonzero(np.bincount(self.F.ravel())))
 
     @cached_property
     def islands(self) -> tuple[Island, ...]:
@@ -282,7 +284,8 @@ class SeamedMesh:
         before = np.concatenate([*(island.uv for island in self.islands), nowhere])
         now = np.concatenate([*places, nowhere])
         given = self.FT >= 0
-        row, vertex = np.unique(np.stack([self.FT[given], owner[given]], axis=1), axis=0).T
+        # Row and vertex in one number, ascending.
+        row, vertex = np.divmod(np.unique(self.FT[given] * len(now) + owner[given]), len(now))
         moved = (now[vertex] != before[vertex]).any(axis=1) & np.isfinite(now[vertex]).all(axis=1)
         # A row goes along where all that use it go to the same place.
         first = np.searchsorted(row, row)
@@ -292,7 +295,6 @@ class SeamedMesh:
         uv[row[moved & together]] = now[vertex[moved & together]]
         row, vertex = row[moved & ~together], vertex[moved & ~together]
         if row.size:
-            # Row and vertex in one number, ascending.
             wanted, corner = row * len(now) + vertex, FT * len(now) + owner
             at = np.minimum(np.searchsorted(wanted, corner), row.size - 1)
             FT = np.where(wanted[at] == corner, len(uv) + at, FT)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import takewhile
 
 from quasiharmonic.descent import (
@@ -47,23 +48,32 @@ def speed(problem: Problem) -> Stages:
     list of Descent or CoarseToFine
         In the order in which they are run.
     """
+    domain = problem.domain
+    pinned, triangles = bool(domain.pins.size), len(problem.F)
+    alone = len(domain.loops) == 1 and not pinned
+    composed = alone and triangles > max(_SMALL, _SLIM * domain.loops[0].size)
+    return list(_speed(pinned, alone, composed, problem.n >= _LARGE))
+
+
+@cache
+def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
+    """The stages with pins or not, for one loop without pins or not, the composite first or not, of a large mesh."""
     other: Stages = ()
-    if problem.domain.pins.size:
+    if pinned:
         first: Descent = VectorAdam(parameterisation="si-log", iterations=400, placing=True)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
         first, newton = VectorAdam(iterations=100, placing=True), Newton(iterations=300, resume=True)
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
     repair: Stages = (Combing(resume=True), Patches(tries=15, resume=True))
-    if len(problem.domain.loops) == 1 and not problem.domain.pins.size:
+    if alone:
         # From one of the two starts or the other.
         composite = Composite(iterations=100, placing=True)
-        soonest = len(problem.F) > max(_SMALL, _SLIM * problem.domain.loops[0].size)
-        first, second = (composite, first) if soonest else (first, composite)
+        first, second = (composite, first) if composed else (first, composite)
         other = (second, *repair)
     coarse = CoarseToFine(first)
-    soon: Stages = (coarse, first, *repair) if problem.n >= _LARGE else (first, *repair, coarse)
-    return [
+    soon: Stages = (coarse, first, *repair) if large else (first, *repair, coarse)
+    return (
         *soon,
         Untangling(iterations=400, resume=True),
         Combing(in_vain=10, resume=True),
@@ -74,7 +84,7 @@ def speed(problem: Problem) -> Stages:
         RandomRestarts(in_vain=30, resume=True),
         RandomRestarts(in_vain=30),
         RandomRestarts(in_vain=60, resume=True),
-    ]
+    )
 
 
 def paper(_: Problem) -> Stages:

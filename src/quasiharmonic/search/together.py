@@ -91,14 +91,10 @@ class _Member:
         if energy < self._deepest or not self._deepest_map.size:
             self._deepest, self._deepest_map, self._deepest_xi = energy, w.copy(), xi.copy()
 
-    def note_placed(self, w: ComplexArray) -> None:
+    def note_placed(self, w: ComplexArray, mu: ComplexArray, energy: float) -> None:
         """Take note of a map with vertices placed, none of whose triangles is inverted, at its own tensors."""
-        mesh = self.problem.domain.mesh("equilateral")
-        dw = mesh.derivatives(w)
-        field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
-        energy = 2 * float(beltrami_terms(mesh, field, dw)[0].sum()) / float(dw.area.sum())
         self.history.append(Step(len(self.history), 0, energy))
-        self.best, self.best_map, self.placed_mu = (0, energy), w, field.mu
+        self.best, self.best_map, self.placed_mu = (0, energy), w, mu
 
     def stage(self, descent: VectorAdam, seconds: float) -> Stage:
         """What reports say of what was done."""
@@ -176,18 +172,34 @@ class _SideBySide:
             energy = np.where(covered > 0, 2 * np.add.reduceat(density, self.triangles[:-1]) / covered, np.inf)
         return _Maps(w, gradient, flipped, energy)
 
-    def placed(self, some: Sequence[int], w: ComplexArray) -> list[ComplexArray | None]:
-        """Of some of the meshes the maps with the vertices of inverted triangles placed, or None where some stay so."""
+    def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
+        """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
         problems = [self.members[k].problem for k in some]
-        starts = np.cumsum([0, *(problem.n for problem in problems)]).tolist()
+        vertices = np.cumsum([0, *(problem.n for problem in problems)])
+        count, starts = np.array([len(problem.F) for problem in problems]), vertices[:-1].tolist()
+        F = np.concatenate([problem.F + start for problem, start in zip(problems, starts, strict=True)])
         moved, righted = placed_each(
-            np.concatenate([problem.F + start for problem, start in zip(problems, starts[:-1], strict=True)]),
+            F,
             np.concatenate([w[self.vertices_of(k)] for k in some]),
-            np.concatenate([problem.fixed + start for problem, start in zip(problems, starts[:-1], strict=True)]),
-            np.repeat(np.arange(len(some)), [len(problem.F) for problem in problems]),
+            np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)]),
+            np.repeat(np.arange(len(some)), count),
         )
-        maps = np.split(moved, starts[1:-1])
-        return [one if good else None for one, good in zip(maps, righted.tolist(), strict=True)]
+        good = np.flatnonzero(righted)
+        if not good.size:
+            return []
+        F, starts = F[np.repeat(righted, count)], np.cumsum(count[good]) - count[good]
+        mesh = ReferenceMesh(np.empty((moved.size, 2)), F, "equilateral")
+        mu, density, area = np.empty(len(F), dtype=np.complex128), np.empty(len(F)), np.empty(len(F))
+        for part in blocks(len(F)):
+            dw = mesh[part].derivatives(moved)
+            field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
+            mu[part], area[part] = field.mu, dw.area
+            density[part] = beltrami_terms(mesh[part], field, dw)[0]
+        energy = 2 * np.add.reduceat(density, starts) / np.add.reduceat(area, starts)
+        noting = [self.members[some[k]] for k in good.tolist()]
+        for member, k, tensors, value in zip(noting, good, np.split(mu, starts[1:]), energy.tolist(), strict=True):
+            member.note_placed(moved[vertices[k] : vertices[k + 1]].copy(), tensors.copy(), value)
+        return noting
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
         """ξ with moduli clipped, in place, to where the rounded tensor is still positive definite."""
@@ -262,10 +274,7 @@ def _descend(
         ready = [side.members[k] for k in live if flipped[k] == 0]
         due = [k for k in live if flipped[k] and iteration < last and side.members[k].tries.due(flipped[k])]
         if descent.placing and due:
-            for k, w in zip(due, side.placed(due, maps.w), strict=True):
-                if w is not None:
-                    side.members[k].note_placed(w)
-                    ready.append(side.members[k])
+            ready += side.place(due, maps.w)
         # Nobody knows what an iteration takes for one of them alone: all are charged alike.
         now = time.perf_counter()
         spent, since = spent + (now - since) / len(live), now
