@@ -151,13 +151,15 @@ def test_noise_far_away_is_mended_as_doubles_have_it():
         nearest_invertible(field + 1e16, spacing=0.1)
 
 
-def test_one_pixel_far_away_leaves_the_rest_alone():
+@pytest.mark.parametrize("far", [1e8, 1e200])
+def test_one_pixel_far_away_leaves_the_rest_alone(far):
     field = wobble(24, 26, 0.2)
-    field[11, 9] = 1e8, -3e7
+    field[11, 9] = far, -0.3 * far
     mended = nearest_invertible(field)
     assert mended.certificate.bijective
     y, x = np.nonzero(mended.moved)
     assert mended.moved[11, 9]
+    assert mended.distance == pytest.approx(far * np.hypot(1, 0.3) / np.sqrt(24 * 26), rel=1e-6)
     assert max(np.abs(y - 11).max(), np.abs(x - 9).max()) < 6
 
 

@@ -140,13 +140,15 @@ def nearest_invertible(
             raise RuntimeError("rounding folds the field that was found: displacements are too large for its spacing")
     certificate = certify(grid.triangles(), (grid.points + mended).reshape(-1, 2))
     moved = (mended != given).any(axis=2)
+    away = np.hypot(*np.moveaxis(mended - given, 2, 0))
+    farthest = float(away.max())
     return InvertibleField(
         field=mended,
         moved=moved,
         certificate=certificate,
         folds=int(np.count_nonzero(wrong)),
         patches=int(labelled(moved).max()),
-        distance=float(np.sqrt(((mended - given) ** 2).sum(axis=2).mean())),
+        distance=farthest * float(np.sqrt(((away / (farthest or 1.0)) ** 2).mean())),
         seconds=time.perf_counter() - began,
     )
 
