@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import surfaces
+from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.exact.convexity import not_convex
 from quasiharmonic.exact.elements import inverted_elements
 from quasiharmonic.mesh.elements import (
@@ -90,6 +91,25 @@ def test_quality_of_known_elements():
     assert element_quality(np.arange(6)[None], STRAIGHT) == pytest.approx([np.sqrt(0.75)])
 
 
+@pytest.mark.parametrize("scale", [1, 1e-3, 1 / 3, 1e-130, 1e130])
+def test_quality_of_straight_second_order_triangles_is_that_of_triangles(scale):
+    points, corners = surfaces.grid(7, 7)
+    points[:, 1] += 0.1 * np.sin(3 * points[:, 0])
+    points, F = second_order(points * scale, corners)
+    assert element_quality(F, points) == pytest.approx(mean_ratio(points, corners), rel=1e-9)
+
+
+def test_quality_sees_the_least_jacobian():
+    rng = np.random.default_rng(4)
+    bent = STRAIGHT + rng.normal(scale=0.06, size=(60, 6, 2))
+    F = np.arange(360).reshape(60, 6)
+    quality = element_quality(F, bent.reshape(-1, 2))
+    coefficients = jacobian_coefficients(bent[..., 0], bent[..., 1])
+    mean = np.abs(coefficients.mean(axis=1)) / 2
+    even = np.array([float(least_jacobian(nodes)) for nodes in bent]) / mean
+    assert quality == pytest.approx(np.abs(mean_ratio(bent.reshape(-1, 2), F[:, :3])) * even, rel=1e-9, abs=1e-12)
+
+
 def test_triangles_among_quadrilaterals():
     F = element_array([[0, 1, 2, 3], [1, 4, 2, 2]], 5)
     points = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [2, 0.5]])
@@ -133,3 +153,11 @@ def test_boundary_nodes_whatever_the_winding():
 def test_rows_that_are_no_elements(F, message):
     with pytest.raises(ValueError, match=message):
         element_array(F, 6)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 5, 4], [0, 1, 2, 4, 5, 3], [3, 4, 5, 0, 1, 2], [0, 3, 1, 4, 2, 5]])
+def test_other_orders_of_nodes_are_told(order):
+    points, F = second_order(*surfaces.grid(2, 2))
+    element_array(F, len(points))
+    with pytest.raises(ValueError, match=r"nodes .* between other corners in one triangle than in another"):
+        element_array(F[:, order], len(points))

@@ -102,6 +102,7 @@ def test_a_boundary_that_crosses_itself_is_told():
             "points is not finite at vertex 5",
         ),
         (lambda p, F: (p * (1, 0), F, [0], [[0, 0]]), "triangles 0, 1, .* without area"),
+        (lambda p, F: (np.where(np.arange(16)[:, None] == 5, 0.9, p), F, [0], [[0, 0]]), "folded over at edge.* rest="),
         (lambda p, F: (np.concatenate([p, [[9, 9]]]), F, [len(p)], [[0, 0]]), "vertex 16 .*in no triangle"),
     ],
 )

@@ -199,12 +199,34 @@ def test_a_mesh_in_place_of_points_and_triangles(ring, tmp_path):
         MovingMesh(quadrilaterals, [0])
 
 
+def test_what_is_handed_back_is_the_callers(ring):
+    points, F, _walls, hole = ring
+    mesh, other = MovingMesh(points, F, hole), MovingMesh(points, F, hole)
+    mesh.advance(points[hole] + (0.05, 0))[:] = np.nan
+    mesh.points[:] = 7
+    other.advance(points[hole] + (0.05, 0))
+    np.testing.assert_array_equal(mesh.advance(points[hole] + (0.1, 0)), other.advance(points[hole] + (0.1, 0)))
+
+
+@pytest.mark.parametrize("exponent", [-600, 900])
+def test_units_do_not_matter(ring, exponent):
+    points, F, _walls, hole = ring
+    there = turned(points[hole], 20)
+    far = MovingMesh(np.ldexp(points, exponent), F, hole).advance(np.ldexp(there, exponent))
+    np.testing.assert_allclose(np.ldexp(far, -exponent), MovingMesh(points, F, hole).advance(there), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"points": [[0, 0], [1, 0], [np.nan, 1]]}, "points"),
         ({"points": [[0, 0], [1, 0], [2, 0]]}, "without area"),
         ({"moved": [7]}, "moved"),
+        ({"moved": [[0]]}, r"moved must have shape \(k,\), not \(1, 1\)"),
+        (
+            {"points": [[0, 0], [1, 0], [0, 1], [0.1, 0.1]], "F": [[0, 1, 2], [1, 3, 2]]},
+            "folded over at edge \\(1, 2\\)",
+        ),
         ({"energy": "arap"}, "energy must be"),
         ({"settle": 0, "slide": True}, "settle"),
         ({"settle": -1}, "settle"),

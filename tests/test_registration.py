@@ -151,6 +151,18 @@ def test_noise_far_away_is_mended_as_doubles_have_it():
         nearest_invertible(field + 1e16, spacing=0.1)
 
 
+@pytest.mark.parametrize("far", [1e8, 1e200])
+def test_one_pixel_far_away_leaves_the_rest_alone(far):
+    field = wobble(24, 26, 0.2)
+    field[11, 9] = far, -0.3 * far
+    mended = nearest_invertible(field)
+    assert mended.certificate.bijective
+    y, x = np.nonzero(mended.moved)
+    assert mended.moved[11, 9]
+    assert mended.distance == pytest.approx(far * np.hypot(1, 0.3) / np.sqrt(24 * 26), rel=1e-6)
+    assert max(np.abs(y - 11).max(), np.abs(x - 9).max()) < 6
+
+
 def test_a_field_turned_inside_out_has_a_nearest_one():
     places = pixels(12, 12)
     field = np.stack([11 - 2 * places[..., 0], 0.1 * places[..., 1]], axis=-1)
@@ -232,5 +244,7 @@ def test_wrong_fields(function, field, options, message):
 def test_wrong_options():
     with pytest.raises(ValueError, match="least must be at least 0 and less than 1, not 1"):
         nearest_invertible(WRONG, least=1)
+    with pytest.raises(ValueError, match=r"least must be at least 0 and less than 1, not '0\.5'"):
+        nearest_invertible(WRONG, least="0.5")
     with pytest.raises(ValueError, match=r"held must be an array of bool of shape \(5, 6\)"):
         nearest_invertible(WRONG, held=[0, 1])

@@ -12,7 +12,7 @@ from quasiharmonic.exact.elements import inverted_elements
 from quasiharmonic.mesh.elements import rim
 from quasiharmonic.mesh.topology import boundary_loops
 from shared.meshes import boundary_of
-from shared.simulation import channel, quadrilaterals, second_order, turned
+from shared.simulation import channel, least_jacobian, quadrilaterals, second_order, turned
 
 
 @pytest.fixture(scope="module")
@@ -256,6 +256,18 @@ def test_elements_that_cannot_be_righted_are_told():
     assert not morphed.valid
     assert morphed.inverted.size == 1
     assert side[0] in F[morphed.inverted[0]]
+
+
+def test_what_cannot_be_righted_is_tried_in_silence():
+    points, F = second_order(*surfaces.grid(5, 5))
+    side = np.flatnonzero(((points == 0) | (points == 1)).any(axis=1))
+    x, y = points[side].T
+    # On the way a system of equations is singular.
+    across = 0.18889902923018087 * np.sin(2 * np.pi * y + 0.38528662)
+    up = 0.11786290113252539 * np.sin(3 * np.pi * x + 4.0750892)
+    morphed = morph(points, F, side, np.stack([x + across, y + up], axis=1))
+    assert morphed.inverted.size
+    assert morphed.inverted.tolist() == [k for k, row in enumerate(F) if least_jacobian(morphed.points[row]) <= 0]
 
 
 @pytest.mark.parametrize("slide", [True, "rails"])

@@ -76,8 +76,10 @@ def landmarks_of(
         raise ValueError(f"weights: {named('landmark', 'landmarks', soft)} on the border, where all arrive exactly")
     _check_apart("landmarks", before)
     _check_apart("moved", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
-    for number, (start, end) in enumerate(curves):
-        one, other = _resampled(start, end, f"curve {number}", step)
+    for number, pair in enumerate(curves):
+        if len(pair) != 2:
+            raise ValueError(f"curve {number} must be two polylines, the one that goes and where to, not {len(pair)}")
+        one, other = _resampled(*pair, f"curve {number}", step)
         for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
             _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
         # A closed curve ends where it began, and curves may meet.

@@ -80,7 +80,8 @@ def warp_by_landmarks(
         one of weight 1 by a pixel costs as much as a unit of energy on a pixel. Those of infinite weight arrive
         exactly, as all do by default.
     curves : sequence of pairs of (a, 2) and (b, 2) arrays, optional
-        Polylines inside the picture and those that they go to, equal parts of the length to equal parts.
+        Polylines inside the picture and those that they go to, equal parts of the length to equal parts, at points no
+        further apart than the cells of the mesh: between these corners are cut.
     smoothness : float, optional
         A length in pixels: as far around landmarks the warp is smooth as a thin plate is
         (`quasiharmonic.energy.bending`), and stretches no more, however fine the mesh is. An eighth of the picture's

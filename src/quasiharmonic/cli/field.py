@@ -100,10 +100,11 @@ def run(options: argparse.Namespace) -> int:
 def _read(path: Path) -> NDArray[Any]:
     import numpy as np
 
-    try:
-        array: NDArray[Any] = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: no array of numbers in NumPy's format: {error}") from error
+    with path.open("rb") as file:
+        try:
+            array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise ValueError(f"{path}: no array of numbers in NumPy's format .npy: {error}") from error
     return array
 
 
@@ -129,5 +130,5 @@ def _border(field: NDArray[Any]) -> NDArray[np.bool_]:
     import numpy as np
 
     border = np.ones(field.shape[:2], dtype=bool)
-    border[1:-1, 1:-1] = False
+    border[(slice(1, -1),) * border.ndim] = False
     return border

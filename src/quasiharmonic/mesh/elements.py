@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import IntArray, check_range, index_array, named
+from quasiharmonic.arrays import IntArray, check_range, index_array, named, named_edges
+from quasiharmonic.mesh.topology import edges
 
 #: Pairs of a six-node triangle's corners, and the mid-side node between each.
 SIDES = np.array([(0, 1), (1, 2), (2, 0)])
@@ -31,7 +32,8 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
     Raises
     ------
     ValueError
-        When there are none, they are no such elements, refer to nodes that there are not, or have a node twice.
+        When there are none, they are no such elements, refer to nodes that there are not, have a node twice, or a node
+        is between other corners in one element than in another.
     """
     array = index_array("F", F)
     if array.size == 0:
@@ -48,7 +50,38 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
         twice |= (array[:, 3:] == array[:, :2]).any(axis=1)
     if twice.any():
         raise ValueError(f"{name_elements(array, np.flatnonzero(twice))} with a node twice")
+    if array.shape[1] == 6:
+        _check_middles(array)
     return array
+
+
+def _check_middles(F: IntArray) -> None:
+    """Refuse six-node triangles (f, 6) in another order of nodes, as far as neighbours show it."""
+    ends = np.sort(F[:, SIDES].reshape(-1, 2), axis=1)
+    middle, first, number = np.unique(F[:, MIDDLES], return_index=True, return_inverse=True)
+    torn = (ends != ends[first][number.ravel()]).any(axis=1)
+    if torn.any():
+        raise ValueError(
+            f"{named('node', 'nodes', middle[np.unique(number.ravel()[torn])])} between other corners in one triangle "
+            "than in another: a row of F has the three corners, and then the nodes between the first and the second, "
+            "the second and the third, the third and the first"
+        )
+
+
+def check_spread(F: IntArray, n: int) -> None:
+    """Refuse a planar mesh of ``n`` nodes, its elements made counterclockwise, of which neighbours lie on each other.
+
+    Raises
+    ------
+    ValueError
+        Names the sides on which that is so.
+    """
+    found = edges(covering_triangles(F)[0], n)
+    if found.inconsistent.size and not found.nonmanifold.size:
+        raise ValueError(
+            f"the mesh at rest is folded over at {named_edges(found.inconsistent)}, both of whose elements lie on one "
+            "side: some are inverted. Hand over the mesh as it was when it was valid; to `morph` as rest="
+        )
 
 
 def joined(blocks: Sequence[IntArray]) -> IntArray:

@@ -71,25 +71,25 @@ def least_jacobian(values: FloatArray) -> FloatArray:
     Returns
     -------
     (f,) float64
-        In floating point: at a corner, or where a side or the inside has a point at which the form is at rest.
+        In floating point, to rounding relative to the largest of the values: at a corner, or where a side or the inside
+        has a point at which the form is at rest.
     """
-    corners, sides = values[:, :3], values[:, 3:]
-    least = corners.min(axis=1)
-    with np.errstate(all="ignore"):
-        for k in range(3):
-            a, b, ab = corners[:, k], corners[:, (k + 1) % 3], sides[:, k]
-            bend = a + b - 2 * ab
-            at_rest = (a * b - ab * ab) / bend
-            least = np.where((bend > 0) & (ab < np.minimum(a, b)), np.minimum(least, at_rest), least)
-        (a, b, c), (ab, bc, ca) = corners.T, sides.T
-        # Where C λ = (ν, ν, ν): λ is the adjugate's row sums over their sum, and ν the determinant over it.
-        rows = np.stack(
-            [
-                b * c - bc * bc + bc * ca - ab * c + ab * bc - b * ca,
-                a * c - ca * ca + bc * ca - ab * c + ab * ca - a * bc,
-                a * b - ab * ab + ab * bc - b * ca + ab * ca - a * bc,
-            ]
-        )
-        det = a * (b * c - bc * bc) + ab * (bc * ca - ab * c) + ca * (ab * bc - b * ca)
-        inside = (rows > 0).all(axis=0) | (rows < 0).all(axis=0)
-        return np.where(inside, np.minimum(least, det / rows.sum(axis=0)), least)
+    scale = np.abs(values).max(axis=1)
+    values = values / np.where(scale > 0, scale, 1.0)[:, None]
+    (a, b, c), (ab, bc, ca) = values[:, :3].T, values[:, 3:].T
+    least = np.minimum(np.minimum(a, b), c)
+    for start, end, between in ((a, b, ab), (b, c, bc), (c, a, ca)):
+        fall, rise = start - between, end - between
+        within = (fall > 0) & (rise > 0)
+        share = fall / np.where(within, fall + rise, 1.0)
+        least = np.where(within, np.minimum(least, start - fall * share), least)
+    # Towards the second and the third corner: slopes at the first, and half the second derivatives. Where sides are
+    # straight these are noise, and so is the point found: the form's value there is taken, which noise cannot lower.
+    second, third, bb, cc, cross = ab - a, ca - a, a + b - 2 * ab, a + c - 2 * ca, a + bc - ab - ca
+    det = bb * cc - cross**2
+    convex = (det > 0) & (bb > 0)
+    at = np.stack([cross * third - cc * second, cross * second - bb * third]) / np.where(convex, det, 1.0)
+    inside = convex & (at > 0).all(axis=0) & (at.sum(axis=0) < 1)
+    s, t = np.where(inside, at, 0.0)
+    value = a + 2 * (second * s + third * t) + bb * s**2 + cc * t**2 + 2 * cross * s * t
+    return np.asarray(scale * np.minimum(least, value))

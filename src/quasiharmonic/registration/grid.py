@@ -86,7 +86,9 @@ class Grid:
         along, down = np.diff(w, axis=1), np.diff(w, axis=0)
         upper, lower, left, right = along[:-1], along[1:], down[:, :-1], down[:, 1:]
         sides = ((upper, left), (upper, right), (lower, left), (lower, right))
-        return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
+        # What overflows is infinite or NaN.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
 
 
 def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,7 +123,7 @@ def nearest_invertible(
     began = time.perf_counter()
     given = checked_field(field)
     grid = checked_grid(given.shape, spacing)
-    if not 0 <= least < 1:
+    if not isinstance(least, Real) or not 0 <= least < 1:
         raise ValueError(f"least must be at least 0 and less than 1, not {least!r}")
     kept = _held(held, grid)
     w = _map(grid, given)
@@ -139,13 +140,15 @@ def nearest_invertible(
             raise RuntimeError("rounding folds the field that was found: displacements are too large for its spacing")
     certificate = certify(grid.triangles(), (grid.points + mended).reshape(-1, 2))
     moved = (mended != given).any(axis=2)
+    away = np.hypot(*np.moveaxis(mended - given, 2, 0))
+    farthest = float(away.max())
     return InvertibleField(
         field=mended,
         moved=moved,
         certificate=certificate,
         folds=int(np.count_nonzero(wrong)),
         patches=int(labelled(moved).max()),
-        distance=float(np.sqrt(((mended - given) ** 2).sum(axis=2).mean())),
+        distance=farthest * float(np.sqrt(((away / (farthest or 1.0)) ** 2).mean())),
         seconds=time.perf_counter() - began,
     )
 
@@ -187,9 +190,9 @@ def _map(grid: Grid, field: FloatArray) -> ComplexArray:
 
 
 def _rounding(w: ComplexArray) -> float:
-    """What rounding may do to a determinant of a map (h, w), generously."""
-    side = max(float(np.abs(np.diff(w, axis=axis)).max()) for axis in (0, 1))
-    return 64 * float(np.finfo(np.float64).eps) * float(np.abs(w).max()) * max(side, 1)
+    """What rounding may do to a determinant of a map (h, w), generously: of most of it, whatever single pixels do."""
+    side = max(float(np.median(np.abs(np.diff(w, axis=axis)))) for axis in (0, 1))
+    return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
 
 
 def _held(held: ArrayLike | None, grid: Grid) -> BoolArray:

@@ -35,8 +35,8 @@ class NoRoomError(Exception):
 
 
 def folded(grid: Grid, w: ComplexArray, least: float) -> BoolArray:
-    """The cells (h − 1, w − 1) of which a corner's determinant is at most ``least``."""
-    return np.asarray((grid.jacobians(w) <= least).any(axis=2))
+    """The cells (h − 1, w − 1) of which a corner's determinant is not above ``least``."""
+    return np.asarray(~(grid.jacobians(w) > least).all(axis=2))
 
 
 def corners_of(cells: BoolArray) -> BoolArray:

@@ -182,7 +182,7 @@ def _step(
 ) -> FloatArray | None:
     """One step of Levenberg and Marquardt's, (k, 2), or None where none lowers what is to be lowered."""
     from scipy.sparse import csr_array, eye_array
-    from scipy.sparse.linalg import spsolve
+    from scipy.sparse.linalg import splu
 
     free = np.flatnonzero(number >= 0)
     gone = (now[free] - first[free]) / size
@@ -204,7 +204,10 @@ def _step(
     jacobian = csr_array((slopes[known], (row[known], column[known])), shape=(len(element), 2 * free.size))
     load = jacobian.T @ lacking[element, which] - dear * gone.ravel()
     matrix = jacobian.T @ jacobian + dear * eye_array(2 * free.size)
-    direction = np.asarray(spsolve(matrix.tocsc(), load)).reshape(-1, 2)
+    try:
+        direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
+    except RuntimeError:  # singular: elements so bad that being dear is rounded away
+        return None
     there = now.copy()
     for halving in range(6):
         t = 0.5**halving

@@ -22,6 +22,7 @@ from quasiharmonic.given.taking import takes_planar_mesh
 from quasiharmonic.hearing import heard
 from quasiharmonic.mesh.elements import (
     MIDDLES,
+    check_spread,
     corner_triangles,
     covering_triangles,
     element_array,
@@ -103,7 +104,7 @@ def morph(
     ------
     ValueError
         When the input is malformed (see `Problem`), a node to move is in no element, or at rest an element has no area
-        or a quadrilateral is not convex; names the elements.
+        or a quadrilateral is not convex, or the mesh is folded over; names the elements.
 
     Notes
     -----
@@ -135,6 +136,7 @@ def morph(
     first = points if rest is None else _like("rest", rest, points, used)
     begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
     F = _counterclockwise(F, first)
+    check_spread(F, len(points))
     fixed, target = _placed(points, F, moved, positions)
     question = _Question(F, first, fixed, nets_of(F))
     settings = _Settings(energy, max_iterations, linear_solver, callback, tolerance)

@@ -32,6 +32,7 @@ from quasiharmonic.energy.polishing import at_own_scale, energy_named
 from quasiharmonic.energy.sliding import SlidingDescent, SlidingSystem, lay_boundary
 from quasiharmonic.given.objects import MeshLike
 from quasiharmonic.given.taking import made_of_planar_mesh
+from quasiharmonic.mesh.elements import check_spread
 from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.problem import Domain
 
@@ -69,11 +70,6 @@ class MovingMesh:
     ------
     ValueError
         When the input is malformed, a triangle has no area, or an option has no such value.
-
-    Attributes
-    ----------
-    points : (n, 2) float64
-        The mesh at present: every triangle strictly positive, decided exactly.
 
     Examples
     --------
@@ -128,32 +124,42 @@ class MovingMesh:
         slide: bool = False,
         linear_solver: str = "auto",
     ) -> None:
-        self.points = map_array("points", points)
-        F = triangle_array(F, len(self.points))
-        ratio = mean_ratio(self.points, F)
+        self._points = map_array("points", points)
+        F = triangle_array(F, len(self._points))
+        ratio = mean_ratio(self._points, F)
         flat = np.flatnonzero(ratio == 0)
         if flat.size:
             raise ValueError(f"{named('triangle', 'triangles', flat)} without area: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
+        check_spread(F, len(self._points))
         self._moved = index_array("moved", moved)
-        check_range("moved", self._moved, len(self.points))
+        if self._moved.ndim != 1:
+            raise ValueError(f"moved must have shape (k,), not {self._moved.shape}")
+        check_range("moved", self._moved, len(self._points))
         true_or_false("slide", slide)
         self._energy, self._slide = energy_named(energy), slide
         whole_number("settle", settle, least=1 if slide else 0)
         self._settle = settle
-        rest = np.setdiff1d(boundary_edges(F, len(self.points)), self._moved)
-        self._domain = Domain(self.points, F, np.concatenate([self._moved, rest]))
+        rest = np.setdiff1d(boundary_edges(F, len(self._points)), self._moved)
+        self._domain = Domain(self._points, F, np.concatenate([self._moved, rest]))
         self._linear_solver = linear_solver
         still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
         # Walls that nothing moves are those of the first mesh for good: gliding vertices do not cut their corners.
-        self._walls = Rails.around(still, self.points, held=self._moved) if slide and still else None
-        a, b, c = self.points[self._domain.F].transpose(1, 0, 2)
+        self._walls = Rails.around(still, self._points, held=self._moved) if slide and still else None
+        # In the mesh's own unit, so that no area leaves the numbers' range.
+        exponent = np.frexp(np.abs(self._points).max())[1]
+        a, b, c = np.ldexp(self._points, -exponent)[self._domain.F].transpose(1, 0, 2)
         area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
         # Small triangles are where a simulation looks closely: each counts the same, whatever its area.
         self._weights = area.mean() / area
-        deformation, exponent = at_own_scale(self._domain, self.points, self._energy, self._weights)
-        self._descent = CarryingDescent(deformation, self.points, self._domain.fixed, exponent, linear_solver)
+        deformation, exponent = at_own_scale(self._domain, self._points, self._energy, self._weights)
+        self._descent = CarryingDescent(deformation, self._points, self._domain.fixed, exponent, linear_solver)
         self._system: SlidingSystem | None = None
+
+    @property
+    def points(self) -> FloatArray:
+        """The mesh at present, (n, 2) float64: every triangle strictly positive, decided exactly. A copy."""
+        return self._points.copy()
 
     @property
     def F(self) -> IntArray:
@@ -182,7 +188,7 @@ class MovingMesh:
         """
         there = map_array("positions", positions, self._moved.size, finite=False)
         check_finite("positions", "row", "rows", there)
-        goal = np.concatenate([there, self.points[self._domain.fixed[self._moved.size :]]])
+        goal = np.concatenate([there, self._points[self._domain.fixed[self._moved.size :]]])
         try:
             # Overflow gives inf or NaN, and a step with either is never accepted.
             with np.errstate(all="ignore"):
@@ -192,11 +198,11 @@ class MovingMesh:
                     f"the boundary can be moved there for {share:.1%} of the way only: then triangles leave it no "
                     "room, or too little for such a step; try shorter ones, or a new mesh"
                 )
-            self.points = self._settled()
+            self._points = self._settled()
         finally:
             # From the mesh there, its walls where they have slid to, or after whatever went wrong from the last.
-            self._descent.place(self.points)
-        return self.points
+            self._descent.place(self._points)
+        return self._points.copy()
 
     def _settled(self) -> FloatArray:
         """The mesh after some steps down the energy."""

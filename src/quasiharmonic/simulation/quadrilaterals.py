@@ -35,7 +35,8 @@ def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     Returns
     -------
     MapResult
-        With a stage more where steps were taken; `Status.SETTLED` where corners stay inverted after all.
+        With a stage more where steps were taken; `Status.SETTLED` where corners stay inverted after all, as few as were
+        found.
     """
     before = flipped_triangles(corners, result.uv).size
     if not before:
@@ -53,14 +54,14 @@ def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     uv[problem.fixed] = problem.target
     after = flipped_triangles(corners, uv).size
     seconds = time.perf_counter() - began
-    stage = Stage("untangling corners", steps, seconds, (before, after), (np.inf, np.inf), kept=not after)
+    stage = Stage("untangling corners", steps, seconds, (before, after), (np.inf, np.inf), kept=after < before)
     stages = [*result.stages, stage]
-    if after:
+    if after >= before:
         return replace(result, status=Status.SETTLED, stages=stages, seconds=result.seconds + seconds)
     return replace(
         result,
         uv=uv,
-        status=Status.INJECTIVE,
+        status=Status.SETTLED if after else Status.INJECTIVE,
         certificate=certify(problem.F, uv, loops=problem.domain.loops),
         stages=stages,
         seconds=result.seconds + seconds,

@@ -30,7 +30,10 @@ def element_quality(F: IntArray, points: FloatArray) -> FloatArray:
         return mean_ratio(points, F)
     if F.shape[1] == 4:
         return _of_quadrilaterals(F, points)
-    x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
+    place = points[F] - points[F[:, :1]]
+    # Products of coordinates: each element at a scale of its own.
+    place = np.ldexp(place, -np.frexp(np.abs(place).max(axis=(1, 2)))[1][:, None, None])
+    x, y = place.transpose(2, 0, 1)
     values = jacobian_coefficients(x, y)
     mean = np.abs(values.mean(axis=1))
     even = least_jacobian(values) / np.where(mean > 0, mean, 1.0)
