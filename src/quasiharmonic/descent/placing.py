@@ -221,7 +221,8 @@ def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> Compl
         least = (height[:2].transpose(1, 2, 0) @ place - height[2][:, :, None]).min(axis=1)
     least[~np.isfinite(least)] = -np.inf
     best, rows = least.argmax(axis=1), np.arange(len(w))
-    found = place[rows, 0, best] + 1j * place[rows, 1, best]
+    # Built from its parts: times 1j, infinity would be no number.
+    found = np.stack([place[rows, 0, best], place[rows, 1, best]], axis=1).view(np.complex128)[:, 0]
     return np.where(np.isfinite(least[rows, best]), found, w)
 
 
