@@ -67,8 +67,8 @@ def test_without_room_at_all_a_vertex_stays():
     nowhere = np.zeros((1, 5), dtype=complex)
     assert roomiest(np.array([2 + 1j]), nowhere, nowhere) == 2 + 1j
     # Edges that meet infinitely far away: no warning.
-    upwards = np.array([[0, 1, 2j + 3]])
-    assert roomiest(np.array([2 + 1j]), upwards, upwards + 1j) == 2 + 1j
+    tails, heads = np.array([[0, -1j, 3]]), np.array([[1, 1 - 1j, 3 + 1j]])
+    assert roomiest(np.array([2 + 1j]), tails, heads) == 2 + 1j
 
 
 def test_vertices_thrown_elsewhere_come_back(rng):
