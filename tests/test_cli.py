@@ -212,6 +212,17 @@ class TestReportFails:
         assert "Traceback" not in done.stderr
         assert run("check", tmp_path / "o.obj") == 0
 
+    @pytest.mark.parametrize(("arguments", "both"), [("map {} -o {}", True), ("measure {} --export {}", False)])
+    def test_full_standard_error_and_exports(self, star, tmp_path, arguments, both):
+        if not Path("/dev/full").exists():
+            pytest.skip("no /dev/full on this system")
+        written = tmp_path / ("o.obj" if both else "o.csv")
+        command = [sys.executable, "-m", "quasiharmonic", *arguments.format(star, written).split()]
+        with open("/dev/full", "w") as full:
+            done = subprocess.run(command, stdout=full, stderr=full if both else subprocess.DEVNULL)
+        assert done.returncode == 3
+        assert written.exists()
+
     @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
     @pytest.mark.parametrize(("more", "status"), [("| true", 3), (">&-", 0), ("--json - >&-", 3)])
     def test_closed_standard_output(self, star, tmp_path, more, status):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, certify, injective_map, io
-from quasiharmonic.construction import constructing
+from quasiharmonic.construction import constructing, cutting
 from quasiharmonic.descent import Newton, RandomRestarts, VectorAdam
 from quasiharmonic.ladder import climbing
 from quasiharmonic.ladder.climbing import climb
@@ -96,6 +96,24 @@ def test_doubles_without_room_are_told():
     assert set(result.crowded.tolist()) <= {0, 1, 2}
     assert result.crowded.size
     assert result.to_dict()["crowded"] == result.crowded.tolist()
+
+
+def test_cutting_without_end_is_told(monkeypatch):
+    """Pins in no order can take more vertices than there is room for: a limit, and a status of its own."""
+
+    def cut(problem, guide, most):
+        if most is not None:
+            raise cutting.TooManyError
+        return cutting.Cutting(problem, guide)
+
+    monkeypatch.setattr(constructing, "Cutting", cut)
+    problem = with_holes(np.random.default_rng(0), 2, 2, size=7)
+    result = climb(problem, max_iterations=1)
+    assert result.status is Status.ENTANGLED
+    assert not result.certificate.bijective
+    assert (result.added, result.crowded.size) == (0, 0)
+    assert np.array_equal(result.uv[problem.fixed], problem.target)
+    assert np.array_equal(result.F, problem.F)
 
 
 def test_targets_that_cross_themselves_are_as_before():

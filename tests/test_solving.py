@@ -518,6 +518,7 @@ def test_what_is_read_only_stays_so_when_copied(again):
     for thing, names in (
         (problem, ["target"]),
         (problem.domain, ["V", "F", "fixed"]),
+        (found, ["V"]),
         (found.certificate, ["flipped", "degenerate", "nonfinite", "crossings", "overwound", "loops"]),
         (result.diagnosis.obstructions[0], ["vertices", "edges", "triangles", "loops", "split"]),
         (InverseMap(V, F, found.uv), ["V", "F", "uv"]),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.arrays import ReadOnly
 from quasiharmonic.exact.certificate import Certificate
 from quasiharmonic.mesh.refinement import Refined
 from quasiharmonic.showing import Shown
@@ -64,6 +65,10 @@ class Status(Enum):
     NO_ROOM = (
         "A finer mesh has a map, but doubles have no room for it at the vertices named: the target is too narrow there "
         "for the spacing of the numbers. Move it nearer to the origin, or widen it."
+    )
+    ENTANGLED = (
+        "A finer mesh has a map, but cutting it as the target is took too many vertices: pins and holes lie in another "
+        "order than in the mesh. Hold fewer, or where the mesh has them; this is the best map of the mesh as given."
     )
     UNSOLVABLE = (
         "No linear solver could factor the system any more; this is the best map so far. "
@@ -174,7 +179,7 @@ class Rung:
 
 
 @dataclass(frozen=True, repr=False)
-class MapResult(Shown):
+class MapResult(ReadOnly, Shown):
     """A map of the mesh into the plane.
 
     Attributes
@@ -203,7 +208,8 @@ class MapResult(Shown):
     path : list of Snapshot
         Maps on the way, where the caller asked to have them recorded.
     V : (n, 2) or (n, 3) float64 or None
-        Rest positions of what was mapped, for pictures and measures; None where whoever made the map did not say.
+        Rest positions of what was mapped, for pictures and measures, not writeable; None where whoever made the map did
+        not say.
     refined : Refined or None
         Where edges were split (``refine``): the mesh that this is a map of, and how it came from the one given. Old
         vertices keep their numbers.
@@ -228,6 +234,15 @@ class MapResult(Shown):
     refined: Refined | None = None
     rungs: list[Rung] = field(default_factory=list)
     crowded: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if self.V is not None:
+            # Seen through this result alone: whoever handed it over may still write.
+            object.__setattr__(self, "V", self.V.view())
+        self._seal()
+
+    def _read_only(self) -> list[NDArray[np.float64]]:
+        return [] if self.V is None else [self.V]
 
     @property
     def added(self) -> int:

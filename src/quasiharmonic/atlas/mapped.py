@@ -18,7 +18,14 @@ from quasiharmonic.mesh.surface import manifold_edges
 from quasiharmonic.result import MapResult, Status
 
 # An atlas is as far as the island that comes first here; of others, as the first one.
-_FURTHEST_LAST = (Status.INTERRUPTED, Status.IMPOSSIBLE, Status.NO_ROOM, Status.OUT_OF_ITERATIONS, Status.STILL_FALLING)
+_FURTHEST_LAST = (
+    Status.INTERRUPTED,
+    Status.IMPOSSIBLE,
+    Status.ENTANGLED,
+    Status.NO_ROOM,
+    Status.OUT_OF_ITERATIONS,
+    Status.STILL_FALLING,
+)
 
 
 @dataclass(frozen=True, eq=False)

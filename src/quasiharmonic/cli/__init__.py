@@ -11,6 +11,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from io import TextIOWrapper
 
 from quasiharmonic.cli import (
@@ -91,12 +92,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(command: str, message: str, status: int) -> int:
-    print(f"qhm {command}: {message}", file=sys.stderr)
-    try:
-        sys.stdout.flush()
-    except (OSError, AttributeError):
-        # Whoever read standard output has gone: keep the interpreter from tripping over it again at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    with suppress(OSError):
+        print(f"qhm {command}: {message}", file=sys.stderr)
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        try:
+            stream.flush()
+        except (OSError, AttributeError):
+            # Whoever read it has gone, or a disk is full: keep the interpreter from tripping over it again at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
     return status
 
 

@@ -30,7 +30,7 @@ def add_parser(commands: Commands) -> None:
         "all records. The same command again goes on where the last one ended, however it ended. `qhm report OUT` "
         "makes a page of it.",
         epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
-        "(the records say why); 2 wrong call, or stopped: what was finished is kept.",
+        "(the records say why); 2 wrong call, or stopped: what was finished is kept; 3 finished, but that could not be told.",
     )
     parser.add_argument(
         "source",
@@ -115,6 +115,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run, showing how far it is; say how it ended."""
     from quasiharmonic import batch
+    from quasiharmonic.cli import report
 
     settings = batch.Settings(
         to=options.to,
@@ -155,7 +156,9 @@ def run(options: argparse.Namespace) -> int:
     finally:
         show.clear()
     wanted = "bijective" if options.flatten else "injective"
-    print(_account(progress, wanted, options.output / f"records.{options.table}"))
+    records = options.output / f"records.{options.table}"
+    with report.after_writing(records):
+        print(_account(progress, wanted, records), flush=True)
     return 0 if progress.solved == progress.total else 1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ def add_parser(commands: Commands) -> None:
         description="Measure what the map that the input's texture coordinates (vt) give does to every triangle. "
         "Means and quantiles are weighted by the surface's area; measures of size are taken after the map has been "
         "scaled to it.",
-        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written.",
+        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but not told.",
     )
     parser.add_argument(
         "input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file with a map, injective or not"
@@ -74,7 +75,8 @@ def run(options: argparse.Namespace) -> int:
         lines.append(f"mirrored {named('island', 'islands', mirrored)} measured as the other side shows them")
     if found.distances is not None:
         lines.append(found.distances.summary())
-    report.emit(facts, options.json, "\n".join(lines))
+    with nullcontext() if options.export is None else report.after_writing(options.export):
+        report.emit(facts, options.json, "\n".join(lines))
     return 0
 
 

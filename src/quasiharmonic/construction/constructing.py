@@ -18,8 +18,9 @@ from quasiharmonic.exact.certificate import Certificate, certify
 from quasiharmonic.mesh.refinement import Refined
 from quasiharmonic.problem import Domain, Problem
 
-# Vertices added for each of the mesh's, at which another way to cut is tried first.
-_MANY = 50
+# Vertices added for each of the mesh's, at which another way to cut is tried first; and so many at which cutting ends
+# where none is left, for walks around many pins that lie elsewhere in the mesh can grow without bound.
+_MANY, _MOST = 50, 60_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +37,15 @@ class Construction:
         The exact verdict on it: bijective, or else doubles have no room where triangles are not positive.
     crowded : (c,) int64
         Fixed vertices nearest to these, none if there are none.
+    cut : bool
+        Whether the mesh could be cut with as many vertices as are allowed; if not, the map is one of the mesh as it is.
     """
 
     refined: Refined
     uv: FloatArray
     certificate: Certificate
     crowded: IntArray
+    cut: bool = True
 
 
 def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Construction]:
@@ -57,13 +61,14 @@ def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Constructi
     Yields
     ------
     Construction
-        One at least. A map is there as soon as it is certified, before what it can do without is taken out.
+        One at least. A map is there as soon as it is certified, before what it can do without is taken out. Where no
+        way to cut does with as many vertices as are allowed, the map at hand, and that it was not cut.
     """
     least = None
     # Around a bad map walks may grow without end, each along those before it.
     most = _MANY * (problem.n + _MANY)
-    for guide, limit in ((best_map, most), (None, most), (best_map, None)):
-        if least is not None and (limit is None or not least[1]):
+    for guide, limit in ((best_map, most), (None, most), (best_map, max(most, _MOST))):
+        if least is not None and (limit > most or not least[1]):
             break
         try:
             for made in _constructions(problem, guide, most=limit):
@@ -73,6 +78,10 @@ def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Constructi
                     yield made
         except TooManyError:
             continue
+    if least is None:
+        certificate = certify(problem.F, best_map, loops=problem.domain.loops)
+        nowhere = np.empty(0, dtype=np.int64)
+        yield Construction(as_refined(problem.V, problem.F, problem.F, []), best_map, certificate, nowhere, cut=False)
 
 
 def construct(problem: Problem, guide: FloatArray | None = None, *, thin: bool = True) -> Construction:

@@ -233,7 +233,7 @@ class _Ladder:
         return replace(
             first,
             uv=made.uv,
-            status=Status.INJECTIVE if made.certificate.bijective else Status.NO_ROOM,
+            status=_status(made),
             certificate=made.certificate,
             stages=[stage],
             history=[],
@@ -254,6 +254,12 @@ class _Ladder:
         if best is None or _rank(result) <= _rank(best):
             self._best = result
         return result
+
+
+def _status(made: Construction) -> Status:
+    if made.certificate.bijective:
+        return Status.INJECTIVE
+    return Status.NO_ROOM if made.cut else Status.ENTANGLED
 
 
 def _rank(result: MapResult) -> tuple[int, bool, int]:

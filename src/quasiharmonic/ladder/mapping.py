@@ -78,7 +78,8 @@ def injective_map(
         Where no map of the mesh as given is found, split inner edges, as few as need be: those that the diagnosis
         names; more around what stays inverted; or, for a connected surface without handles and a target whose loops
         are simple, disjoint, nested and wound as the mesh's, pins distinct and strictly inside, as many as a
-        construction with a proof needs. Such a problem ends with a bijective map, or with ``NO_ROOM``.
+        construction with a proof needs. Such a problem ends with a bijective map, with ``NO_ROOM``,
+        or, where dozens of pins lie elsewhere than in the mesh, with ``ENTANGLED``.
 
     Returns
     -------
