@@ -13,7 +13,7 @@ from quasiharmonic.exact.side_by_side import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.problem import Domain
+from quasiharmonic.problem.side_by_side import posed_each
 from quasiharmonic.search import many
 from quasiharmonic.search.together import Patterns, first_stage
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
@@ -37,6 +37,13 @@ def pinned():
     target = V[fixed].copy()
     target[-1] += [0.2, 0.15]
     return V, F, fixed, target
+
+
+def blob(n, seed):
+    """A mesh of its own that stays in its place."""
+    V, F = random_delaunay(n, seed=seed)
+    loop = boundary_of(F)
+    return V, F, loop, V[loop]
 
 
 def mixed():
@@ -152,14 +159,12 @@ class TestStream:
     def test_none_at_all(self):
         assert list(injective_maps([])) == []
 
-    def test_equal_meshes_are_looked_at_once(self, monkeypatch):
-        looked = []
-        monkeypatch.setattr(Domain, "check_areas", lambda domain: looked.append(domain))
+    def test_equal_meshes_are_looked_at_once(self):
         copies = [tuple(np.array(part) for part in given) for given in ellipses(6)]
-        assert all(result.injective for result in injective_maps(copies, jobs=1))
-        assert len(looked) == 1
-        assert all(result.injective for result in injective_maps([*ellipses(2, 3), *ellipses(2, 4)], jobs=1))
-        assert len(looked) == 3
+        for problems, meshes in ((copies, 1), ([*ellipses(2, 3), *ellipses(2, 4)], 2)):
+            results = list(injective_maps(problems, jobs=1))
+            assert all(result.injective for result in results)
+            assert len({id(result.V) for result in results}) == meshes
 
     def test_done_is_told(self):
         told = []
@@ -248,3 +253,65 @@ def test_verdicts_on_many_maps_are_those_on_each(rng):
     kinds = {(verdict.injective, verdict.bijective) for verdict in found}
     assert kinds == {(True, True), (True, False), (False, False)}
     assert certify_each([], [], []) == []
+
+
+class TestPosing:
+    """Problems posed side by side, beside what `Problem` makes of each."""
+
+    def given(self):
+        V, F = random_annulus()
+        ring = np.concatenate(boundary_loops(F, len(V)))
+        made = [blob(30, 1), (V, F, ring, V[ring]), blob(40, 2), pinned(), blob(20, 3)]
+        return [tuple(np.array(part) for part in one) for one in made]
+
+    def test_they_are_the_same(self):
+        given = self.given()
+        given[2] = (1e90 * given[2][0], given[2][1].astype(np.int32), *given[2][2:])
+        for arrays, problem in zip(given, posed_each(given), strict=True):
+            alone = Problem(*arrays)
+            for name in ("V", "F", "fixed", "target"):
+                one, other = getattr(problem, name), getattr(alone, name)
+                assert one.dtype == other.dtype
+                assert not one.flags.writeable
+                np.testing.assert_array_equal(one, other)
+            for name in ("interior", "boundary", "inconsistent", "nonmanifold"):
+                np.testing.assert_array_equal(getattr(problem.domain.edges, name), getattr(alone.domain.edges, name))
+            assert [loop.tolist() for loop in problem.domain.loops] == [loop.tolist() for loop in alone.domain.loops]
+            assert problem.reference is None
+
+    @pytest.mark.parametrize(
+        ("which", "spoil"),
+        [
+            (0, lambda V: np.where(V.max() == V, np.nan, V)),
+            (0, lambda V: np.vstack([V, V[:1]])),
+            (0, lambda V: np.column_stack([V, 0 * V[:, 0]])),
+            (0, lambda V: V * [1, 0]),
+            (0, lambda V: V[:, 0]),
+            (1, lambda F: F + 1),
+            (1, lambda F: F - 1),
+            (1, lambda F: F[:, [0, 1, 1]]),
+            (1, lambda F: np.vstack([F, F[:1]])),
+            (1, lambda F: np.vstack([F[:1, ::-1], F[1:]])),
+            (1, lambda F: F.astype(float)),
+            (2, lambda fixed: fixed[[*range(len(fixed) - 1), 0]]),
+            (2, lambda fixed: fixed + 1000),
+            (2, lambda fixed: fixed[:-1]),
+            (3, lambda target: target[:-1]),
+            (3, lambda target: np.where(target == target.max(), np.inf, target)),
+        ],
+    )
+    def test_what_is_malformed_is_left_to_others(self, which, spoil):
+        given = self.given()
+        given[2] = (*given[2][:which], spoil(given[2][which]), *given[2][which + 1 :])
+        assert posed_each(given) is None
+
+    def test_so_are_closed_surfaces_and_those_in_pieces(self):
+        closed = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+        V, F, fixed, target = blob(30, 1)
+        twice = np.concatenate([V, V + 5]), np.concatenate([F, F + len(V)])
+        none = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        for odd in (
+            (np.random.default_rng(0).normal(size=(4, 2)), closed, *none),
+            (*twice, np.concatenate([fixed, fixed + len(V)]), np.concatenate([target, target + 5])),
+        ):
+            assert posed_each([*self.given(), odd]) is None

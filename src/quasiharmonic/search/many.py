@@ -20,6 +20,7 @@ from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
 from quasiharmonic.mesh.reference import Reference
 from quasiharmonic.problem import Problem
+from quasiharmonic.problem.side_by_side import posed_each
 from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.solving import solve
 from quasiharmonic.search.stages import Begun, Stages
@@ -207,7 +208,8 @@ class _Worker:
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
         """The results of some problems, or what was raised; ``first`` is the number of the first of them."""
-        posed: list[Problem | Exception] = [self._posed(first + k, given) for k, given in enumerate(group)]
+        ready = self._posed_at_once(group)
+        posed = [self._posed(first + k, given, ready.get(k)) for k, given in enumerate(group)]
         begun: dict[int, MapResult | Begun] = {}
         for descent, some in self._alike(posed).items():
             found = first_stage(
@@ -223,8 +225,29 @@ class _Worker:
             for k, problem in enumerate(posed)
         ]
 
-    def _posed(self, number: int, given: Any) -> Problem | Exception:
-        """A problem, on the domain of the one before if that is the same."""
+    def _posed_at_once(self, group: Sequence[Any]) -> dict[int, Problem]:
+        """Those given as arrays that have a small mesh each, unless something is the matter with one of them."""
+        if self._settings.reference is not None:
+            return {}
+        fresh = dict[int, Any]()
+        before: Sequence[Any] | None = None
+        if self._last is not None:
+            before = self._last.V, self._last.F, self._last.fixed
+        for k, given in enumerate(group):
+            if isinstance(given, Problem):
+                continue
+            if not isinstance(given, Sequence) or len(given) != 4:
+                return {}
+            if not all(isinstance(array, np.ndarray) for array in given) or _triangles(given) > SMALL:
+                return {}
+            if before is None or not all(map(_same, before, given[:3])):
+                fresh[k] = given
+            before = given[:3]
+        posed = posed_each(list(fresh.values())) if len(fresh) > 1 else None
+        return {} if posed is None else dict(zip(fresh, posed, strict=True))
+
+    def _posed(self, number: int, given: Any, ready: Problem | None) -> Problem | Exception:
+        """A problem, on the domain of the one before if that is the same; ``ready`` if it is posed already."""
         self._still_wanted()
         if isinstance(given, Problem):
             return given
@@ -235,7 +258,7 @@ class _Worker:
             last, reference = self._last, self._settings.reference
             if last is not None and _same(last.V, V) and _same(last.F, F) and _same(last.fixed, fixed):
                 return last.moved(target)
-            self._last = Problem(V, F, fixed, target, reference=reference)
+            self._last = Problem(V, F, fixed, target, reference=reference) if ready is None else ready
         except Exception as error:
             return _numbered(number, error)
         return self._last
