@@ -30,7 +30,8 @@ def add_parser(commands: Commands) -> None:
         "all records. The same command again goes on where the last one ended, however it ended. `qhm report OUT` "
         "makes a page of it.",
         epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
-        "(the records say why); 2 wrong call, or stopped: what was finished is kept; 3 finished, but that could not be told.",
+        "(the records say why); 2 wrong call, or stopped: what was finished is kept; 3 "
+        "finished, but that could not be told.",
     )
     parser.add_argument(
         "source",
