@@ -24,7 +24,7 @@ from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, 
 from quasiharmonic.descent.base import Iterates
 from quasiharmonic.descent.vector_adam import VectorAdam
 from quasiharmonic.exact.constrained_delaunay import BlockedError, constrained_delaunay
-from quasiharmonic.exact.loops import judge_loops
+from quasiharmonic.exact.loops import simple_loops
 from quasiharmonic.exact.point_location import PointLocator
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.mesh.topology import edge_keys, linked
@@ -138,8 +138,7 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     k = len(outline)
     ring = np.arange(k)
     points = _points(outline)
-    _, reasons = judge_loops([ring], points)
-    if reasons:
+    if not simple_loops([ring], points).all():
         return None
     low, high = points.min(axis=0), points.max(axis=0)
     low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
@@ -149,6 +148,7 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
         F = constrained_delaunay(np.concatenate([points, box]), sides, k + np.arange(4))
     except (BlockedError, ValueError):
         return None
+    # To the left of what runs clockwise lies the rest of the box, of k + 4 triangles.
     F = F[_within(F, k)]
     return F if len(F) == k - 2 else None
 
