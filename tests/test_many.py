@@ -78,8 +78,9 @@ class TestAgreement:
             assert result.status is alone.status
             assert [stage.name for stage in result.stages] == [stage.name for stage in alone.stages]
             assert [step.flipped for step in result.history] == [step.flipped for step in alone.history]
+            # At a map whose vertices have been placed the energy is zero but for rounding.
             np.testing.assert_allclose(
-                [step.energy for step in result.history], [step.energy for step in alone.history], rtol=1e-6
+                [step.energy for step in result.history], [step.energy for step in alone.history], rtol=1e-6, atol=1e-25
             )
             assert result.certificate.to_dict() == alone.certificate.to_dict()
             np.testing.assert_array_equal(result.V, alone.V)
