@@ -80,6 +80,12 @@ class TestTriangulation:
         F, _ = triangles([[0, 0], [1, 1], [2, 2], [3, 3]], [[0, 1, 2, 3]])
         assert F.shape == (2, 3)
 
+    @pytest.mark.parametrize("far", [np.inf, np.nan, 1e200])
+    def test_corners_out_of_range_are_triangulated_in_any_way(self, far):
+        V = np.array([[far, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        T, _ = triangulated(V, np.arange(4), np.array([0, 4]))
+        assert T.shape == (2, 3)
+
     def test_a_ring_that_repeats_a_vertex_is_named(self):
         with pytest.raises(ValueError, match="face 1 with a vertex twice"):
             triangles(np.eye(4)[:, :2], [[0, 1, 2, 3], [0, 1, 2, 1]])

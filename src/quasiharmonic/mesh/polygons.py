@@ -123,7 +123,13 @@ def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
 
 def _ears(points: FloatArray, rings: IntArray) -> IntArray:
     """Triangulate polygons (p, k, 3) of equally many corners, whose numbers are ``rings`` (p, k); (p, k - 2, 3)."""
-    flat = _projected(points)
+    # Corners that are not finite, or whose products are not, are triangulated in any way.
+    with np.errstate(all="ignore"):
+        return _cut(_projected(points), rings)
+
+
+def _cut(flat: ComplexArray, rings: IntArray) -> IntArray:
+    """Cut ears off polygons in the plane (p, k), the best first."""
     triangles = []
     while rings.shape[1] > 3:
         ear = _best_ears(flat)
@@ -143,8 +149,7 @@ def _projected(points: FloatArray) -> ComplexArray:
     least = np.eye(3)[np.abs(normal).argmin(axis=1)]
     across = np.cross(normal, least)
     along = np.cross(across, normal)
-    with np.errstate(invalid="ignore"):
-        across, along = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (across, along))
+    across, along = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (across, along))
     # A polygon without area has no normal, and is seen as well from anywhere.
     plane = np.nan_to_num(along + 1j * across, nan=1.0)
     return np.einsum("pkd,pd->pk", points, plane)
