@@ -133,7 +133,6 @@ class Smoothing:
             if self._system is None:
                 self._system = NewtonSystem(energy.F, energy.g, domain.n, domain.fixed, self._linear_solver)
             descent = NearDescent(energy, uv, domain.fixed, exponent, self._system, around, nearness)
-            for _ in range(steps):
-                if descent.step(_TOLERANCE) is not None:
-                    break
+            for _ in descent.descend(steps, _TOLERANCE):
+                pass
             return descent.positions(descent.w), descent.lowered

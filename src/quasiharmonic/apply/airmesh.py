@@ -210,9 +210,8 @@ class AirMesh:
                 rest_F=np.concatenate([self._F, n + np.arange(air.size).reshape(-1, 3)]),
             )
             descent = NewtonDescent(energy, points, fixed, 0, "auto")
-            for _ in range(60):
-                if descent.step(_AT_REST) is not None:
-                    break
+            for _ in descent.descend(60, _AT_REST):
+                pass
             points = descent.positions(descent.w)
             elastic = self._elastic(points)
             # Fresh air may let them slide further.

@@ -225,15 +225,11 @@ def bend_map(
         deformation, exponent = at_own_scale(domain, result.uv, energy_named(energy))
         descent = BendingDescent(deformation, result.uv, domain.fixed, exponent, linear_solver, plate)
     try:
-        for number in range(_STEPS):
-            with np.errstate(all="ignore"):
-                outcome = descent.step(_TOLERANCE)
-            history.append(Step(number + 1, 0, descent.value))
+        for number, outcome in enumerate(descent.descend(_STEPS, _TOLERANCE), start=1):
+            history.append(Step(number, 0, descent.value))
             if callback is not None:
                 callback(history[-1])
-            if outcome is not None:
-                status = outcome
-                break
+            status = outcome or status
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     uv = descent.positions(descent.w)

@@ -15,6 +15,7 @@ converges faster.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -138,6 +139,16 @@ class NewtonDescent:
         uv[self._faint[still]] = self._faint_uv[still]
         uv[self.fixed] = self._pinned
         return uv
+
+    def descend(self, steps: int, tolerance: float) -> Iterator[Status | None]:
+        """Take so many steps at most, and tell after each what `step` does; a status after the last that there is."""
+        outcome = None
+        while outcome is None and steps > 0:
+            # Overflow gives inf or NaN, and a step with either is never accepted.
+            with np.errstate(all="ignore"):
+                outcome = self.step(tolerance)
+            steps -= 1
+            yield outcome
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step; a status where there is no other to take."""

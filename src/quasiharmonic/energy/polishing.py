@@ -188,13 +188,9 @@ def polish_map(
     status = Status.STILL_FALLING
     try:
         report()
-        for _ in range(max_iterations):
-            with np.errstate(all="ignore"):
-                outcome = descent.step(tolerance)
+        for outcome in descent.descend(max_iterations, tolerance):
             report()
-            if outcome is not None:
-                status = outcome
-                break
+            status = outcome or status
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     uv = descent.positions(descent.w)

@@ -208,9 +208,8 @@ class MovingMesh:
         """The mesh after some steps down the energy."""
         with np.errstate(all="ignore"):
             descent = self._sliding_from(self._descent.positions(self._descent.w)) if self._slide else self._descent
-            for _ in range(self._settle):
-                if descent.step(_TOLERANCE) is not None:
-                    break
+            for _ in descent.descend(self._settle, _TOLERANCE):
+                pass
         return descent.positions(descent.w)
 
     def _sliding_from(self, here: FloatArray) -> SlidingDescent:
