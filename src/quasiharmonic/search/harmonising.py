@@ -235,9 +235,10 @@ def harmonise_map(
                 for value in values:
                     rest = descent.run(f"harmonise, {name}, η = {value:g}", value, max_iterations, tolerance)
                     status = Status.POLISHED if rest else Status.STILL_FALLING
-                if (descent.right() and descent.best < first) or values == len(schedule) * schedule[-1:]:
+                done = descent.right() and (descent.best < first or status is Status.POLISHED)
+                if done or values == len(schedule) * schedule[-1:]:
                     break
-                # The schedule's long steps left triangles that cannot be righted, or no map better than the first:
+                # The schedule's long steps left triangles that cannot be righted, or are still above the map given:
                 # from the start once more, with the last η alone.
                 descent.back()
         except KeyboardInterrupt:
