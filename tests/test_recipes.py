@@ -27,6 +27,7 @@ def test_there_is_one_for_each():
         "A functional",
         "An energy",
         "A linear solver",
+        "A kernel",
         "A way to descend",
         "A file format",
         "An outline",

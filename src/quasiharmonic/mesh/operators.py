@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags, vstack
 
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
 
@@ -78,14 +78,15 @@ def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Refere
     -------
     Operators
     """
-    F = np.asarray(F, dtype=np.int64)
-    mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), F, reference)
-    f, n = len(F), len(V)
+    triangles: IntArray = np.asarray(F, dtype=np.int64)
+    mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), triangles, reference)
+    f, n = len(triangles), len(V)
     shape, offsets = (f, n), np.arange(0, 3 * f + 1, 3)
     Gx, Gy = (
-        csr_array((part.T.ravel(), F.ravel(), offsets), shape=shape) for part in (mesh.gamma.real, mesh.gamma.imag)
+        csr_array((part.T.ravel(), triangles.ravel(), offsets), shape=shape)
+        for part in (mesh.gamma.real, mesh.gamma.imag)
     )
-    edge = boundary_edges(F, n)
+    edge = boundary_edges(triangles, n)
     half = csr_array((np.full(len(edge), 0.5), (edge[:, 0], edge[:, 1])), shape=(n, n))
     D = csr_array(half - half.T)
     boundary = np.unique(edge)

@@ -20,7 +20,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.kernels import compiled
 
 Reference = Literal["equilateral", "rest", "corrected"]
 
@@ -109,7 +110,7 @@ class ReferenceMesh:
         f times (stride 0), which keeps them out of memory.
     """
 
-    def __init__(self, V: FloatArray, F: NDArray[np.integer], kind: Reference) -> None:
+    def __init__(self, V: FloatArray, F: IntArray, kind: Reference) -> None:
         self.kind = kind
         self.F = F
         self.n = len(V)
@@ -167,16 +168,23 @@ class ReferenceMesh:
         -------
         Derivatives
         """
-        corners = w.take(self.F)
-        d1, d2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        g1, g2 = self._half_gamma
-        area = 0.5 * (d1.conj() * d2).imag
-        p = d1 * g1.conj()
-        p += d2 * g2.conj()
-        d1 *= g1
-        d2 *= g2
-        d1 += d2
-        return Derivatives(p, d1, area)
+        f = len(self.F)
+        p, q, area = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
+        wirtinger(w, self.F, self._half_gamma, p, q, area)
+        return Derivatives(p, q, area)
+
+
+@compiled
+def wirtinger(
+    w: ComplexArray, F: IntArray, half_gamma: ComplexArray, p: ComplexArray, q: ComplexArray, area: FloatArray
+) -> None:
+    """Fill in ``∂w/∂z``, ``∂w/∂z̄`` and signed areas of a map (n,); half_gamma: of the last two corners (2, f)."""
+    corners = w.take(F)
+    d1, d2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    g1, g2 = half_gamma
+    area[:] = 0.5 * (d1.conj() * d2).imag
+    p[:] = d1 * g1.conj() + d2 * g2.conj()
+    q[:] = d1 * g1 + d2 * g2
 
 
 class Derivatives(NamedTuple):

@@ -1,0 +1,35 @@
+"""The extension of compiled kernels; all else about the package is in pyproject.toml.
+
+Without a compiler, or with ``QUASIHARMONIC_PURE=1``, the package is built without it and runs on NumPy alone.
+"""
+
+import os
+import sys
+import sysconfig
+from pathlib import Path
+
+from setuptools import Extension, setup
+
+KERNELS = Path("src/quasiharmonic/kernels")
+# A product and a sum rounded as one, where the processor can, would make results differ from machine to machine.
+FLAGS = ["/std:c11"] if sys.platform == "win32" else ["-std=c11", "-O3", "-ffp-contract=off"]
+# One wheel serves this Python and all later ones, but for those without the global lock.
+STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
+
+if os.environ.get("QUASIHARMONIC_PURE"):
+    setup()
+else:
+    setup(
+        ext_modules=[
+            Extension(
+                "quasiharmonic.kernels._compiled",
+                sorted(str(path) for path in KERNELS.glob("*.c")),
+                depends=sorted(str(path) for path in KERNELS.glob("*.h")),
+                define_macros=[("Py_LIMITED_API", "0x030B0000")] if STABLE else [],
+                py_limited_api=STABLE,
+                extra_compile_args=FLAGS,
+                optional=True,
+            )
+        ],
+        options={"bdist_wheel": {"py_limited_api": "cp311"}} if STABLE else {},
+    )

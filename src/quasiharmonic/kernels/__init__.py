@@ -1,0 +1,34 @@
+"""Loops in C, where a compiler was at hand when the package was built, each with a twin in NumPy that says the same.
+
+A kernel is a function that fills arrays handed to it. Its NumPy text stands where it is used, defines what it does, and
+is decorated by `compiled`; the function of that name in the extension, made of the C files of this folder, takes its
+place where there is one. It takes its arguments by position, wants arrays of the very types and contiguous unless its C
+text says otherwise, and asks no more of them: indices in arrays are in range because whoever calls has seen to it.
+
+``QUASIHARMONIC_PURE=1`` in the environment has the NumPy texts run. Both give the same results but for rounding, and in
+the room `exact` the same in every bit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+try:
+    if os.environ.get("QUASIHARMONIC_PURE"):
+        raise ImportError("switched off")
+    from quasiharmonic.kernels import _compiled as extension
+except ImportError:
+    extension = None  # type: ignore[assignment]
+
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+
+#: The NumPy texts by name, of the modules that have been imported.
+TWINS: dict[str, Callable[..., Any]] = {}
+
+
+def compiled(twin: Kernel) -> Kernel:
+    """The function of this name in the extension, or the function as it is where there is no extension."""
+    TWINS[twin.__name__] = twin
+    return twin if extension is None else getattr(extension, twin.__name__)

@@ -1,0 +1,132 @@
+#include "arguments.h"
+
+#include <ctype.h>
+#include <string.h>
+
+/* Formats of buffers, as NumPy and `struct` write them, and the size of an item, by the letter of a kind. */
+static int fits(char kind, const char *format, Py_ssize_t itemsize)
+{
+    if (*format == '@' || *format == '=')
+        format++;
+    switch (kind) {
+    case 'd':
+        return !strcmp(format, "d") && itemsize == 8;
+    case 'z':
+        return !strcmp(format, "Zd") && itemsize == 16;
+    case 'q':
+        return (*format == 'q' || *format == 'l') && !format[1] && itemsize == 8;
+    case 'i':
+        return (*format == 'i' || *format == 'l') && !format[1] && itemsize == 4;
+    case 'u':
+        return (*format == 'I' || *format == 'L') && !format[1] && itemsize == 4;
+    case 'b':
+        return (*format == '?' || *format == 'b' || *format == 'B') && !format[1];
+    default:
+        return 0;
+    }
+}
+
+static void release(Argument *arguments, Py_ssize_t count)
+{
+    for (Py_ssize_t i = 0; i < count; i++)
+        if (arguments[i].held)
+            PyBuffer_Release(&arguments[i].view);
+}
+
+/* An array's data and shape. */
+static int take_array(PyObject *given, char letter, int strided, Argument *to)
+{
+    int flags = PyBUF_FORMAT | (strided ? PyBUF_STRIDES : PyBUF_C_CONTIGUOUS);
+    if (isupper((unsigned char)letter))
+        flags |= PyBUF_WRITABLE;
+    if (PyObject_GetBuffer(given, &to->view, flags) < 0)
+        return 0;
+    to->held = 1;
+    const Py_buffer *view = &to->view;
+    char kind = (char)tolower((unsigned char)letter);
+    if (!fits(kind, view->format ? view->format : "B", view->itemsize)) {
+        PyErr_Format(PyExc_TypeError, "holds items of the format '%s'", view->format ? view->format : "B");
+        return 0;
+    }
+    to->data = view->buf;
+    to->size = view->itemsize ? view->len / view->itemsize : 0;
+    to->rows = to->columns = to->row_stride = to->stride = 1;
+    if (view->ndim > 0) {
+        int last = view->ndim - 1;
+        to->columns = view->shape[last];
+        to->rows = 1;
+        for (int axis = 0; axis < last; axis++)
+            to->rows *= view->shape[axis];
+        to->row_stride = to->columns;
+        if (strided) {
+            if (view->ndim > 2) {
+                PyErr_SetString(PyExc_TypeError, "has more than two axes");
+                return 0;
+            }
+            to->stride = view->strides[last] / view->itemsize;
+            to->row_stride = last ? view->strides[0] / view->itemsize : 0;
+        }
+    }
+    return 1;
+}
+
+int take(const char *kernel, PyObject *const *given, Py_ssize_t count, const char *kinds, Argument *arguments)
+{
+    Py_ssize_t read = 0;
+    const char *letter = kinds;
+    for (; *letter; letter++, read++) {
+        int strided = *letter == '~';
+        letter += strided;
+        Argument *to = &arguments[read];
+        to->held = 0;
+        if (read >= count)
+            break;
+        if (*letter == 'n') {
+            to->integer = PyNumber_AsSsize_t(given[read], PyExc_OverflowError);
+            if (to->integer == -1 && PyErr_Occurred())
+                goto wrong;
+        } else if (*letter == 'x') {
+            to->number = PyFloat_AsDouble(given[read]);
+            if (to->number == -1 && PyErr_Occurred())
+                goto wrong;
+        } else if (!take_array(given[read], *letter, strided, to)) {
+            read++;
+            goto wrong;
+        }
+    }
+    if (!*letter && read == count)
+        return 1;
+    release(arguments, read);
+    PyErr_Format(PyExc_TypeError, "the kernel %s was given %zd arguments", kernel, count);
+    return 0;
+
+wrong:
+    release(arguments, read);
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    PyErr_NormalizeException(&type, &value, &traceback);
+    PyErr_Format(PyExc_TypeError, "an argument of the kernel %s (of the kinds \"%s\"): %S", kernel, kinds, value);
+    Py_XDECREF(type);
+    Py_XDECREF(value);
+    Py_XDECREF(traceback);
+    return 0;
+}
+
+PyObject *done(Argument *arguments, Py_ssize_t count)
+{
+    release(arguments, count);
+    Py_INCREF(Py_None);
+    return Py_None;
+}
+
+PyObject *done_with_integer(Argument *arguments, Py_ssize_t count, Py_ssize_t answer)
+{
+    release(arguments, count);
+    return PyLong_FromSsize_t(answer);
+}
+
+PyObject *done_with_number(Argument *arguments, Py_ssize_t count, double answer)
+{
+    release(arguments, count);
+    return PyFloat_FromDouble(answer);
+}

@@ -1,0 +1,24 @@
+/* The extension: the kernels of all files, a file for each room that has some. */
+#include "arguments.h"
+
+extern PyMethodDef mesh_kernels[];
+
+static int fill(PyObject *module)
+{
+    PyMethodDef *const tables[] = {mesh_kernels};
+    for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
+        if (PyModule_AddFunctions(module, tables[i]) < 0)
+            return -1;
+    return 0;
+}
+
+static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)fill}, {0, NULL}};
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "_compiled", "Loops of quasiharmonic, compiled.", 0, NULL, slots, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__compiled(void)
+{
+    return PyModuleDef_Init(&definition);
+}
