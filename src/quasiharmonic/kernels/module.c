@@ -1,11 +1,11 @@
-/* The extension: the kernels of all files, a file for each room that has some. */
+/* The extension: the kernels of all files, a file for each idea, as the Python files that they are for. */
 #include "arguments.h"
 
-extern PyMethodDef mesh_kernels[];
+extern PyMethodDef reference_kernels[];
 
 static int fill(PyObject *module)
 {
-    PyMethodDef *const tables[] = {mesh_kernels};
+    PyMethodDef *const tables[] = {reference_kernels};
     for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
         if (PyModule_AddFunctions(module, tables[i]) < 0)
             return -1;

@@ -1,4 +1,4 @@
-/* Kernels of the room `mesh`. */
+/* What `mesh/reference.py` has compiled. */
 #include "arguments.h"
 
 /* (w, F, half_gamma, p, q, area): Wirtinger derivatives of a map and signed areas of the images, by triangle. */
@@ -25,4 +25,4 @@ static PyObject *wirtinger(PyObject *module, PyObject *const *given, Py_ssize_t 
     return done(a, LENGTH(a));
 }
 
-PyMethodDef mesh_kernels[] = {KERNEL(wirtinger), END_OF_KERNELS};
+PyMethodDef reference_kernels[] = {KERNEL(wirtinger), END_OF_KERNELS};
