@@ -7,6 +7,7 @@ import pkgutil
 import subprocess
 import sys
 from importlib import import_module
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -71,6 +72,16 @@ def test_other_arrays_are_refused(name, make):
     for wrong in (arguments[:-1], (*arguments, arguments[-1]), ()):
         with pytest.raises(TypeError, match=f"{name} was given {len(wrong)} arguments"):
             kernel(*wrong)
+
+
+def test_an_extension_of_before_is_told(monkeypatch):
+    def newer():
+        pass
+
+    monkeypatch.setattr(kernels, "extension", SimpleNamespace(__file__="there"))
+    monkeypatch.setattr(kernels, "TWINS", {})
+    with pytest.raises(ImportError, match=r"there is too old to have newer.*pip install"):
+        kernels.compiled(newer)
 
 
 @pytest.mark.parametrize(("value", "switched"), [("1", True), ("", False)])

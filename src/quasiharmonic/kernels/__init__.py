@@ -29,6 +29,17 @@ TWINS: dict[str, Callable[..., Any]] = {}
 
 
 def compiled(twin: Kernel) -> Kernel:
-    """The function of this name in the extension, or the function as it is where there is no extension."""
+    """The function of this name in the extension, or the function as it is where there is no extension.
+
+    Raises
+    ------
+    ImportError
+        The extension was built of other C files than those beside these Python files, and has no such function.
+    """
     TWINS[twin.__name__] = twin
-    return twin if extension is None else getattr(extension, twin.__name__)
+    if extension is None:
+        return twin
+    kernel: Kernel | None = getattr(extension, twin.__name__, None)
+    if kernel is None:
+        raise ImportError(f"{extension.__file__} is too old to have {twin.__name__}; build it again: pip install -e .")
+    return kernel
