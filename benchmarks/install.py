@@ -4,8 +4,10 @@
     python benchmarks/install.py cut shapes   # the base and these
 
 Each goes into a fresh environment, from this checkout, as the README's first command has it, and makes the demo's
-picture there. Packages come from pip's cache or the network, which decides the seconds: it is done twice, both times
-are reported, and of the second the processor's share. Megabytes are of the files, over those of the empty environment.
+picture there; with `uv` too where that is installed. Packages come from a cache or the network, which decides the
+seconds: it is done twice, both times are reported, and of the second the processor's share. Megabytes, of 10⁶ bytes,
+are what the environment has grown by: its files, the blocks that they take on this disk, and of the files those that
+pip compiles (`.pyc`; uv leaves them to first use).
 """
 
 from __future__ import annotations
@@ -13,25 +15,46 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def megabytes(folder: Path) -> float:
-    """Of all files below a folder."""
-    return sum(path.lstat().st_size for path in folder.rglob("*") if not path.is_dir()) / 1e6
+def files(folder: Path) -> list[Path]:
+    """All files below a folder."""
+    return [path for path in folder.rglob("*") if not path.is_dir()]
 
 
-def installed(environment: Path, requirement: str) -> tuple[float, float]:
-    """Seconds that pip takes to install something into a new environment, by the clock and of the processor."""
+def megabytes(folder: Path, ending: str = "") -> float:
+    """Of all files below a folder, or of those that end so."""
+    return sum(path.lstat().st_size for path in files(folder) if path.name.endswith(ending)) / 1e6
+
+
+def blocks(folder: Path) -> float:
+    """Megabytes that these files take on the disk; not a number where that is not told."""
+    return sum(getattr(path.lstat(), "st_blocks", float("nan")) * 512 for path in files(folder)) / 1e6
+
+
+def commands() -> dict[str, Callable[[Path], list[str]]]:
+    """What installs into an environment, by its name."""
+    uv = shutil.which("uv")
+    by_pip = {"pip install": lambda environment: [str(python(environment)), "-m", "pip", "install", "--quiet"]}
+    by_uv = {"uv pip install": lambda environment: [uv, "pip", "install", "-q", "--python", str(python(environment))]}
+    return by_pip | by_uv if uv else by_pip
+
+
+def installed(environment: Path, command: Callable[[Path], list[str]], requirement: str) -> tuple[float, float]:
+    """Seconds that it takes to install something into a new environment, by the clock and of the processor."""
     subprocess.run([sys.executable, "-m", "venv", environment], check=True)
     began, before = time.perf_counter(), os.times()
-    subprocess.run([python(environment), "-m", "pip", "install", "--quiet", requirement], check=True)
+    subprocess.run([*command(environment), requirement], check=True)
     after = os.times()
     worked = after.children_user + after.children_system - before.children_user - before.children_system
     return time.perf_counter() - began, worked
@@ -63,25 +86,25 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("extras", nargs="*", default=["mkl"])
     options = parser.parse_args(arguments)
     print(f"{platform.platform()}, Python {platform.python_version()}\n")
-    print(
-        "| | seconds, first | again | of the processor | MB | the largest, MB |\n|---|---|---|---|---|---|", flush=True
-    )
-    for extra in ["", *options.extras]:
+    columns = "seconds, first", "again", "of the processor", "MB", "on the disk", "of them `.pyc`", "the largest, MB"
+    print(f"| | {' | '.join(columns)} |\n" + "|---" * (len(columns) + 1) + "|", flush=True)
+    for extra, (name, command) in product(["", *options.extras], commands().items()):
         requirement = f"{ROOT}[{extra}]" if extra else str(ROOT)
         with tempfile.TemporaryDirectory() as work:
             empty, first, again = (Path(work, name) for name in ("empty", "first", "again"))
             subprocess.run([sys.executable, "-m", "venv", empty], check=True)
-            (slow, _), (quick, worked) = (installed(environment, requirement) for environment in (first, again))
-            demo = [python(again), "-m", "quasiharmonic", "demo", "-o", Path(work, "demo")]
+            (slow, _), (quick, worked) = (installed(each, command, requirement) for each in (first, again))
             # Sizes before anything has run: what Python compiles on first use is pip's doing already.
-            taken = megabytes(again) - megabytes(empty)
+            sizes = megabytes(again), blocks(again), megabytes(again, ".pyc")
+            before = megabytes(empty), blocks(empty), megabytes(empty, ".pyc")
+            demo = [python(again), "-m", "quasiharmonic", "demo", "-o", Path(work, "demo")]
             subprocess.run(demo, check=True, stdout=subprocess.DEVNULL)
-            pictures = list(Path(work, "demo").glob("*.png"))
-            if not pictures:
+            if not list(Path(work, "demo").glob("*.png")):
                 raise SystemExit("the demo has drawn nothing")
-            command = f"`pip install '.[{extra}]'`" if extra else "`pip install .`"
-            row = f"{slow:.0f} | {quick:.0f} | {worked:.0f} | {taken:.0f} | {heaviest(again, 4)}"
-            print(f"| {command} | {row} |", flush=True)
+            said = f"`{name} '.[{extra}]'`" if extra else f"`{name} .`"
+            grown = [f"{size - bare:.0f}" for size, bare in zip(sizes, before, strict=True)]
+            row = [f"{slow:.0f}", f"{quick:.0f}", f"{worked:.0f}", *grown, heaviest(again, 4)]
+            print(f"| {said} | {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":
