@@ -96,3 +96,49 @@ def _(rng):
     """A vertex passed twice."""
     loops = np.array([[0, 1], [1, 2], [2, 0], [2, 3], [3, 4], [4, 2]])
     return rng.permutation(loops), np.zeros(6, dtype=np.int64), np.zeros(6, dtype=np.int64)
+
+
+@arguments_of("sure_signs")
+def _(rng):
+    """Triangles of whole numbers, many of them without area, and of what has no orientation."""
+    uv = rng.integers(0, 4, (30, 2)) * rng.choice([1.0, 1e200, 1e-320, 0.1], (30, 1))
+    uv[rng.integers(0, 30, 3), rng.integers(0, 2, 3)] = np.nan, np.inf, -np.inf
+    return soup(rng, 30, 400), uv, np.zeros(400, dtype=np.int8)
+
+
+@arguments_of("sure_signs")
+def _(rng):
+    """Slivers within rounding of none."""
+    uv = np.ldexp(np.linspace(0, 1, 40)[:, None] * [1, 3] + rng.integers(-2, 3, (40, 2)) * 2.0**-52, 3)
+    return soup(rng, 40, 500), uv, np.zeros(500, dtype=np.int8)
+
+
+@arguments_of("sure_signs")
+def _(rng):
+    """A vertex that is not there, in the first triangle."""
+    F = soup(rng, 7, 5)
+    F[0] = -1, 6, 7
+    return F, rng.normal(size=(7, 2)), np.zeros(5, dtype=np.int8)
+
+
+def curves(rng, places: Any) -> Arguments:
+    """Closed curves of three, four and twice as many places as are left, and room for what may meet."""
+    k = len(places) - 7
+    vertices = rng.permutation(len(places))
+    starts = np.array([0, 3, 7, 7 + k])
+    return places, vertices, starts, np.zeros((9 * len(places), 2), dtype=np.int64)
+
+
+@arguments_of("doubtful_pairs")
+def _(rng):
+    """Places on a coarse grid: edges cross, touch, overlap, turn back and have no length."""
+    return curves(rng, rng.integers(0, 9, (60, 2)) * 0.1)
+
+
+@arguments_of("doubtful_pairs")
+def _(rng):
+    """A star-shaped curve, and the same within rounding of a line."""
+    angle = np.sort(rng.uniform(0, 2 * np.pi, 300))
+    star = rng.uniform(0.5, 1, (300, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = np.concatenate([star, star * [1, 1e-17] + [0, 0.5]])
+    return places, np.arange(600), np.array([0, 300, 600]), np.zeros((9000, 2), dtype=np.int64)
