@@ -142,3 +142,34 @@ def _(rng):
     star = rng.uniform(0.5, 1, (300, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     places = np.concatenate([star, star * [1, 1e-17] + [0, 0.5]])
     return places, np.arange(600), np.array([0, 300, 600]), np.zeros((9000, 2), dtype=np.int64)
+
+
+def pattern_of(F: Any, place: Any) -> Arguments:
+    """What a pattern takes at most, and something in it."""
+    size, halves = int(place.max(initial=-1)) + 1, F.size
+    lengths = size + 1, size + halves, halves, halves, halves, halves + 1, halves, halves, halves
+    kinds = np.int32, np.int32, np.int64, np.int64, np.int32, np.int32, np.int64, np.int64, np.int64
+    return F, place, *(np.zeros(k, dtype=kind) for k, kind in zip(lengths, kinds, strict=True)), np.zeros(3, np.int64)
+
+
+@arguments_of("find_pattern")
+def _(rng):
+    """A mesh with its boundary held, unknowns in any order."""
+    V, F = disk(4)
+    free = rng.permutation(len(V))[: len(V) - 20]
+    place = np.full(len(V), -1, dtype=np.int32)
+    place[free] = np.arange(free.size)
+    return pattern_of(F, place)
+
+
+@arguments_of("find_pattern")
+def _(rng):
+    """Edges of many triangles, among few vertices; half of them fixed."""
+    place = rng.permutation([-1, -1, -1, -1, 0, 1, 2, 3, 4]).astype(np.int32)
+    return pattern_of(soup(rng, 9, 200), place)
+
+
+@arguments_of("find_pattern")
+def _(rng):
+    """All vertices fixed, and none."""
+    return pattern_of(soup(rng, 9, rng.integers(2) * 20), np.full(9, -1, dtype=np.int32))

@@ -339,7 +339,7 @@ def _signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
 
 @compiled
 def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
-    """Fill in orientations (f,) where floating point is sure, 0 elsewhere; how often that is, -1 for ``F`` out of range."""
+    """Fill in orientations (f,), 0 where floating point is not sure; how many of these, -1 for ``F`` out of range."""
     if F.size and (F.min() < 0 or F.max() >= len(uv)):
         return -1
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
@@ -347,7 +347,7 @@ def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
             chunk = slice(start, start + TRIANGLE_CHUNK)
             corners = uv.take(F[chunk], axis=0)
             sign[chunk] = sure_orientation(corners[:, 0], corners[:, 1], corners[:, 2])
-    return sign.size - np.count_nonzero(sign)
+    return sign.size - int(np.count_nonzero(sign))
 
 
 def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
