@@ -36,3 +36,140 @@ def _(rng):
     V, F = disk(4)
     gamma = np.broadcast_to(numbers(rng, 2, 1), (2, len(F)))[:, 5:40]
     return numbers(rng, len(V)), F[5:40], gamma, numbers(rng, 35), numbers(rng, 35), np.empty(35)
+
+
+def soup(rng, n: int, f: int) -> Any:
+    """Triangles at random: edges of one, two, three and more of them, wound alike and not, corners repeated."""
+    return rng.integers(0, n, (f, 3))
+
+
+@arguments_of("sort_edges")
+def _(rng):
+    V, F = disk(4)
+    return F, len(V), np.empty((F.size, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
+
+
+@arguments_of("sort_edges")
+def _(rng):
+    return soup(rng, 9, 70), 9, np.zeros((210, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
+
+
+@arguments_of("sort_edges")
+def _(rng):
+    """A fan around the first vertex."""
+    F = np.stack([np.zeros(99, dtype=np.int64), np.arange(1, 100), rng.permutation(np.arange(2, 101))], axis=1)
+    return F, 101, np.zeros((297, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
+
+
+@arguments_of("sort_edges")
+def _(rng):
+    return soup(rng, 9, 5), 4, np.zeros((15, 2), dtype=np.int64), np.zeros(4, dtype=np.int64)
+
+
+@arguments_of("sort_edges")
+def _(rng):
+    return soup(rng, 9, 0), 0, np.zeros((0, 2), dtype=np.int64), np.zeros(4, dtype=np.int64)
+
+
+@arguments_of("link_nodes")
+def _(rng):
+    """Columns of triangles, as components has them."""
+    F = soup(rng, 200, 40)
+    return F[:, :2], F[:, 1:], np.empty(200, dtype=np.int64)
+
+
+@arguments_of("link_nodes")
+def _(rng):
+    return rng.integers(0, 50, 30), rng.integers(0, 50, 30), np.empty(50, dtype=np.int64)
+
+
+@arguments_of("follow_loops")
+def _(rng):
+    """A short loop, and a long one."""
+    around = rng.permutation(60)
+    loops = np.concatenate([np.stack([some, np.roll(some, 1)], axis=1) for some in (around[:4], around[4:])])
+    return rng.permutation(loops), np.zeros(60, dtype=np.int64), np.zeros(60, dtype=np.int64)
+
+
+@arguments_of("follow_loops")
+def _(rng):
+    """A vertex passed twice."""
+    loops = np.array([[0, 1], [1, 2], [2, 0], [2, 3], [3, 4], [4, 2]])
+    return rng.permutation(loops), np.zeros(6, dtype=np.int64), np.zeros(6, dtype=np.int64)
+
+
+@arguments_of("sure_signs")
+def _(rng):
+    """Triangles of whole numbers, many of them without area, and of what has no orientation."""
+    uv = rng.integers(0, 4, (30, 2)) * rng.choice([1.0, 1e200, 1e-320, 0.1], (30, 1))
+    uv[rng.integers(0, 30, 3), rng.integers(0, 2, 3)] = np.nan, np.inf, -np.inf
+    return soup(rng, 30, 400), uv, np.zeros(400, dtype=np.int8)
+
+
+@arguments_of("sure_signs")
+def _(rng):
+    """Slivers within rounding of none."""
+    uv = np.ldexp(np.linspace(0, 1, 40)[:, None] * [1, 3] + rng.integers(-2, 3, (40, 2)) * 2.0**-52, 3)
+    return soup(rng, 40, 500), uv, np.zeros(500, dtype=np.int8)
+
+
+@arguments_of("sure_signs")
+def _(rng):
+    """A vertex that is not there, in the first triangle."""
+    F = soup(rng, 7, 5)
+    F[0] = -1, 6, 7
+    return F, rng.normal(size=(7, 2)), np.zeros(5, dtype=np.int8)
+
+
+def curves(rng, places: Any) -> Arguments:
+    """Closed curves of three, four and twice as many places as are left, and room for what may meet."""
+    k = len(places) - 7
+    vertices = rng.permutation(len(places))
+    starts = np.array([0, 3, 7, 7 + k])
+    return places, vertices, starts, np.zeros((9 * len(places), 2), dtype=np.int64)
+
+
+@arguments_of("doubtful_pairs")
+def _(rng):
+    """Places on a coarse grid: edges cross, touch, overlap, turn back and have no length."""
+    return curves(rng, rng.integers(0, 9, (60, 2)) * 0.1)
+
+
+@arguments_of("doubtful_pairs")
+def _(rng):
+    """A star-shaped curve, and the same within rounding of a line."""
+    angle = np.sort(rng.uniform(0, 2 * np.pi, 300))
+    star = rng.uniform(0.5, 1, (300, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = np.concatenate([star, star * [1, 1e-17] + [0, 0.5]])
+    return places, np.arange(600), np.array([0, 300, 600]), np.zeros((9000, 2), dtype=np.int64)
+
+
+def pattern_of(F: Any, place: Any) -> Arguments:
+    """What a pattern takes at most, and something in it."""
+    size, halves = int(place.max(initial=-1)) + 1, F.size
+    lengths = size + 1, size + halves, halves, halves, halves, halves + 1, halves, halves, halves
+    kinds = np.int32, np.int32, np.int64, np.int64, np.int32, np.int32, np.int64, np.int64, np.int64
+    return F, place, *(np.zeros(k, dtype=kind) for k, kind in zip(lengths, kinds, strict=True)), np.zeros(3, np.int64)
+
+
+@arguments_of("find_pattern")
+def _(rng):
+    """A mesh with its boundary held, unknowns in any order."""
+    V, F = disk(4)
+    free = rng.permutation(len(V))[: len(V) - 20]
+    place = np.full(len(V), -1, dtype=np.int32)
+    place[free] = np.arange(free.size)
+    return pattern_of(F, place)
+
+
+@arguments_of("find_pattern")
+def _(rng):
+    """Edges of many triangles, among few vertices; half of them fixed."""
+    place = rng.permutation([-1, -1, -1, -1, 0, 1, 2, 3, 4]).astype(np.int32)
+    return pattern_of(soup(rng, 9, 200), place)
+
+
+@arguments_of("find_pattern")
+def _(rng):
+    """All vertices fixed, and none."""
+    return pattern_of(soup(rng, 9, rng.integers(2) * 20), np.full(9, -1, dtype=np.int32))

@@ -49,8 +49,9 @@ from quasiharmonic.arrays import (
     true_or_false,
 )
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
-from quasiharmonic.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.exact.predicates import orientation_or_nonfinite, sure_orientation
 from quasiharmonic.given.objects import mesh_triangles
+from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.showing import Shown
 
@@ -213,14 +214,15 @@ def certify(
     Not injective: of 2 triangles, 1 is flipped (1).
     """
     true_or_false("boundary", boundary)
-    F, uv = _checked(F, uv)
+    F, uv = _taken(F, uv)
     sign, nonfinite = _signs(F, uv)
-    flipped = np.flatnonzero(sign < 0)
-    degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
+    flipped = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []
     if not len(F):
         reasons.append(Reason(Obstacle.NO_TRIANGLES, "there are no triangles"))
-    if np.any(sign <= 0):
+    elif sign.min() <= 0:
+        flipped = np.flatnonzero(sign < 0)
+        degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
         text = f"of {len(F)} triangles, {_counted(flipped, degenerate, nonfinite)}"
         reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
     known: list[IntArray] = []
@@ -275,8 +277,8 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     ValueError
         When shapes are wrong or an index is out of range, as in `certify`.
     """
-    F, uv = _checked(F, uv)
-    return len(F) > 0 and bool(np.all(_signs(F, uv)[0] > 0))
+    F, uv = _taken(F, uv)
+    return len(F) > 0 and bool(_signs(F, uv)[0].min() > 0)
 
 
 def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
@@ -299,36 +301,53 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
     ValueError
         When shapes are wrong or an index is out of range, as in `certify`.
     """
-    return np.flatnonzero(_signs(*_checked(F, uv))[0] <= 0)
+    return np.flatnonzero(_signs(*_taken(F, uv))[0] <= 0)
 
 
-def _checked(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
+def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
     triangles, places = triangle_rows(mesh_triangles(F), copy=False), map_array("uv", uv, finite=False)
-    check_range("F", triangles, len(places))
     # Of the numeric types, wide integers and extended precision have values that double has not.
     given = np.asarray(getattr(uv, "uv", uv))
-    rounded = np.zeros(places.shape, dtype=bool)
-    if given.dtype.kind != "f":
-        rounded = np.abs(places) >= 2.0**53
-    elif given.dtype.itemsize > 8:
-        rounded = (places != given) & ~np.isnan(places)
-    rows = np.flatnonzero(rounded.any(axis=1))
-    if rows.size:
-        raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rows)}")
+    if given.dtype.kind != "f" or given.dtype.itemsize > 8:
+        rounded = np.abs(places) >= 2.0**53 if given.dtype.kind != "f" else (places != given) & ~np.isnan(places)
+        rows = np.flatnonzero(rounded.any(axis=1))
+        if rows.size:
+            # A vertex that is not there is the plainer mistake.
+            check_range("F", triangles, len(places))
+            raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rows)}")
     return triangles, places
 
 
 def _signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
     """Orientation of every triangle, (f,), and the indices of those with a NaN or infinite coordinate."""
-    sign = np.empty(len(F), dtype=np.int8)
-    nonfinite = [np.empty(0, dtype=np.int64)]
-    for start in range(0, len(F), TRIANGLE_CHUNK):
-        chunk = slice(start, start + TRIANGLE_CHUNK)
-        corners = uv.take(F[chunk], axis=0)
-        sign[chunk], undefined = orientation_or_nonfinite(corners[:, 0], corners[:, 1], corners[:, 2])
-        nonfinite.append(undefined + start)
-    return sign, np.concatenate(nonfinite)
+    sign, nonfinite = np.empty(len(F), dtype=np.int8), np.empty(0, dtype=np.int64)
+    number = sure_signs(F, uv, sign)
+    if number < 0:
+        check_range("F", F, len(uv))
+    if number:
+        open_ = np.flatnonzero(sign == 0)
+        found = [nonfinite]
+        for start in range(0, open_.size, TRIANGLE_CHUNK):
+            chunk = open_[start : start + TRIANGLE_CHUNK]
+            corners = uv.take(F.take(chunk, axis=0), axis=0)
+            sign[chunk], undefined = orientation_or_nonfinite(corners[:, 0], corners[:, 1], corners[:, 2])
+            found.append(chunk[undefined])
+        nonfinite = np.concatenate(found)
+    return sign, nonfinite
+
+
+@compiled
+def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
+    """Fill in orientations (f,), 0 where floating point is not sure; how many of these, -1 for ``F`` out of range."""
+    if F.size and (F.min() < 0 or F.max() >= len(uv)):
+        return -1
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        for start in range(0, len(F), TRIANGLE_CHUNK):
+            chunk = slice(start, start + TRIANGLE_CHUNK)
+            corners = uv.take(F[chunk], axis=0)
+            sign[chunk] = sure_orientation(corners[:, 0], corners[:, 1], corners[:, 2])
+    return sign.size - int(np.count_nonzero(sign))
 
 
 def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:

@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.exact.predicates import SegmentRelation, box_pairs, box_pairs_within, orientation, segment_relation
+from quasiharmonic.exact.predicates import (
+    SegmentRelation,
+    box_pairs,
+    box_pairs_within,
+    orientation,
+    segment_relation,
+    sure_orientation,
+)
+from quasiharmonic.kernels import compiled
 
 SignArray = NDArray[np.int8]
 
@@ -128,24 +136,58 @@ def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
     -------
     (k,) bool
     """
-    curves = _Curves.of(loops, uv)
     simple = np.ones(len(loops), dtype=bool)
+    vertices, starts = np.concatenate(loops), np.cumsum([0, *map(len, loops)])
+    # Hardly ever are there any; where a boundary has collapsed, billions.
+    pairs = np.empty((len(vertices), 2), dtype=np.int64)
+    number = doubtful_pairs(uv, vertices, starts, pairs)
+    if number == 0:
+        return simple
+    curves = _Curves.of(loops, uv)
     p, q, following = curves.p, curves.q, curves.following
-    # An edge without length shares all it is with the edges before and after it; others overlap with the next where
-    # the curve turns back.
-    beyond = q[following]
-    back = ((p < q) == (beyond < q)).all(axis=1) & ((p > q) == (beyond > q)).all(axis=1)
-    back[back] = orientation(p[back], q[back], beyond[back]) == 0
-    simple[curves.owner[back | (p == q).all(axis=1)]] = False
-    for i, j in box_pairs_within(np.minimum(p, q), np.maximum(p, q), curves.start):
-        apart = (following[i] != j) & (following[j] != i)
-        i, j = i[apart], j[apart]
-        if i.size:
-            met = segment_relation(p[i], q[i], p[j], q[j]) != SegmentRelation.DISJOINT
-            simple[curves.owner[i[met]]] = False
+    # An edge without length shares all it is with the edges before and after it.
+    point = (p == q).all(axis=1)
+    simple[curves.owner[point]] = False
+    portions = curves.boxes_that_meet() if number < 0 else [pairs[:number].T]
+    for i, j in portions:
+        relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
+        joined = (following[i] == j) | (following[j] == i)
+        met = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
+        simple[curves.owner[i[met]]] = False
         if not simple.any():
             break
     return simple
+
+
+@compiled
+def doubtful_pairs(uv: FloatArray, vertices: IntArray, starts: IntArray, pairs: IntArray) -> int:
+    """List pairs of edges of the same loop that may have more in common than an end, by what floating point is sure of.
+
+    Loops are one after another, ``starts`` (l + 1,). How many pairs (m, 2) there are, -1 where they have no room.
+    """
+    curves = _Curves.of(np.split(vertices, starts[1:-1]), uv)
+    p, q, following = curves.p, curves.q, curves.following
+    # Edges overlap with the next where the curve turns back, or one of them has no length.
+    beyond = q[following]
+    back = ((p < q) == (beyond < q)).all(axis=1) & ((p > q) == (beyond > q)).all(axis=1)
+    back[back] = sure_orientation(p[back], q[back], beyond[back]) == 0
+    at = np.flatnonzero(back | (p == q).all(axis=1))
+    found = [np.sort(np.stack([at, following[at]], axis=1), axis=1)]
+    for i, j in curves.boxes_that_meet():
+        apart = (following[i] != j) & (following[j] != i)
+        i, j = i[apart], j[apart]
+        r, s = p.take(j, 0), q.take(j, 0)
+        near = sure_orientation(p.take(i, 0), q.take(i, 0), r) * sure_orientation(p.take(i, 0), q.take(i, 0), s) <= 0
+        i, j, r, s = i[near], j[near], r[near], s[near]
+        near = sure_orientation(r, s, p.take(i, 0)) * sure_orientation(r, s, q.take(i, 0)) <= 0
+        found.append(np.stack([i[near], j[near]], axis=1))
+        if sum(map(len, found)) > len(pairs):
+            return -1
+    listed = np.unique(np.concatenate(found), axis=0)
+    if len(listed) > len(pairs):
+        return -1
+    pairs[: len(listed)] = listed
+    return len(listed)
 
 
 def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
@@ -227,6 +269,10 @@ class _Curves:
     """(k, 2) Places of the second vertices."""
     following: IntArray
     """(k,) The next edge of the same loop."""
+
+    def boxes_that_meet(self) -> Iterator[tuple[IntArray, IntArray]]:
+        """Pairs of edges of the same loop, the smaller first, whose boxes meet; in portions."""
+        return box_pairs_within(np.minimum(self.p, self.q), np.maximum(self.p, self.q), self.start)
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:

@@ -1,11 +1,15 @@
 /* The extension: the kernels of all files, a file for each idea, as the Python files that they are for. */
 #include "arguments.h"
 
+extern PyMethodDef certificate_kernels[];
+extern PyMethodDef loops_kernels[];
+extern PyMethodDef pattern_kernels[];
 extern PyMethodDef reference_kernels[];
+extern PyMethodDef topology_kernels[];
 
 static int fill(PyObject *module)
 {
-    PyMethodDef *const tables[] = {reference_kernels};
+    PyMethodDef *const tables[] = {certificate_kernels, loops_kernels, pattern_kernels, reference_kernels, topology_kernels};
     for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
         if (PyModule_AddFunctions(module, tables[i]) < 0)
             return -1;

@@ -7,6 +7,7 @@ the factorisation reads.
 
 from __future__ import annotations
 
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.linsolve import make_solver, takes_order
+from quasiharmonic.linsolve.pattern import stiffness_pattern
 from quasiharmonic.mesh.dissection import nested_dissection
-from quasiharmonic.mesh.topology import edge_keys
 
 # From this many unknowns on they are numbered by dissection. Minimum degree is as good for fewer (10k unknowns: 17 ms
 # to order and analyse, 7 to factor, for both), and there is nothing to do in parallel yet.
@@ -61,56 +62,42 @@ class Laplacian:
         is_free = np.ones(n, dtype=bool)
         is_free[fixed] = False
         self.free = np.flatnonzero(is_free)
-        # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
-        tail, head = (corner.ravel() for corner in self._unknowns(F))
         order = None
         if points is not None and self.free.size >= DISSECT_FROM and takes_order(linear_solver):
+            # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
+            tail = self._place()[F.T]
+            tail, head = tail.ravel(), tail[(1, 2, 0), :].ravel()
             once = np.flatnonzero((tail >= 0) & (tail < head))
             order = nested_dissection(points[self.free], tail[once], head[once])
         if order is not None:
             self.free = self.free[order]
-            tail, head = (corner.ravel() for corner in self._unknowns(F))
-
-        # Entries above the diagonal: every half-edge between two free vertices, sorted by (row, column).
-        size = self.free.size
-        inner = np.flatnonzero((tail >= 0) & (head >= 0))
-        key = edge_keys(tail[inner], head[inner], size)
-        sorting = np.argsort(key)
-        key = key[sorting]
-        starts = np.ones(key.size, dtype=bool)
-        np.not_equal(key[1:], key[:-1], out=starts[1:])
-        first = np.flatnonzero(starts)
-        self._row, self._column = np.divmod(key[first], max(size, 1))
+        self._pattern = pattern = stiffness_pattern(F, self._place(), self.free.size)
+        self._diagonal = pattern.indptr[:-1]
+        self._above = np.arange(pattern.row.size) + pattern.row + 1
         # The fastest gather at hand; reduceat takes twice as long.
-        halves, offsets = inner[sorting].astype(np.int32), np.append(first, inner.size).astype(np.int32)
-        self._sum = csr_array((np.ones(inner.size), halves, offsets), shape=(first.size, tail.size))
-        # A row of the upper triangle is its diagonal entry followed by those entries.
-        indptr = np.arange(size + 1) + np.append(0, np.cumsum(np.bincount(self._row, minlength=size)))
-        self._diagonal = indptr[:-1]
-        self._above = np.arange(self._row.size) + self._row + 1
-        indices = np.empty(indptr[-1], dtype=np.int32)
-        indices[self._diagonal] = np.arange(size)
-        indices[self._above] = self._column
-        self._values = np.empty(indptr[-1])
-        self.solver = make_solver(indptr, indices, name=linear_solver, ordered=order is not None)
+        ones = np.ones(pattern.halves.size)
+        self._sum = csr_array((ones, pattern.halves, pattern.offsets), shape=(pattern.row.size, F.size))
+        self._values = np.empty(pattern.indices.size)
+        self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver, ordered=order is not None)
         # Whose the one factor is may be asked only while nobody can overwrite it before the solve.
         self._lock = Lock()
         self._factored: FactoredLaplacian | None = None
+        self._F = F
 
-        # Half-edges between a free and a fixed vertex carry the boundary's positions into the right-hand side.
-        self._border = np.flatnonzero((tail >= 0) != (head >= 0))
-        self._border_row = np.maximum(tail[self._border], head[self._border])
-        ends = _ends(F, self._border)
-        self._border_fixed = np.where(tail[self._border] < 0, *ends)
-        self._rim = np.flatnonzero((tail < 0) | (head < 0))
-        self._rim_tail, self._rim_head = _ends(F, self._rim)
-
-    def _unknowns(self, F: IntArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Number of the unknown at each half-edge's tail and head, -1 at fixed vertices; (3, f) each."""
+    def _place(self) -> NDArray[np.int32]:
+        """Number of the unknown at each vertex, -1 at fixed ones; (n,)."""
         place = np.full(self.n, -1, dtype=np.int32)
         place[self.free] = np.arange(self.free.size, dtype=np.int32)
-        tail = place[F.T]
-        return tail, tail[(1, 2, 0), :]
+        return place
+
+    @cached_property
+    def _rim(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Half-edges with a fixed vertex, and their tails and heads."""
+        corner = np.ascontiguousarray(self._F.T)
+        tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
+        held = self._place() < 0
+        rim = np.flatnonzero(held[tail] | held[head])
+        return rim, tail[rim], head[rim]
 
     def factor(self, stiffness: FloatArray) -> FactoredLaplacian:
         """Assemble and factor.
@@ -142,9 +129,9 @@ class Laplacian:
         above = self._sum @ stiffness
         # Rows of Gᵀ A G sum to zero, so each half-edge is taken off the diagonal at both of its ends.
         # Where no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
-        diagonal = np.bincount(self._row, above, size).astype(np.float64, copy=False)
-        diagonal += np.bincount(self._column, above, size)
-        diagonal += np.bincount(self._border_row, stiffness[self._border], size)
+        diagonal = np.bincount(self._pattern.row, above, size).astype(np.float64, copy=False)
+        diagonal += np.bincount(self._pattern.column, above, size)
+        diagonal += np.bincount(self._pattern.border_row, stiffness[self._pattern.border], size)
         self._values[self._diagonal] = -diagonal
         self._values[self._above] = above
         self.solver.factor(self._values)
@@ -193,10 +180,10 @@ class FactoredLaplacian:
         (n,) complex128
             Equal to ``w`` at the fixed vertices, to the last bit.
         """
-        of = self.pattern
-        pull = -self.stiffness[of._border] * w[of._border_fixed]
+        of, pattern = self.pattern, self.pattern._pattern
+        pull = -self.stiffness[pattern.border] * w[pattern.border_fixed]
         load = np.zeros(of.free.size, dtype=np.complex128)
-        np.add.at(load, of._border_row, pull)
+        np.add.at(load, pattern.border_row, pull)
         out = w.copy()
         out[of.free] = of._solve(self, load)
         return out
@@ -229,17 +216,11 @@ class FactoredLaplacian:
         (n,) complex128
         """
         of = self.pattern
-        tail, head = of._rim_tail, of._rim_head
+        rim, tail, head = of._rim
         # Rows sum to zero, so an off-diagonal entry k of edge (i, j) adds k (wⱼ − wᵢ) to row i.
-        pull = self.stiffness[of._rim] * (w[head] - w[tail])
+        pull = self.stiffness[rim] * (w[head] - w[tail])
         out = np.zeros(of.n, dtype=np.complex128)
         np.add.at(out, tail, pull)
         np.subtract.at(out, head, pull)
         out[of.free] = 0
         return out
-
-
-def _ends(F: IntArray, half_edges: IntArray) -> tuple[IntArray, IntArray]:
-    """Vertices at the tails and the heads of some half-edges."""
-    edge, triangle = np.divmod(half_edges, len(F))
-    return F[triangle, edge], F[triangle, (edge + 1) % 3]

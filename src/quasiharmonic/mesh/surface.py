@@ -30,18 +30,21 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
         With the first offending elements: triangles that use a vertex twice or are repeated, vertices without
         triangle, non-manifold edges, mixed winding, no boundary, several components.
     """
-    used = np.zeros(n, dtype=bool)
-    used[F] = True
-    if not used.all():
-        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(~used))}: no triangle uses them; remove them")
+    label = components(F, n)
+    connected = not label.any()
+    if not connected:
+        # A vertex without triangle is a component of its own.
+        unused = np.setdiff1d(np.arange(n), F)
+        if unused.size:
+            raise ValueError(f"{named('vertex', 'vertices', unused)}: no triangle uses them; remove them")
     found = manifold_edges(F, n)
     if not closed and not found.boundary.size:
         raise ValueError(
             "the surface is closed: it has no boundary to place; cut it open first "
             "(cut_open; --cut of qhm map and qhm flatten)"
         )
-    if components(F, n).any():
-        first = np.unique(components(F, n))
+    if not connected:
+        first = np.unique(label)
         raise ValueError(
             f"the mesh has {first.size} components, the first ones around {named('vertex', 'vertices', first)}: "
             "map them one at a time"
@@ -69,11 +72,10 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
         With the first offending elements: triangles that use a vertex twice or are repeated, non-manifold edges,
         mixed winding.
     """
-    collapsed = np.flatnonzero((F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0]))
-    if collapsed.size:
-        raise ValueError(f"{named('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
     found = edges(F, n)
-    if found.nonmanifold.size or found.inconsistent.size:
+    # An edge from a vertex to itself is never between two triangles that traverse it in opposite directions.
+    if found.nonmanifold.size or found.inconsistent.size or np.any(found.boundary[:, 0] == found.boundary[:, 1]):
+        _collapsed(F)
         _repeated(F)
     if found.nonmanifold.size:
         raise ValueError(f"{named_edges(found.nonmanifold)} in more than two triangles: not a surface")
@@ -83,6 +85,12 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
             "orient all triangles alike"
         )
     return found
+
+
+def _collapsed(F: IntArray) -> None:
+    collapsed = np.flatnonzero((F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0]))
+    if collapsed.size:
+        raise ValueError(f"{named('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
 
 
 def _repeated(F: IntArray) -> None:

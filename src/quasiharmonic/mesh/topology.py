@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import BoolArray, IntArray, named
+from quasiharmonic.arrays import BoolArray, IntArray, check_range, named
+from quasiharmonic.kernels import compiled
 
 # Half-edges from which on a sparse matrix sorts them sooner than a sort does.
 _MANY = 10_000
@@ -55,7 +57,23 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     Edges
         Each kind in ascending order of its undirected edge.
     """
-    T = np.ascontiguousarray(np.asarray(F).T, dtype=np.int32)
+    T: IntArray = np.ascontiguousarray(F, dtype=np.int64)
+    pairs, sizes = np.empty((T.size, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
+    if not sort_edges(T, n, pairs, sizes):
+        check_range("F", T, n)
+    # Most edges have two half-edges: the rest of the memory is given back, none of it touched yet.
+    pairs.resize((int(sizes.sum()), 2), refcheck=False)
+    end = np.cumsum(sizes).tolist()
+    rest = (pairs[start:stop].copy() for start, stop in pairwise(end))
+    return Edges(pairs[: end[0]], *rest)
+
+
+@compiled
+def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
+    """Fill in edges, one kind of `Edges` after another, and how many there are of each; 0 where F is out of range."""
+    if F.size and (F.min() < 0 or F.max() >= n):
+        return 0
+    T = np.ascontiguousarray(F.T, dtype=np.int32)
     tail, head = T.ravel(), T[(1, 2, 0), :].ravel()
     # SciPy halves the time, where there are many, but to import it for this alone takes longer.
     by_edge = _by_rows if tail.size >= _MANY and "scipy.sparse" in sys.modules else _by_keys
@@ -66,19 +84,18 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     starts[1:] |= low[1:] != low[:-1]
     first = np.flatnonzero(starts)
     count = np.diff(first, append=low.size)
-
-    def unpack(start: IntArray) -> IntArray:
-        pairs = np.empty((start.size, 2), dtype=np.int64)
-        pairs[:, 0], pairs[:, 1] = low[start], high[start]
-        return pairs
-
-    pair = first[count == 2]
+    pair, single = first[count == 2], first[count == 1]
     opposed = direction[pair] != direction[pair + 1]
-    single = first[count == 1]
-    boundary = unpack(single)
-    flip = direction[single]
-    boundary[flip] = boundary[flip, ::-1]
-    return Edges(unpack(pair[opposed]), boundary, unpack(pair[~opposed]), unpack(first[count > 2]))
+    filled = 0
+    for kind, start in enumerate((pair[opposed], single, pair[~opposed], first[count > 2])):
+        sizes[kind] = start.size
+        some = pairs[filled : filled + start.size]
+        some[:, 0], some[:, 1] = low[start], high[start]
+        if kind == 1:
+            flip = direction[single]
+            some[flip] = some[flip, ::-1]
+        filled += start.size
+    return 1
 
 
 _Integers = NDArray[np.integer]
@@ -173,24 +190,38 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
         When the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
         not a consistently oriented surface.
     """
-    tails, heads = np.sort(boundary, axis=0).T
-    shared = tails[1:][tails[1:] == tails[:-1]]
-    if shared.size:
-        raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', np.unique(shared))}")
-    if not np.array_equal(tails, heads):
+    vertices, lengths = np.empty(len(boundary), dtype=np.int64), np.empty(len(boundary), dtype=np.int64)
+    number = follow_loops(boundary, vertices, lengths)
+    if number < 0:
+        tails, heads = np.sort(boundary, axis=0).T
+        shared = np.unique(tails[1:][tails[1:] == tails[:-1]])
+        if shared.size:
+            raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', shared)}")
         unpaired = np.setxor1d(tails, heads)
         raise ValueError(f"the boundary does not close at {named('vertex', 'vertices', unpaired)}")
+    return np.split(vertices, np.cumsum(lengths[: number - 1])) if number > 1 else [vertices][:number]
+
+
+@compiled
+def follow_loops(boundary: IntArray, vertices: IntArray, lengths: IntArray) -> int:
+    """Fill in loop after loop (k,) and as many lengths, as `trace_loops` orders them; how many loops, -1 for none."""
+    tails, heads = np.sort(boundary, axis=0).T
+    if (tails[1:] == tails[:-1]).any() or not np.array_equal(tails, heads):
+        return -1
     following = dict(zip(boundary[:, 0].tolist(), boundary[:, 1].tolist(), strict=True))
-    loops = []
+    passed: list[int] = []
+    number = 0
     for start in tails.tolist():
         if start not in following:
             continue
-        loop, here = [start], following.pop(start)
-        while here != start:
-            loop.append(here)
+        before, here = len(passed), start
+        while here in following:
+            passed.append(here)
             here = following.pop(here)
-        loops.append(np.array(loop, dtype=np.int64))
-    return loops
+        lengths[number] = len(passed) - before
+        number += 1
+    vertices[:] = passed
+    return number
 
 
 def components(F: NDArray[np.integer], n: int) -> IntArray:
@@ -209,7 +240,7 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     """
     T: IntArray = np.asarray(F, dtype=np.int64)
     # Two edges of a triangle connect its three vertices.
-    return linked(T[:, :2].ravel(), T[:, 1:].ravel(), n)
+    return linked(T[:, :2], T[:, 1:], n)
 
 
 def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
@@ -217,7 +248,7 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
 
     Parameters
     ----------
-    tail, head : (e,) int64
+    tail, head : (e,) or (e, k) int64
         Nodes ``0 … n - 1`` at the ends of each link.
     n : int
         Number of nodes.
@@ -227,18 +258,28 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
     (n,) int64
         The smallest node of the component.
     """
+    label = np.empty(n, dtype=np.int64)
+    link_nodes(tail, head, label)
+    return label
+
+
+@compiled
+def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> None:
+    """Fill in the smallest node of every node's component (n,)."""
     # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
     # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
     # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
-    label = np.arange(n)
+    tail, head = tail.ravel(), head.ravel()
+    here = np.arange(label.size)
     # Any smaller neighbour will do to begin with, and there is nothing to look up yet.
-    label[np.maximum(tail, head)] = np.minimum(tail, head)
+    here[np.maximum(tail, head)] = np.minimum(tail, head)
     while True:
-        while not np.array_equal(label, root := label[label]):
-            label = root
-        one, other = label[tail], label[head]
+        while not np.array_equal(here, root := here[here]):
+            here = root
+        one, other = here[tail], here[head]
         apart = one != other
         if not apart.any():
-            return label
+            break
         tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
-        np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
+        np.minimum.at(here, np.maximum(one, other), np.minimum(one, other))
+    label[:] = here

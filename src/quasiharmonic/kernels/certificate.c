@@ -1,0 +1,32 @@
+/* What `exact/certificate.py` has compiled. */
+#include "arguments.h"
+#include "predicates.h"
+
+/* (F, uv, sign): orientations of triangles, 0 where floating point is not sure; how many of these there are, or -1 where
+ * F names a vertex that there is not. */
+static PyObject *sure_signs(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[3];
+    if (!take("sure_signs", given, count, "qdB", a))
+        return NULL;
+    const int64_t *F = a[0].data;
+    const double *uv = a[1].data;
+    const Py_ssize_t f = a[2].size, n = a[1].size / 2;
+    int8_t *sign = a[2].data;
+    Py_ssize_t open = 0;
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t j = 0; j < f; j++) {
+        const int64_t *corner = F + 3 * j;
+        if (corner[0] < 0 || corner[0] >= n || corner[1] < 0 || corner[1] >= n || corner[2] < 0 || corner[2] >= n) {
+            open = -1;
+            break;
+        }
+        sign[j] = (int8_t)sure_orientation(uv + 2 * corner[0], uv + 2 * corner[1], uv + 2 * corner[2]);
+        open += !sign[j];
+    }
+    Py_END_ALLOW_THREADS
+    return done_with_integer(a, LENGTH(a), open);
+}
+
+PyMethodDef certificate_kernels[] = {KERNEL(sure_signs), END_OF_KERNELS};

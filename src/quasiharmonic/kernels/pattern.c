@@ -1,0 +1,134 @@
+/* What `linsolve/pattern.py` has compiled. */
+#include "arguments.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+/* Numbers from which on a row is sorted by the library. */
+#define MANY 24
+
+static int ascending(const void *one, const void *other)
+{
+    const uint64_t a = *(const uint64_t *)one, b = *(const uint64_t *)other;
+    return (a > b) - (a < b);
+}
+
+static void sort(uint64_t *numbers, int64_t size)
+{
+    if (size >= MANY) {
+        qsort(numbers, (size_t)size, sizeof(*numbers), ascending);
+        return;
+    }
+    for (int64_t k = 1; k < size; k++) {
+        const uint64_t here = numbers[k];
+        int64_t at = k;
+        for (; at > 0 && numbers[at - 1] > here; at--)
+            numbers[at] = numbers[at - 1];
+        numbers[at] = here;
+    }
+}
+
+/* Triangles, the rows of their corners or -1, and how many rows there are. */
+typedef struct {
+    const int64_t *F;
+    const int32_t *place;
+    Py_ssize_t triangles, size;
+} Mesh;
+
+/* Half-edges between free vertices by their rows: where those of each row start, and their columns and numbers. */
+static void by_row(const Mesh *mesh, int64_t *starts, uint64_t *inner)
+{
+    memset(starts, 0, (size_t)(mesh->size + 1) * sizeof(*starts));
+    for (int filling = 0; filling < 2; filling++) {
+        for (Py_ssize_t t = 0; t < mesh->triangles; t++) {
+            const int64_t *corner = mesh->F + 3 * t;
+            const int32_t at[] = {mesh->place[corner[0]], mesh->place[corner[1]], mesh->place[corner[2]]};
+            for (int e = 0; e < 3; e++) {
+                const int32_t one = at[e], other = at[(e + 1) % 3], low = one < other ? one : other;
+                if (low < 0)
+                    continue;
+                if (filling)
+                    inner[--starts[low]] = (uint64_t)(low == one ? other : one) << 32 | (uint64_t)(e * mesh->triangles + t);
+                else
+                    starts[low]++;
+            }
+        }
+        /* Where each row ends. It is filled from behind, and then it starts there. */
+        for (Py_ssize_t i = 1; i <= mesh->size && !filling; i++)
+            starts[i] += starts[i - 1];
+    }
+}
+
+/* List the entries, and the half-edges of each; how many there are. */
+static Py_ssize_t list_entries(const Mesh *mesh, const int64_t *starts, uint64_t *inner, Argument *to)
+{
+    int32_t *indptr = to[0].data, *indices = to[1].data, *halves = to[4].data, *offsets = to[5].data;
+    int64_t *row = to[2].data, *column = to[3].data;
+    Py_ssize_t entries = 0;
+    for (Py_ssize_t i = 0; i < mesh->size; i++) {
+        indptr[i] = (int32_t)(i + entries);
+        *indices++ = (int32_t)i;
+        sort(inner + starts[i], starts[i + 1] - starts[i]);
+        for (int64_t k = starts[i]; k < starts[i + 1]; k++) {
+            const int64_t next = (int64_t)(inner[k] >> 32);
+            if (k == starts[i] || next != column[entries - 1]) {
+                row[entries] = i;
+                column[entries] = next;
+                offsets[entries++] = (int32_t)k;
+                *indices++ = (int32_t)next;
+            }
+            halves[k] = (int32_t)(inner[k] & 0xffffffffu);
+        }
+    }
+    indptr[mesh->size] = (int32_t)(mesh->size + entries);
+    offsets[entries] = (int32_t)starts[mesh->size];
+    return entries;
+}
+
+/* List half-edges between a free and a fixed vertex; how many there are. */
+static Py_ssize_t list_border(const Mesh *mesh, int64_t *border, int64_t *border_row, int64_t *border_fixed)
+{
+    Py_ssize_t listed = 0;
+    for (int e = 0; e < 3; e++)
+        for (Py_ssize_t t = 0; t < mesh->triangles; t++) {
+            const int64_t tail = mesh->F[3 * t + e], head = mesh->F[3 * t + (e + 1) % 3];
+            const int32_t one = mesh->place[tail], other = mesh->place[head];
+            if ((one < 0) == (other < 0))
+                continue;
+            border[listed] = e * mesh->triangles + t;
+            border_row[listed] = one < 0 ? other : one;
+            border_fixed[listed++] = one < 0 ? tail : head;
+        }
+    return listed;
+}
+
+/* (F, place, indptr, indices, row, column, halves, offsets, border, border_row, border_fixed, sizes): the pattern of a
+ * Laplacian. */
+static PyObject *find_pattern(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[12];
+    if (!take("find_pattern", given, count, "qiIIQQIIQQQQ", a))
+        return NULL;
+    const Mesh mesh = {a[0].data, a[1].data, a[0].size / 3, a[2].size - 1};
+    int64_t *starts = malloc((size_t)(mesh.size + 1) * sizeof(*starts));
+    uint64_t *inner = malloc((size_t)(3 * mesh.triangles + 1) * sizeof(*inner));
+    if (!starts || !inner) {
+        free(starts);
+        free(inner);
+        Py_DECREF(done(a, LENGTH(a)));
+        return PyErr_NoMemory();
+    }
+    int64_t *sizes = a[11].data;
+    Py_BEGIN_ALLOW_THREADS
+    by_row(&mesh, starts, inner);
+    sizes[0] = list_entries(&mesh, starts, inner, a + 2);
+    sizes[1] = starts[mesh.size];
+    sizes[2] = list_border(&mesh, a[8].data, a[9].data, a[10].data);
+    Py_END_ALLOW_THREADS
+    free(starts);
+    free(inner);
+    return done(a, LENGTH(a));
+}
+
+PyMethodDef pattern_kernels[] = {KERNEL(find_pattern), END_OF_KERNELS};

@@ -1,0 +1,111 @@
+"""Where the edge stiffnesses of triangles go: the pattern of ``Sᵀ Gᵀ A G S``, and of what fixed vertices add to it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.arrays import IntArray
+from quasiharmonic.kernels import compiled
+from quasiharmonic.mesh.topology import edge_keys
+
+
+class StiffnessPattern(NamedTuple):
+    """The entries of a Laplacian among the free vertices, and the half-edges that they are summed of.
+
+    Half-edge e·f + t is edge e of triangle t, the layout of `ReferenceMesh.edge_stiffness`.
+
+    Attributes
+    ----------
+    indptr, indices : (size + 1,), (size + e,) int32
+        The upper triangle in compressed sparse rows, each of them its diagonal entry and then those above.
+    row, column : (e,) int64
+        The entries above the diagonal, row by row.
+    halves, offsets : (m,), (e + 1,) int32
+        The half-edges of each of these, ascending, and where they start.
+    border, border_row, border_fixed : (b,) int64
+        Half-edges between a free and a fixed vertex, ascending; the row of the one, and the other.
+    """
+
+    indptr: NDArray[np.int32]
+    indices: NDArray[np.int32]
+    row: IntArray
+    column: IntArray
+    halves: NDArray[np.int32]
+    offsets: NDArray[np.int32]
+    border: IntArray
+    border_row: IntArray
+    border_fixed: IntArray
+
+
+def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> StiffnessPattern:
+    """Find the pattern.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles.
+    place : (n,) int32
+        Row of every free vertex, -1 at fixed ones.
+    size : int
+        How many are free.
+    """
+    halves = F.size
+    made = StiffnessPattern(
+        np.empty(size + 1, dtype=np.int32),
+        np.empty(size + halves, dtype=np.int32),
+        *(np.empty(halves, dtype=np.int64) for _ in range(2)),
+        *(np.empty(halves + more, dtype=np.int32) for more in range(2)),
+        *(np.empty(halves, dtype=np.int64) for _ in range(3)),
+    )
+    sizes = np.empty(3, dtype=np.int64)
+    find_pattern(np.ascontiguousarray(F, dtype=np.int64), place, *made, sizes)
+    entries, inner, border = sizes.tolist()
+    # What memory is not needed is given back, none of it touched yet.
+    lengths = size + 1, size + entries, entries, entries, inner, entries + 1, border, border, border
+    for array, length in zip(made, lengths, strict=True):
+        array.resize(length, refcheck=False)
+    return made
+
+
+@compiled
+def find_pattern(
+    F: IntArray,
+    place: NDArray[np.int32],
+    indptr: NDArray[np.int32],
+    indices: NDArray[np.int32],
+    row: IntArray,
+    column: IntArray,
+    halves: NDArray[np.int32],
+    offsets: NDArray[np.int32],
+    border: IntArray,
+    border_row: IntArray,
+    border_fixed: IntArray,
+    sizes: IntArray,
+) -> None:
+    """Fill in a `StiffnessPattern`, in arrays that are long enough, and the numbers e, m and b (3,)."""
+    size = indptr.size - 1
+    tail = place[F.T]
+    tail, head = tail.ravel(), tail[(1, 2, 0), :].ravel()
+    inner = np.flatnonzero((tail >= 0) & (head >= 0))
+    key = edge_keys(tail[inner], head[inner], size)
+    sorting = np.argsort(key, kind="stable")
+    key = key[sorting]
+    starts = np.ones(key.size, dtype=bool)
+    np.not_equal(key[1:], key[:-1], out=starts[1:])
+    first = np.flatnonzero(starts)
+    e, m = first.size, inner.size
+    halves[:m], offsets[:e], offsets[e] = inner[sorting], first, m
+    np.divmod(key[first], max(size, 1), out=(row[:e], column[:e]))
+    indptr[0] = 0
+    np.cumsum(np.bincount(row[:e], minlength=size) + 1, out=indptr[1:])
+    indices[indptr[:-1]] = np.arange(size)
+    indices[np.arange(e) + row[:e] + 1] = column[:e]
+    at = np.flatnonzero((tail >= 0) != (head >= 0))
+    b = at.size
+    border[:b], border_row[:b] = at, np.maximum(tail[at], head[at])
+    edge, triangle = np.divmod(at, len(F))
+    border_fixed[:b] = np.where(tail[at] < 0, F[triangle, edge], F[triangle, (edge + 1) % 3])
+    sizes[:] = e, m, b
