@@ -5,17 +5,20 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import platform
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import cli, io
+from quasiharmonic import __version__, cli, io
 from quasiharmonic.energy.measures import distortion
+from quasiharmonic.linsolve import available
 from quasiharmonic.surfaces import random_delaunay
 from shared.commands import run
 from shared.meshes import boundary_of, lift, signed_areas
@@ -483,6 +486,22 @@ def test_every_subcommand_explains_itself(command):
 def test_module_runs_as_the_command():
     done = subprocess.run([sys.executable, "-m", "quasiharmonic", "--version"], capture_output=True, text=True)
     assert done.stdout.startswith("qhm ")
+
+
+@pytest.mark.parametrize("pure", ["", "1"])
+def test_the_version_says_what_it_runs_on(pure):
+    command = [sys.executable, "-m", "quasiharmonic", "--version"]
+    done = subprocess.run(command, env=os.environ | {"QUASIHARMONIC_PURE": pure}, capture_output=True, text=True)
+    first, python, packages, loops, solvers = done.stdout.splitlines()
+    assert (done.returncode, first) == (0, f"qhm {__version__}")
+    assert platform.python_version() in python
+    assert f"numpy {np.__version__}" in packages
+    assert solvers == f"linear solvers: {', '.join(available())}"
+    if pure:
+        assert loops == "loops: in NumPy, as QUASIHARMONIC_PURE has it"
+    else:
+        built = find_spec("quasiharmonic.kernels._compiled") is not None
+        assert loops.startswith("loops: compiled" if built else "loops: in NumPy: ")
 
 
 def test_progress_on_a_terminal_only(star, tmp_path):

@@ -36,6 +36,7 @@ from quasiharmonic.cli import (
 )
 from quasiharmonic.cli.interrupts import Interrupts
 from quasiharmonic.cli.report import ReportError
+from quasiharmonic.cli.version import Version
 
 COMMANDS = (
     map,
@@ -104,15 +105,13 @@ def _fail(command: str, message: str, status: int) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from quasiharmonic import __version__
-
     parser = argparse.ArgumentParser(
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
         epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written), 3 "
         "written, but not what should be told about it.",
     )
-    parser.add_argument("--version", action="version", version=f"qhm {__version__}")
+    parser.add_argument("--version", action=Version)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS:
         command.add_parser(commands)
