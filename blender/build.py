@@ -1,17 +1,20 @@
 """Build the zip that Blender installs: ``python blender/build.py [--platform NAME] [-o FOLDER]``.
 
 It holds the extension, a wheel of this package, SciPy, and the two solvers of the base install. NumPy is Blender's own.
+The package's loops are compiled where the zip is for the platform that it is built on, and in NumPy for others.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import subprocess
 import sys
 import tempfile
 import zipfile
 from pathlib import Path
+from platform import machine
 
 HERE = Path(__file__).resolve().parent
 EXTENSION = HERE / "extension"
@@ -29,7 +32,9 @@ NEEDED = ["scipy>=1.14,<1.17", "qdldl>=0.1.7", "rslab>=1.7"]
 def main(arguments: list[str] | None = None) -> int:
     """Download, write, say where."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--platform", choices=PLATFORMS, default=_here(), help="(default: this one)")
+    parser.add_argument(
+        "--platform", choices=PLATFORMS, default=_here(), required=_here() is None, help="(default: this one)"
+    )
     parser.add_argument("-o", "--output", type=Path, default=HERE / "dist", help="folder (default: blender/dist)")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
@@ -50,13 +55,14 @@ def version() -> str:
 
 
 def collect(folder: Path, platform: str) -> list[Path]:
-    """All wheels, in a folder."""
+    """All wheels for a platform, in a folder."""
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
     tags = [option for tag in PLATFORMS[platform] for option in ("--platform", tag)]
     chosen = ["--only-binary=:all:", "--no-deps", "--python-version", PYTHON, *tags]
+    surroundings = os.environ | ({} if platform == _here() else {"QUASIHARMONIC_PURE": "1"})
     try:
         subprocess.run([*pip, "download", *chosen, "-d", str(folder), *NEEDED], check=True)
-        subprocess.run([*pip, "wheel", "--no-deps", "-w", str(folder), str(HERE.parent)], check=True)
+        subprocess.run([*pip, "wheel", "--no-deps", "-w", str(folder), str(HERE.parent)], check=True, env=surroundings)
     except subprocess.CalledProcessError as error:
         sys.exit(f"build.py: a wheel could not be had (pip ended with {error.returncode}); is there a network?")
     return sorted(folder.glob("*.whl"))
@@ -76,8 +82,12 @@ def write(target: Path, wheels: list[Path], platform: str) -> None:
             archive.write(wheel, f"wheels/{wheel.name}", compress_type=zipfile.ZIP_STORED)
 
 
-def _here() -> str:
-    return {"win32": "windows-x64", "darwin": "macos-arm64"}.get(sys.platform, "linux-x64")
+def _here() -> str | None:
+    """The platform that this runs on, if it is one of Blender's."""
+    system = {"win32": "windows", "darwin": "macos"}.get(sys.platform, sys.platform)
+    processor = {"amd64": "x64", "x86_64": "x64"}.get(machine().lower(), machine().lower())
+    name = f"{system}-{processor}"
+    return name if name in PLATFORMS else None
 
 
 if __name__ == "__main__":
