@@ -22,7 +22,9 @@ from quasiharmonic.mesh.reference import blocks
 #: Of which a mixture is made, in the order of its factors.
 OWN: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
 
-_SINGLE = {type(energy): factors for energy, factors in zip(OWN, np.eye(len(OWN)), strict=True)}
+_SINGLE: dict[type[Energy], FloatArray] = {
+    type(energy): factors for energy, factors in zip(OWN, np.eye(len(OWN)), strict=True)
+}
 
 
 def mixture_of(energy: Energy) -> FloatArray | None:
@@ -80,7 +82,12 @@ def mixed_curvature(
     for part in blocks(det.size):
         form = energy.curvature(Deformation(p[part], q[part], det[part]), negative=negative).scaled(share[part])
         pp[part], qq[part], p2[part], q2[part], pq[part], pqc[part] = (
-            form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
+            form.pp,
+            form.qq,
+            form.p2,
+            form.q2,
+            form.pq,
+            form.pqc,
         )
 
 

@@ -18,7 +18,7 @@ from quasiharmonic.energy.energies import QuadraticForm
 from quasiharmonic.hearing import still_at_it
 from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
-from quasiharmonic.mesh.topology import edge_keys
+from quasiharmonic.linsolve.pattern import stiffness_pattern
 
 # Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
 _CHUNK = 8192
@@ -52,27 +52,21 @@ class NewtonSystem:
         is_free = np.ones(n, dtype=bool)
         is_free[fixed] = False
         self.free = np.flatnonzero(is_free)
-        size = self.free.size
-        place = np.full(n, -1, dtype=np.int64)
-        place[self.free] = np.arange(size)
+        place = np.full(n, -1, dtype=np.int32)
+        place[self.free] = np.arange(self.free.size)
         self.take_gradients(g)
-        self._pattern(place[F.T], size)
+        self._pattern(F, place)
         self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
 
     def take_gradients(self, g: ComplexArray) -> None:
         """Have other gradients (3, f) of the hat functions on the same triangles, as another scale gives them."""
-        self._g = np.ascontiguousarray(g)
+        self._g = np.ascontiguousarray(g, dtype=np.complex128)
 
-    def _pattern(self, corner: IntArray, size: int) -> None:
+    def _pattern(self, F: IntArray, place: NDArray[np.int32]) -> None:
         """Where the blocks go."""
-        tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
-        inner = np.flatnonzero((tail >= 0) & (head >= 0))
-        key = edge_keys(tail[inner], head[inner], size)
-        order = np.argsort(key, kind="stable")
-        inner, key = inner[order], key[order]
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        row, column = np.divmod(key[first], max(size, 1))
-
+        size = self.free.size
+        edges = stiffness_pattern(F, place, size)
+        row, column = edges.row, edges.column
         # Row 2i holds xx and xy of the diagonal block and then of the others, row 2i + 1 yy and then yx, yy.
         degree = np.bincount(row, minlength=size)
         upper = np.append(0, np.cumsum(4 * degree + 3))
@@ -92,12 +86,15 @@ class NewtonSystem:
         # of its corners. What belongs to a fixed vertex goes where nobody looks, behind the matrix.
         self._sums = np.empty(upper[-1] + 2)
         self._values = self._sums[:-2]
-        self._turns = np.where(tail <= head, 1.0, -1.0).reshape(corner.shape)
+        corner = place[F.T]
+        self._turns = np.where(corner <= corner[(1, 2, 0), :], 1.0, -1.0)
         self._slots = np.full((2, 2, *corner.shape), upper[-1], dtype=np.int32)
         of_sides, of_corners = self._slots.reshape(2, 2, -1)
-        nth_side = np.cumsum(np.diff(key, prepend=-1) > 0) - 1
-        of_sides[:, inner] = xx[nth_side], yx[nth_side]
-        of_corners[:, tail >= 0] = upper[tail[tail >= 0]], lower[tail[tail >= 0]] - 1
+        nth_side = np.repeat(np.arange(row.size), np.diff(edges.offsets))
+        of_sides[0, edges.halves], of_sides[1, edges.halves] = xx[nth_side], yx[nth_side]
+        free = np.flatnonzero(corner.ravel() >= 0)
+        of = corner.ravel()[free]
+        of_corners[0, free], of_corners[1, free] = upper[of], lower[of] - 1
 
     def assemble(self, form: QuadraticForm) -> None:
         """Add up the triangles' quadratic forms.
@@ -108,8 +105,10 @@ class NewtonSystem:
             On every triangle, with its area and weight in it.
         """
         still_at_it()
-        fields = form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
-        add_up(*(np.ascontiguousarray(field) for field in fields), self._g, self._slots, self._turns, self._sums)
+        pp, qq = (np.ascontiguousarray(field, dtype=np.float64) for field in (form.pp, form.qq))
+        rest = form.p2, form.q2, form.pq, form.pqc
+        p2, q2, pq, pqc = (np.ascontiguousarray(field, dtype=np.complex128) for field in rest)
+        add_up(pp, qq, p2, q2, pq, pqc, self._g, self._slots, self._turns, self._sums)
         self._diagonal = self._values[self._first]
 
     def add_blocks(self, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> None:
@@ -222,7 +221,7 @@ def add_up(
     g : (3, f) complex128
         Half the gradients of the hat functions.
     slots : (2, 2, 3, f) int32
-        Where rows of blocks begin in ``values``: of the triangles' sides and of their corners, the upper rows and the lower.
+        Where rows of blocks begin in ``values``: of the triangles' sides and of their corners, upper rows and lower.
     turns : (3, f) float64
         Of the sides: 1, or -1 where they run from the higher vertex to the lower, and the block is transposed.
     values : float64
