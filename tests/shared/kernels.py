@@ -173,3 +173,83 @@ def _(rng):
 def _(rng):
     """All vertices fixed, and none."""
     return pattern_of(soup(rng, 9, rng.integers(2) * 20), np.full(9, -1, dtype=np.int32))
+
+
+def gradients(rng, f: int) -> Any:
+    """Of the hat functions of triangles (3, f), nearly summing up to zero."""
+    g = numbers(rng, 3, f)
+    g[0] = -g[1] - g[2]
+    return g
+
+
+@arguments_of("jacobians")
+def _(rng):
+    """Triangles with repeated corners, whose areas are rounding; a place that is no number."""
+    n, f = 30, 1 + rng.integers(400)
+    F = soup(rng, n, f)
+    F[::5, 2] = F[::5, 1]
+    w = numbers(rng, n)
+    w[3] = np.nan
+    return w, F, gradients(rng, f), rng.uniform(1, 2, f), numbers(rng, f), numbers(rng, f), np.zeros(f)
+
+
+@arguments_of("pulls")
+def _(rng):
+    """Vertices without triangle, and triangles without share."""
+    n, f = 40, rng.integers(300)
+    share = rng.uniform(0, 1, f) * rng.integers(2, size=f)
+    return numbers(rng, f), numbers(rng, f), share, soup(rng, n - 5, f), gradients(rng, f), numbers(rng, n)
+
+
+@arguments_of("collapses")
+def _(rng):
+    """Steps of many lengths, none at some vertices, overflow at one; upright triangles, inverted and flat ones."""
+    n, f = 60, rng.integers(400)
+    step = numbers(rng, n) * rng.integers(2, size=n)
+    step[7] = 1e300
+    return rng.normal(size=(n, 2)) @ (1, 1j), step, soup(rng, n, f), np.zeros(f)
+
+
+def strained(rng) -> Arguments:
+    """Derivatives p, q and determinants: also p = 0 and q = 0, no number, inverted triangles, and ones on the brink."""
+    f = rng.integers(400)
+    p, q = np.array([[1], [0]]) + 0.4 * (rng.normal(size=(2, f, 2)) @ (1, 1j))
+    p[::7], q[::5] = 0, 0
+    p[3::50] = np.nan
+    det = np.abs(p) ** 2 - np.abs(q) ** 2
+    det[1::9], det[2::31] = 0, 1e-3
+    return p, q, det
+
+
+MIXTURES = np.concatenate([np.eye(4), [[127 / 128, 0, 0, 1 / 128], [0, 0, 1, 0.1], [0.5, 2, 0.25, 3]]])
+
+
+@arguments_of("mixed_energy")
+def _(rng):
+    """With a triangle that makes the sum infinite, now and then."""
+    p, q, det = strained(rng)
+    keep = np.isfinite(p) & (det > -rng.integers(2))
+    return MIXTURES[rng.integers(7)], p[keep], q[keep], det[keep], rng.uniform(size=int(keep.sum()))
+
+
+@arguments_of("mixed_slopes")
+def _(rng):
+    p, q, det = strained(rng)
+    return MIXTURES[rng.integers(7)], p, q, det, numbers(rng, p.size), numbers(rng, p.size)
+
+
+@arguments_of("mixed_curvature")
+def _(rng):
+    p, q, det = strained(rng)
+    share, negative = rng.uniform(size=p.size), float(rng.integers(-1, 2))
+    fields = rng.normal(size=(2, p.size)), numbers(rng, 4, p.size)
+    return MIXTURES[rng.integers(7)], p, q, det, share, negative, *fields[0], *fields[1]
+
+
+@arguments_of("add_up")
+def _(rng):
+    """Pairs of entries anywhere, often at the same place."""
+    f, size = rng.integers(200), 50
+    form = *rng.normal(size=(2, f)), *numbers(rng, 4, f)
+    slots = rng.integers(size - 1, size=(2, 2, 3, f)).astype(np.int32)
+    return *form, gradients(rng, f), slots, rng.choice([-1.0, 1.0], (3, f)), rng.normal(size=size)

@@ -9,8 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, named, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, named, real_array
 from quasiharmonic.energy.energies import Deformation, Energy, QuadraticForm
+from quasiharmonic.energy.mixtures import curvature_of_mixture, mixed_energy, mixed_slopes, mixture_of
+from quasiharmonic.kernels import compiled
+from quasiharmonic.mesh.reference import blocks
 from quasiharmonic.mesh.shapes import rest_shapes
 
 
@@ -60,7 +63,7 @@ class DeformationEnergy:
         rest_F: ArrayLike | None = None,
     ) -> None:
         self.energy = energy
-        self.F = np.asarray(F, dtype=np.int64)
+        self.F = np.ascontiguousarray(F, dtype=np.int64)
         shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))
         if shapes.flat.size:
             raise ValueError(
@@ -76,7 +79,6 @@ class DeformationEnergy:
         if weights is not None:
             self.share = self.share * _weights(weights, len(self.F))
         self._det_per_area = scale**2 / shapes.m
-        self._corners = np.ascontiguousarray(self.F.T)
 
     def deform(self, w: ComplexArray) -> Deformation:
         """The Jacobian of a map ``w = u + i v`` (n,) complex128 on every triangle.
@@ -84,12 +86,10 @@ class DeformationEnergy:
         Determinants come from the images' areas. An area too small to be told from its own rounding is
         taken to be that rounding: it is positive if the map has been certified, and the energy huge.
         """
-        d1, d2 = _edges(self._corners, w)
-        left, right = d1.real * d2.imag, d1.imag * d2.real
-        area, noise = left - right, 2.0**-51 * (np.abs(left) + np.abs(right))
-        area = 0.5 * np.where(np.abs(area) <= noise, noise, area)
-        g1, g2 = self.g[1], self.g[2]
-        return Deformation(d1 * g1.conj() + d2 * g2.conj(), d1 * g1 + d2 * g2, area * self._det_per_area)
+        f = len(self.F)
+        p, q, det = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
+        jacobians(w, self.F, self.g, self._det_per_area, p, q, det)
+        return Deformation(p, q, det)
 
     def value(self, w: ComplexArray) -> float:
         """The mean energy of a map; ``inf`` where the energy is a barrier and a triangle is inverted."""
@@ -97,7 +97,10 @@ class DeformationEnergy:
 
     def value_of(self, d: Deformation) -> float:
         """The mean energy of a deformation at hand."""
-        return float(np.sum(self.share * self.energy.density(d)))
+        mixture = mixture_of(self.energy)
+        if mixture is None:
+            return float(np.sum(self.share * self.energy.density(d)))
+        return mixed_energy(mixture, d.p, d.q, d.det, self.share)
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
         """Its derivative by the positions, ``∂E/∂u + i ∂E/∂v`` at every vertex; (n,) complex128."""
@@ -105,11 +108,15 @@ class DeformationEnergy:
 
     def gradient_of(self, d: Deformation, n: int) -> ComplexArray:
         """The derivative by ``n`` positions for a deformation at hand."""
-        by_p, by_q = self.energy.gradient(d)
-        by_p, by_q = self.share * by_p, self.share * by_q
-        pull = (by_p * self.g + by_q * self.g.conj()).ravel()
-        at = self._corners.ravel()
-        return np.bincount(at, pull.real, minlength=n) + 1j * np.bincount(at, pull.imag, minlength=n)
+        mixture = mixture_of(self.energy)
+        if mixture is None:
+            by_p, by_q = (np.ascontiguousarray(by, dtype=np.complex128) for by in self.energy.gradient(d))
+        else:
+            by_p, by_q = np.empty_like(d.p), np.empty_like(d.q)
+            mixed_slopes(mixture, d.p, d.q, d.det, by_p, by_q)
+        gradient = np.empty(n, dtype=np.complex128)
+        pulls(by_p, by_q, self.share, self.F, self.g, gradient)
+        return gradient
 
     def curvature_of(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivatives by (p, q) on every triangle, weights and areas included.
@@ -120,7 +127,10 @@ class DeformationEnergy:
         negative : float
             What negative eigenvalues are multiplied by; see `Energy.curvature`.
         """
-        return self.energy.curvature(d, negative=negative).scaled(self.share)
+        mixture = mixture_of(self.energy)
+        if mixture is None:
+            return self.energy.curvature(d, negative=negative).scaled(self.share)
+        return curvature_of_mixture(mixture, d, self.share, negative)
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
         """How far along a direction each triangle's area first vanishes.
@@ -134,19 +144,65 @@ class DeformationEnergy:
             Positive; ``inf`` where it never does, and where the area of ``w`` itself is lost in rounding, so
             that only the exact test can say.
         """
-        d1, d2 = _edges(self._corners, w)
-        e1, e2 = _edges(self._corners, direction)
+        first = np.empty(len(self.F))
+        collapses(w, direction, self.F, first)
+        return first
+
+
+@compiled
+def jacobians(
+    w: ComplexArray,
+    F: IntArray,
+    g: ComplexArray,
+    det_per_area: FloatArray,
+    p: ComplexArray,
+    q: ComplexArray,
+    det: FloatArray,
+) -> None:
+    """Fill in what `DeformationEnergy.deform` says of a map (n,)."""
+    for part in blocks(len(F)):
+        d1, d2 = _edges(F[part].T, w)
+        left, right = d1.real * d2.imag, d1.imag * d2.real
+        area, noise = left - right, 2.0**-51 * (np.abs(left) + np.abs(right))
+        area = 0.5 * np.where(np.abs(area) <= noise, noise, area)
+        g1, g2 = g[1:, part]
+        p[part] = d1 * g1.conj() + d2 * g2.conj()
+        q[part] = d1 * g1 + d2 * g2
+        det[part] = area * det_per_area[part]
+
+
+@compiled
+def pulls(
+    by_p: ComplexArray, by_q: ComplexArray, share: FloatArray, F: IntArray, g: ComplexArray, gradient: ComplexArray
+) -> None:
+    """Fill in derivatives by the positions (n,) of a sum whose terms have these derivatives by p and q, times share."""
+    x, y = np.empty((2, *g.shape))
+    for part in blocks(len(F)):
+        along_p, along_q, here = share[part] * by_p[part], share[part] * by_q[part], g[:, part]
+        pull = along_p * here + along_q * here.conj()
+        x[:, part], y[:, part] = pull.real, pull.imag
+    at, n = F.T.ravel(), gradient.size
+    gradient.real, gradient.imag = np.bincount(at, x.ravel(), minlength=n), np.bincount(at, y.ravel(), minlength=n)
+
+
+@compiled
+def collapses(w: ComplexArray, direction: ComplexArray, F: IntArray, first: FloatArray) -> None:
+    """Fill in what `DeformationEnergy.steps_to_collapse` says, (f,)."""
+    for part in blocks(len(F)):
+        corners = F[part].T
+        d1, d2 = _edges(corners, w)
+        e1, e2 = _edges(corners, direction)
         c0 = d1.real * d2.imag - d1.imag * d2.real
         c1 = d1.real * e2.imag - d1.imag * e2.real + e1.real * d2.imag - e1.imag * d2.real
         c2 = e1.real * e2.imag - e1.imag * e2.real
         root = np.sqrt(np.maximum(c1**2 - 4 * c0 * c2, 0))
-        real = c1**2 >= 4 * c0 * c2
+        real = (c0 > 0) & (c1**2 >= 4 * c0 * c2)
         falls = real & (c1 < 0)
         rises = real & (c1 >= 0) & (c2 < 0)
-        first = np.full(c0.shape, np.inf)
-        first[falls] = 2 * c0[falls] / (root - c1)[falls]
-        first[rises] = (c1 + root)[rises] / (-2 * c2[rises])
-        return np.where(c0 > 0, first, np.inf)
+        here = first[part]
+        here[:] = np.inf
+        here[falls] = 2 * c0[falls] / (root - c1)[falls]
+        here[rises] = (c1 + root)[rises] / (-2 * c2[rises])
 
 
 def signed_areas(F: NDArray[np.integer], w: ComplexArray) -> FloatArray:

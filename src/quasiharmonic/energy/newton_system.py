@@ -10,13 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array, triu
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
 from quasiharmonic.energy.energies import QuadraticForm
 from quasiharmonic.hearing import still_at_it
+from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
-from quasiharmonic.mesh.topology import edge_keys
+from quasiharmonic.linsolve.pattern import stiffness_pattern
 
 # Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
 _CHUNK = 8192
@@ -50,40 +52,21 @@ class NewtonSystem:
         is_free = np.ones(n, dtype=bool)
         is_free[fixed] = False
         self.free = np.flatnonzero(is_free)
-        size = self.free.size
-        place = np.full(n, -1, dtype=np.int64)
-        place[self.free] = np.arange(size)
-        self._corner = corner = place[F.T]
+        place = np.full(n, -1, dtype=np.int32)
+        place[self.free] = np.arange(self.free.size)
         self.take_gradients(g)
-        self._pattern(corner, size)
+        self._pattern(F, place)
         self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
 
     def take_gradients(self, g: ComplexArray) -> None:
         """Have other gradients (3, f) of the hat functions on the same triangles, as another scale gives them."""
-        # Their products over the sides, from lower to higher free vertex, and at the corners.
-        first, second = self._corner, self._corner[(1, 2, 0), :]
-        g1, g2 = g, g[(1, 2, 0), :]
-        upward = first <= second
-        low, high = np.where(upward, g1, g2), np.where(upward, g2, g1)
-        self._side_products = _parts(low, high)
-        self._corner_products = _parts(g, g)
-        self._work = np.empty(self._side_products.shape)
+        self._g = np.ascontiguousarray(g, dtype=np.complex128)
 
-    def _pattern(self, corner: IntArray, size: int) -> None:
+    def _pattern(self, F: IntArray, place: NDArray[np.int32]) -> None:
         """Where the blocks go."""
-        tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
-        count = tail.size
-        inner = np.flatnonzero((tail >= 0) & (head >= 0))
-        key = edge_keys(tail[inner], head[inner], size)
-        order = np.argsort(key, kind="stable")
-        inner, key = inner[order], key[order]
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        row, column = np.divmod(key[first], max(size, 1))
-        self._sum_sides = _summation(inner, np.append(first, inner.size), count)
-        at = np.flatnonzero(tail >= 0)
-        at = at[np.argsort(tail[at], kind="stable")]
-        self._sum_corners = _summation(at, np.append(0, np.cumsum(np.bincount(tail[at], minlength=size))), count)
-
+        size = self.free.size
+        edges = stiffness_pattern(F, place, size)
+        row, column = edges.row, edges.column
         # Row 2i holds xx and xy of the diagonal block and then of the others, row 2i + 1 yy and then yx, yy.
         degree = np.bincount(row, minlength=size)
         upper = np.append(0, np.cumsum(4 * degree + 3))
@@ -98,7 +81,20 @@ class NewtonSystem:
         self._indices[self._corner_slots] = own, own + 1, own + 1
         self._indices[self._side_slots] = 2 * column, 2 * column + 1, 2 * column, 2 * column + 1
         self._first = self._indptr[:-1]
-        self._values = np.empty(upper[-1])
+
+        # By triangle: the first entries of both rows of the blocks of its sides, from lower to higher free vertex, and
+        # of its corners. What belongs to a fixed vertex goes where nobody looks, behind the matrix.
+        self._sums = np.empty(upper[-1] + 2)
+        self._values = self._sums[:-2]
+        corner = place[F.T]
+        self._turns = np.where(corner <= corner[(1, 2, 0), :], 1.0, -1.0)
+        self._slots = np.full((2, 2, *corner.shape), upper[-1], dtype=np.int32)
+        of_sides, of_corners = self._slots.reshape(2, 2, -1)
+        nth_side = np.repeat(np.arange(row.size), np.diff(edges.offsets))
+        of_sides[0, edges.halves], of_sides[1, edges.halves] = xx[nth_side], yx[nth_side]
+        free = np.flatnonzero(corner.ravel() >= 0)
+        of = corner.ravel()[free]
+        of_corners[0, free], of_corners[1, free] = upper[of], lower[of] - 1
 
     def assemble(self, form: QuadraticForm) -> None:
         """Add up the triangles' quadratic forms.
@@ -109,11 +105,10 @@ class NewtonSystem:
             On every triangle, with its area and weight in it.
         """
         still_at_it()
-        for slot, part in zip(self._side_slots, _blocks(form, self._side_products, self._work), strict=True):
-            self._values[slot] = self._sum_sides @ part.ravel()
-        xx, xy, _, yy = _blocks(form, self._corner_products, self._work)
-        for slot, part in zip(self._corner_slots, (xx, xy, yy), strict=True):
-            self._values[slot] = self._sum_corners @ part.ravel()
+        pp, qq = (np.ascontiguousarray(field, dtype=np.float64) for field in (form.pp, form.qq))
+        rest = form.p2, form.q2, form.pq, form.pqc
+        p2, q2, pq, pqc = (np.ascontiguousarray(field, dtype=np.complex128) for field in rest)
+        add_up(pp, qq, p2, q2, pq, pqc, self._g, self._slots, self._turns, self._sums)
         self._diagonal = self._values[self._first]
 
     def add_blocks(self, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> None:
@@ -204,34 +199,51 @@ class NewtonSystem:
         return (np.ascontiguousarray(load).view(np.float64) / diagonal).view(np.complex128)
 
 
-def _parts(g1: ComplexArray, g2: ComplexArray) -> FloatArray:
-    """Real and imaginary parts of ``g₁ conj(g₂)`` and of ``g₁ g₂``, (4, 3, f) float64."""
-    turned, product = g1 * g2.conj(), g1 * g2
-    return np.stack([turned.real, turned.imag, product.real, product.imag])
+@compiled
+def add_up(
+    pp: FloatArray,
+    qq: FloatArray,
+    p2: ComplexArray,
+    q2: ComplexArray,
+    pq: ComplexArray,
+    pqc: ComplexArray,
+    g: ComplexArray,
+    slots: NDArray[np.int32],
+    turns: FloatArray,
+    values: FloatArray,
+) -> None:
+    """Fill in the entries of a matrix to which triangles' quadratic forms add up.
 
-
-def _blocks(form: QuadraticForm, products: FloatArray, out: FloatArray) -> FloatArray:
-    """Entries xx, xy, yx, yy of the blocks between pairs of corners i, j; (4, 3, f) float64.
-
-    With dp and dq written out, the form is the real part of ``Σ Mᵢⱼ conj(dwᵢ) dwⱼ + Nᵢⱼ dwᵢ dwⱼ``.
+    Parameters
+    ----------
+    pp, qq, p2, q2, pq, pqc : (f,)
+        The forms.
+    g : (3, f) complex128
+        Half the gradients of the hat functions.
+    slots : (2, 2, 3, f) int32
+        Where rows of blocks begin in ``values``: of the triangles' sides and of their corners, upper rows and lower.
+    turns : (3, f) float64
+        Of the sides: 1, or -1 where they run from the higher vertex to the lower, and the block is transposed.
+    values : float64
+        The first entries of corners' lower rows, which are below the diagonal, are not in it.
     """
-    for start in range(0, form.pp.size, _CHUNK):
+    # With dp and dq written out, the form is the real part of Σ Mᵢⱼ conj(dwᵢ) dwⱼ + Nᵢⱼ dwᵢ dwⱼ.
+    values[:] = 0
+    for start in range(0, pp.size, _CHUNK):
         part = slice(start, start + _CHUNK)
-        cr, ci, sr, si = products[:, :, part]
-        p2, q2, pq, pqc = form.p2[part], form.q2[part], form.pq[part], form.pqc[part]
-        m_real = (form.pp[part] + form.qq[part]) * cr + (pqc.real * sr + pqc.imag * si)
-        m_imag = (form.pp[part] - form.qq[part]) * ci
-        n_real = (p2.real + q2.real) * sr + (p2.imag - q2.imag) * si + pq.real * cr
-        n_imag = (p2.imag + q2.imag) * sr + (q2.real - p2.real) * si + pq.imag * cr
-        out[0, :, part] = m_real + n_real
-        out[1, :, part] = -m_imag - n_imag
-        out[2, :, part] = m_imag - n_imag
-        out[3, :, part] = m_real - n_real
-    return out
-
-
-def _summation(members: IntArray, offsets: IntArray, count: int) -> csr_array:
-    """Sums of some of ``count`` numbers: row i adds up ``members[offsets[i]:offsets[i + 1]]``."""
-    return csr_array(
-        (np.ones(members.size), members.astype(np.int32), offsets.astype(np.int32)), shape=(offsets.size - 1, count)
-    )
+        mean, turn = pp[part] + qq[part], turns[:, part] * (pp[part] - qq[part])
+        total, rest, twice, turned = p2[part] + q2[part], p2[part] - q2[part], pq[part], pqc[part]
+        here = g[:, part]
+        for (upper, lower), there in zip(slots[..., part], (here[(1, 2, 0), :], here), strict=True):
+            square, product = here * there.conj(), here * there
+            even = mean * square.real + turned.real * product.real + turned.imag * product.imag
+            odd = twice.real * square.real + total.real * product.real + rest.imag * product.imag
+            cross = rest.real * product.imag - total.imag * product.real - twice.imag * square.real
+            np.add.at(values, upper.ravel(), (even + odd).ravel())
+            np.add.at(values, lower.ravel() + 1, (even - odd).ravel())
+            if there is here:
+                np.add.at(values, upper.ravel() + 1, cross.ravel())
+            else:
+                twist = turn * square.imag
+                np.add.at(values, upper.ravel() + 1, (cross - twist).ravel())
+                np.add.at(values, lower.ravel(), (cross + twist).ravel())

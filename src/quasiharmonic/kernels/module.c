@@ -2,14 +2,26 @@
 #include "arguments.h"
 
 extern PyMethodDef certificate_kernels[];
+extern PyMethodDef deformation_kernels[];
 extern PyMethodDef loops_kernels[];
+extern PyMethodDef mixtures_kernels[];
+extern PyMethodDef newton_system_kernels[];
 extern PyMethodDef pattern_kernels[];
 extern PyMethodDef reference_kernels[];
 extern PyMethodDef topology_kernels[];
 
 static int fill(PyObject *module)
 {
-    PyMethodDef *const tables[] = {certificate_kernels, loops_kernels, pattern_kernels, reference_kernels, topology_kernels};
+    PyMethodDef *const tables[] = {
+        certificate_kernels,
+        deformation_kernels,
+        loops_kernels,
+        mixtures_kernels,
+        newton_system_kernels,
+        pattern_kernels,
+        reference_kernels,
+        topology_kernels,
+    };
     for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
         if (PyModule_AddFunctions(module, tables[i]) < 0)
             return -1;
