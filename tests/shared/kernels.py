@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk
 
 Arguments = tuple[Any, ...]
@@ -253,3 +254,205 @@ def _(rng):
     form = *rng.normal(size=(2, f)), *numbers(rng, 4, f)
     slots = rng.integers(size - 1, size=(2, 2, 3, f)).astype(np.int32)
     return *form, gradients(rng, f), slots, rng.choice([-1.0, 1.0], (3, f)), rng.normal(size=size)
+
+
+def field_on(rng, triangles: int, scale: float) -> Any:
+    """ξ of some triangles, of few magnitudes and among them zero."""
+    xi = scale * (rng.normal(size=triangles) + 1j * rng.normal(size=triangles))
+    xi[::7] = 0
+    xi[1::7] *= 1e-9
+    return xi
+
+
+@arguments_of("fill_stiffness")
+def _(rng):
+    return field_on(rng, 50, 2.0), 0, rng.normal(size=(9, 50)), np.empty((3, 50))
+
+
+@arguments_of("fill_stiffness")
+def _(rng):
+    """Triangles all alike, none of them, and tensors that are no numbers."""
+    xi = field_on(rng, 20, 1e4)
+    xi[3], xi[4] = np.nan, np.inf
+    return xi, 1, np.broadcast_to(rng.normal(size=(9, 1)), (9, 20)), np.empty((3, 20))
+
+
+@arguments_of("fill_stiffness")
+def _(rng):
+    return np.empty(0, dtype=complex), 0, np.empty((9, 0)), np.empty((3, 0))
+
+
+def swept(rng, number: int, scale: float, starts: list[int]) -> Arguments:
+    """A stirred mesh's triangles, in runs."""
+    V, F = disk(6)
+    w, f = (V[:, 0] + 1j * V[:, 1]) + 0.1 * rng.normal(size=len(V)), starts[-1]
+    gamma = np.broadcast_to(0.5 * (rng.normal(size=(2, 1)) + 1j * rng.normal(size=(2, 1))), (2, f))
+    m = np.broadcast_to(np.sqrt(0.1875), (f,))
+    xi = field_on(rng, f, scale)
+    return w, F[:f], gamma, m, xi, number, np.array(starts), numbers(rng, f), np.empty((len(starts) - 1, 4))
+
+
+@arguments_of("dirichlet_sweep")
+def _(rng):
+    return swept(rng, 0, 1.0, [0, 80])
+
+
+@arguments_of("dirichlet_sweep")
+def _(rng):
+    return swept(rng, 1, 10.0, [0, 1, 30, 31, 70])
+
+
+@arguments_of("dirichlet_sweep")
+def _(rng):
+    """A vertex that lies nowhere, weights and gradients of each triangle's own."""
+    w, F, gamma, _, xi, *rest = swept(rng, 0, 1.0, [0, 40, 60])
+    w[F[50, 1]] = np.nan
+    return w, F, rng.normal() * gamma.copy(), rng.uniform(1, 2, 60), xi, *rest
+
+
+@arguments_of("clip_moduli")
+def _(rng):
+    xi = field_on(rng, 30, 8.0)
+    xi[5], xi[6] = np.nan, 1e150
+    return xi, 8.8
+
+
+@arguments_of("assemble")
+def _(rng):
+    """Of a triangle's three edges between unknowns, one with two half-edges, and four unknowns."""
+    halves, offsets = np.array([0, 5, 7, 2], dtype=np.int32), np.array([0, 2, 3, 4], dtype=np.int32)
+    row, column, border = np.array([0, 0, 2]), np.array([1, 2, 3]), np.array([1, 3, 4])
+    border_row, indptr = np.array([3, 1, 3]), np.array([0, 3, 4, 6, 7], dtype=np.int32)
+    return rng.normal(size=9), indptr, row, column, halves, offsets, border, border_row, rng.normal(size=7)
+
+
+@arguments_of("assemble")
+def _(rng):
+    """One unknown, all of whose neighbours are fixed."""
+    none, border = np.empty(0, dtype=np.int64), np.array([0, 2, 3, 5])
+    indptr, offsets, border_row = np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32), np.zeros(4, dtype=np.int64)
+    return rng.normal(size=6), indptr, none, none, none.astype(np.int32), offsets, border, border_row, np.empty(1)
+
+
+@arguments_of("boundary_load")
+def _(rng):
+    rows = np.array([3, 1, 3])
+    return rng.normal(size=9), np.array([1, 3, 4]), rows, np.array([5, 0, 2]), numbers(rng, 6), np.full((2, 4), np.nan)
+
+
+@arguments_of("put_at")
+def _(rng):
+    return rng.normal(size=(2, 3)), np.array([4, 0, 2]), numbers(rng, 6)
+
+
+def upper_triangle(rng, size: int) -> Any:
+    """A pattern with a diagonal, and positive values."""
+    full = np.triu(rng.random((size, size)) < 0.2, 1) | np.eye(size, dtype=bool)
+    indptr = np.append(0, np.cumsum(full.sum(axis=1))).astype(np.int32)
+    return indptr, np.nonzero(full)[1].astype(np.int32), rng.uniform(0.1, 2, indptr[-1])
+
+
+@arguments_of("probe_matrix")
+def _(rng):
+    return *upper_triangle(rng, 12), rng.choice([-1.0, 1.0], 12), np.empty(12), np.empty(12), np.empty(12)
+
+
+@arguments_of("probe_matrix")
+def _(rng):
+    """A diagonal with a zero and with what is no number."""
+    indptr, indices, values = upper_triangle(rng, 12)
+    values[indptr[[5, 9]]] = 0.0, np.nan
+    return indptr, indices, values, np.ones(12), np.zeros(12), np.zeros(12), np.zeros(12)
+
+
+@arguments_of("probe_matrix")
+def _(rng):
+    return *upper_triangle(rng, 1), np.ones(1), np.empty(1), np.empty(1), np.empty(1)
+
+
+@arguments_of("scaled_sizes")
+def _(rng):
+    return *rng.normal(size=(3, 20)), rng.normal(size=(2, 20)), rng.normal(size=(2, 20)), np.empty((3, 2))
+
+
+@arguments_of("adam_step")
+def _(rng):
+    """Of triangles of which some have never had a gradient."""
+    gradient, square = field_on(rng, 40, 1.0), rng.uniform(0, 1, 40)
+    mean = numbers(rng, 40)
+    mean[::14] = square[::14] = 0
+    return gradient, 0.6, 0.9, 0.2, mean, square, numbers(rng, 40)
+
+
+def stirred_disks(rng, stirred: list[int]) -> Arguments:
+    """Disks side by side, of each so many of its interior vertices thrown elsewhere."""
+    V, F = disk(6)
+    n, count = len(V), len(stirred)
+    w = np.tile((V[:, 0] + 1j * V[:, 1]) + 0.01 * rng.normal(size=n), count)
+    inner = np.setdiff1d(np.arange(n), np.concatenate(boundary_loops(F, n)))
+    for k, some in enumerate(stirred):
+        thrown = rng.choice(inner, some, replace=False) + k * n
+        w[thrown] += 0.4 * (rng.normal(size=some) + 1j * rng.normal(size=some))
+    moves = np.tile(np.isin(np.arange(n), inner), count)
+    F, mesh = np.concatenate([F + k * n for k in range(count)]), np.repeat(np.arange(count), len(F))
+    return F, moves, mesh, w, np.empty_like(w), np.empty(count, dtype=bool)
+
+
+@arguments_of("place_inverted")
+def _(rng):
+    return stirred_disks(rng, [3])
+
+
+@arguments_of("place_inverted")
+def _(rng):
+    return stirred_disks(rng, [2, 0, 30, 5, 1])
+
+
+@arguments_of("place_inverted")
+def _(rng):
+    """One triangle that cannot be helped, a vertex that lies nowhere, one with many triangles around it."""
+    F, moves, mesh, w, *_ = stirred_disks(rng, [1, 2])
+    w[np.flatnonzero(moves)[-4]] = np.nan
+    n, spokes = w.size, 20
+    rim = n + 1 + np.arange(spokes)
+    fan = np.stack([np.full(spokes, n), rim, np.roll(rim, -1)], axis=1)
+    alone = n + spokes + 1 + np.arange(3)[None]
+    F = np.concatenate([F, fan, alone])
+    moves = np.concatenate([moves, [True], np.zeros(spokes + 3, dtype=bool)])
+    mesh = np.concatenate([mesh, np.full(spokes, 2), [3]])
+    w = np.concatenate([w, [3], np.exp(2j * np.pi * np.arange(spokes) / spokes), [0, 1j, 1]])
+    return F, moves, mesh, w, np.empty_like(w), np.empty(4, dtype=bool)
+
+
+def divided_cells(rng, triangles: int, parents: int, room: int) -> Arguments:
+    """Small and large triangles in the unit box, some in a corner of it, to be listed in parts of cells."""
+    corners = np.clip(rng.random((triangles, 1, 2)) + 0.2 * rng.normal(size=(triangles, 3, 2)), 0, 1 - 2.0**-40)
+    corners[::3] *= 2.0**-6
+    tail, head = corners, np.roll(corners, -1, axis=1)
+    nx, ny = tail[..., 1] - head[..., 1], head[..., 0] - tail[..., 0]
+    finest, shift = (corners * 2.0**40).astype(np.int64), 36
+    corner = 4 * np.stack(np.divmod(rng.permutation(16)[:parents], 4), axis=1)
+    low, high = finest.min(axis=1), finest.max(axis=1)
+    touch = (low[None] >> shift <= corner[:, None] + 3) & (high[None] >> shift >= corner[:, None])
+    parent, triangle = np.array(np.nonzero(touch.all(axis=2)))
+    return (
+        low, high, nx, ny, nx * tail[..., 0] + ny * tail[..., 1],
+        triangle, parent, corner, 4, 4, shift,
+        np.empty(16 * parents, dtype=np.int64), np.zeros(room, dtype=np.int64),
+    )  # fmt: skip
+
+
+@arguments_of("divide_cells")
+def _(rng):
+    return divided_cells(rng, 40, 9, 4000)
+
+
+@arguments_of("divide_cells")
+def _(rng):
+    """Into lists for which there is no room."""
+    return divided_cells(rng, 40, 9, 3)
+
+
+@arguments_of("divide_cells")
+def _(rng):
+    return divided_cells(rng, 0, 1, 0)

@@ -23,6 +23,7 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.energy.deformation import signed_areas
+from quasiharmonic.kernels import compiled
 
 # Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step of the descent. The
 # first map, from which the way may be far, is tried with more.
@@ -86,7 +87,7 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
     F, w, fixed
         Of all meshes, none joined to another.
     mesh : (f,) int64
-        Which mesh a triangle belongs to.
+        Which mesh a triangle belongs to, ascending.
 
     Returns
     -------
@@ -96,8 +97,18 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
     """
     moves = np.ones(len(w), dtype=bool)
     moves[fixed] = False
-    given, w = w, w.copy()
-    fewest, in_vain = np.full(int(mesh.max()) + 1, len(F) + 1), np.zeros(int(mesh.max()) + 1, dtype=np.int64)
+    moved, righted = np.empty_like(w), np.empty(int(mesh[-1]) + 1, dtype=bool)
+    place_inverted(np.ascontiguousarray(F), moves, mesh, w, moved, righted)
+    return moved, righted
+
+
+@compiled
+def place_inverted(
+    F: IntArray, moves: BoolArray, mesh: IntArray, given: ComplexArray, w: ComplexArray, righted: BoolArray
+) -> None:
+    """Fill in what `placed_each` returns; moves: which vertices may (n,)."""
+    w[:] = given
+    fewest, in_vain = np.full(righted.size, len(F) + 1), np.zeros(righted.size, dtype=np.int64)
     vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
     T, of, looked_at = F, mesh, np.ones(fewest.size, dtype=bool)
     for sweep in range(_SWEEPS + 1):
@@ -114,7 +125,7 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
         if not np.array_equal(vertices, before):
             groups = _apart(T, vertices, len(w))
         _place(w, groups)
-    righted = fewest == 0
+    np.equal(fewest, 0, out=righted)
     if righted.any():
         # What has moved is placed again, together with its neighbours.
         near = np.zeros(len(w), dtype=bool)
@@ -127,8 +138,7 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
         spoilt = np.bincount(of[~(signed_areas(T, there) > 0)], minlength=righted.size) > 0
         back = T[spoilt[of]]
         there[back] = w[back]
-        w = there
-    return w, righted
+        w[:] = there
 
 
 def _any_corner(marked: BoolArray) -> BoolArray:

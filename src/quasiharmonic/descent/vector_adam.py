@@ -12,10 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, IntArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.descent.base import FunctionalDescent, Iterates
 from quasiharmonic.descent.placing import Tries, placed
 from quasiharmonic.field.objective import Iterate, Objective
+from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.reference import blocks
 
 # Less momentum than Adam's usual 0.9 / 0.999 is the largest single gain: the landscape changes as fast as
@@ -124,14 +125,28 @@ class Pace:
         self._steps += 1
         length *= np.sqrt(1 - second**self._steps) / (1 - first**self._steps)
         step = np.empty_like(self._mean)
-        for part in blocks(step.size):
-            g, average, squares = gradient[part], self._mean[part], self._square[part]
-            average *= first
-            average += (1 - first) * g
-            squares *= second
-            squares += (1 - second) * (g.real**2 + g.imag**2)
-            root = np.sqrt(squares)
-            # A triangle whose gradient has never differed from zero stays where it is.
-            root[root == 0] = np.inf
-            np.multiply(average, -length / root, out=step[part])
+        adam_step(gradient, first, second, length, self._mean, self._square, step)
         return step
+
+
+@compiled
+def adam_step(
+    gradient: ComplexArray,
+    first: float,
+    second: float,
+    length: float,
+    mean: ComplexArray,
+    square: FloatArray,
+    step: ComplexArray,
+) -> None:
+    """Take a gradient into its mean and mean square, and fill in the step of this length."""
+    for part in blocks(step.size):
+        g, average, squares = gradient[part], mean[part], square[part]
+        average *= first
+        average += (1 - first) * g
+        squares *= second
+        squares += (1 - second) * (g.real**2 + g.imag**2)
+        root = np.sqrt(squares)
+        # A triangle whose gradient has never differed from zero stays where it is.
+        root[root == 0] = np.inf
+        np.multiply(average, -length / root, out=step[part])

@@ -16,9 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.kernels import compiled
 
 # The finest cells have integer coordinates below 2 to this power; a cell ``s`` levels of halving up has them
 # shifted by ``s`` bits.
@@ -29,6 +29,9 @@ _LONG = 12
 _MORE = 1.5
 # or the parts that are not empty have on average no more than this fraction of its own.
 _GAIN = 0.75
+# A part that keeps all triangles of its cell is not divided once more if they are no more than this: they have a corner
+# in common, as a rule, and would crowd around it however small the part.
+_CROWD = 48
 # Triangles in all lists together, for each triangle of the mesh, at most: the limit on memory.
 _ENTRIES = 64
 # The same for the cells of the first grid.
@@ -37,8 +40,8 @@ _AT_FIRST = 16
 _MARGIN = 2.0**-48
 # Added to it, so that this holds too where products underflow.
 _TINY = 2.0**-1000
-# Entries spread over cells at a time: what is in work stays in the cache.
-_ROWS = 1 << 14
+# Entries spread over cells at a time: what is in work stays in the cache. Room for their lists, for each of them.
+_ROWS, _ROOM = 1 << 14, 4
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,15 @@ class _Level:
     """(k,) Length of each list."""
     triangle: IntArray
     """(sum of lengths,) The lists, each ascending."""
+    crowded: BoolArray
+    """(k,) Whether a cell has all of the few triangles that the one had that it is a part of."""
 
     def without(self, cells: IntArray) -> _Level:
         """The same cells with empty lists for some."""
         kept = np.ones(self.length.size, dtype=np.bool_)
         kept[cells] = False
-        return _Level(self.place, np.where(kept, self.length, 0), self.triangle[np.repeat(kept, self.length)])
+        triangle = self.triangle[np.repeat(kept, self.length)]
+        return _Level(self.place, np.where(kept, self.length, 0), triangle, self.crowded)
 
 
 class NestedGrid:
@@ -74,9 +80,10 @@ class NestedGrid:
     """
 
     def __init__(self, corners: FloatArray) -> None:
+        corners = np.ascontiguousarray(corners)
         finest = _coordinates(corners)
         self._low, self._high = finest.min(axis=1), finest.max(axis=1)
-        self._edges = _Edges(corners)
+        self._lines = _lines(corners)
         self._shift = shift = self._first_shift()
         columns, lines = (int(m) + 1 for m in self._high.max(axis=0) >> shift)
         self._columns = columns
@@ -96,7 +103,7 @@ class NestedGrid:
             made += finer.length.size
             room -= finer.triangle.size + levels[-2].triangle.size - level.triangle.size
             level = finer
-        del self._low, self._high, self._edges
+        del self._low, self._high, self._lines
         # Cells are numbered level after level. Those of ``_begin`` are where their lists begin; ``_parts`` is the
         # first of 16 parts, row by row, or -1.
         self.listed = np.concatenate([level.triangle for level in levels]).astype(np.int32)
@@ -141,7 +148,7 @@ class NestedGrid:
 
     def _refined(self, level: _Level, shift: int, room: int) -> tuple[IntArray, _Level]:
         """The cells of a level that should be divided, and their parts, ``room`` entries more at most."""
-        split = np.flatnonzero(level.length > _LONG)
+        split = np.flatnonzero((level.length > _LONG) & ~level.crowded)
         number = np.full(level.length.size, -1, dtype=np.int64)
         number[split] = np.arange(split.size)
         parent = np.repeat(number, level.length)
@@ -157,7 +164,8 @@ class NestedGrid:
         chosen[order[more > room]] = False
         part = np.repeat(chosen, 16)
         entry = np.repeat(part, finer.length)
-        return split[chosen], _Level(finer.place[part], finer.length[part], finer.triangle[entry])
+        crowded = ((parts == before[:, None]) & (before <= _CROWD)[:, None])[chosen].ravel()
+        return split[chosen], _Level(finer.place[part], finer.length[part], finer.triangle[entry], crowded)
 
     def _divided(
         self, triangle: IntArray, parent: IntArray, corner: IntArray, columns: int, lines: int, shift: int
@@ -172,52 +180,90 @@ class NestedGrid:
             Coordinates of each cell's first part.
         columns, lines, shift : int
         """
-        from scipy.sparse import csr_array
-
-        cells, counts = [np.empty(0, dtype=np.int64)], [np.zeros(1, dtype=np.int64)]
-        for start in range(0, triangle.size, _ROWS):
-            t, p = triangle[start : start + _ROWS], parent[start : start + _ROWS]
-            first = np.maximum(self._low[t] >> shift, corner[p])
-            last = np.minimum(self._high[t] >> shift, corner[p] + [columns - 1, lines - 1])
-            wide, high = (last - first + 1).T
-            row = np.repeat(np.arange(t.size), wide * high)
-            step = np.arange(row.size) - np.repeat(np.cumsum(wide * high) - wide * high, wide * high)
-            across = wide[row]
-            down = step // across
-            x, y = first[row, 0] + step - down * across, first[row, 1] + down
-            meets = self._edges.meet(t, row, x, y, shift)
-            row, x, y = row[meets], x[meets], y[meets]
-            owner = p[row]
-            cells.append((owner * lines + y - corner[owner, 1]) * columns + x - corner[owner, 0])
-            counts.append(np.bincount(row, minlength=t.size))
-        # Turning the table of entries and cells on its side sorts by cell and keeps the order of the entries.
-        where, size = np.concatenate(cells), len(corner) * columns * lines
-        table = (np.ones(where.size, dtype=np.int8), where, np.cumsum(np.concatenate(counts)))
-        turned = csr_array(table, shape=(triangle.size, size)).tocsc()
+        size = len(corner) * columns * lines
+        length, room = np.empty(size, dtype=np.int64), _ROOM * triangle.size
+        while True:
+            listed = np.empty(room, dtype=np.int64)
+            room = divide_cells(
+                self._low, self._high, *self._lines, triangle, parent, corner, columns, lines, shift, length, listed
+            )
+            if room <= listed.size:
+                break
         inner = np.indices((lines, columns))[::-1].reshape(2, -1).T
         place = (corner[:, None, :] + inner).reshape(-1, 2)
-        return _Level(place, np.diff(turned.indptr).astype(np.int64), triangle[turned.indices])
+        return _Level(place, length, listed[:room], np.zeros(size, dtype=np.bool_))
 
 
-class _Edges:
-    """Lines through the edges of triangles, for telling which cells lie outside of them."""
+@compiled
+def divide_cells(
+    low: IntArray,
+    high: IntArray,
+    nx: FloatArray,
+    ny: FloatArray,
+    offset: FloatArray,
+    triangle: IntArray,
+    parent: IntArray,
+    corner: IntArray,
+    columns: int,
+    lines: int,
+    shift: int,
+    length: IntArray,
+    listed: IntArray,
+) -> int:
+    """Fill in the lists of the parts of cells, and their lengths; how long they are together.
 
-    def __init__(self, corners: FloatArray) -> None:
-        tail, head = corners, np.roll(corners, -1, axis=1)
-        # A point is to the left of the edge where x nx + y ny exceeds the offset.
-        self._nx, self._ny = tail[..., 1] - head[..., 1], head[..., 0] - tail[..., 0]
-        self._offset = self._nx * tail[..., 0] + self._ny * tail[..., 1]
+    Only the lengths where ``listed`` has no room for that. low, high: finest cells between which each triangle lies
+    (f, 2); nx, ny, offset: as `_lines` has them; the others as of `NestedGrid._divided`.
+    """
+    from scipy.sparse import csr_array
 
-    def meet(self, triangle: IntArray, row: IntArray, x: IntArray, y: IntArray, shift: int) -> NDArray[np.bool_]:
-        """Whether the triangles of some rows meet cells that their boxes meet; if in doubt, they do."""
-        size = 2.0 ** (shift - _BITS)
-        middle_x, middle_y = (x + 0.5) * size, (y + 0.5) * size
-        meets = np.ones(row.size, dtype=np.bool_)
-        for i in range(3):
-            nx, ny = self._nx[triangle, i], self._ny[triangle, i]
-            reach = self._offset[triangle, i] - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _TINY
-            meets &= middle_x * nx[row] + middle_y * ny[row] >= reach[row]
-        return meets
+    cells, counts = [np.empty(0, dtype=np.int64)], [np.zeros(1, dtype=np.int64)]
+    for start in range(0, triangle.size, _ROWS):
+        t, p = triangle[start : start + _ROWS], parent[start : start + _ROWS]
+        first = np.maximum(low[t] >> shift, corner[p])
+        last = np.minimum(high[t] >> shift, corner[p] + [columns - 1, lines - 1])
+        wide, tall = (last - first + 1).T
+        row = np.repeat(np.arange(t.size), wide * tall)
+        step = np.arange(row.size) - np.repeat(np.cumsum(wide * tall) - wide * tall, wide * tall)
+        across = wide[row]
+        down = step // across
+        x, y = first[row, 0] + step - down * across, first[row, 1] + down
+        meets = _meet(nx[t], ny[t], offset[t], row, x, y, shift)
+        row, x, y = row[meets], x[meets], y[meets]
+        owner = p[row]
+        cells.append((owner * lines + y - corner[owner, 1]) * columns + x - corner[owner, 0])
+        counts.append(np.bincount(row, minlength=t.size))
+    # Turning the table of entries and cells on its side sorts by cell and keeps the order of the entries.
+    where = np.concatenate(cells)
+    table = (np.ones(where.size, dtype=np.int8), where, np.cumsum(np.concatenate(counts)))
+    turned = csr_array(table, shape=(triangle.size, length.size)).tocsc()
+    length[:] = np.diff(turned.indptr)
+    if where.size <= listed.size:
+        listed[: where.size] = triangle[turned.indices]
+    return where.size
+
+
+def _lines(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Lines through the edges of triangles, for telling which cells lie outside of them; (f, 3) each.
+
+    A point is to the left of an edge where ``x nx + y ny`` exceeds the offset.
+    """
+    tail, head = corners, np.roll(corners, -1, axis=1)
+    nx, ny = tail[..., 1] - head[..., 1], head[..., 0] - tail[..., 0]
+    return nx, ny, nx * tail[..., 0] + ny * tail[..., 1]
+
+
+def _meet(
+    nx: FloatArray, ny: FloatArray, offset: FloatArray, row: IntArray, x: IntArray, y: IntArray, shift: int
+) -> BoolArray:
+    """Whether triangles, by row, meet cells that their boxes meet; if in doubt, they do."""
+    size = 2.0 ** (shift - _BITS)
+    middle_x, middle_y = (x + 0.5) * size, (y + 0.5) * size
+    reach = offset - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _TINY
+    meets = np.ones(row.size, dtype=np.bool_)
+    for i in range(3):
+        meets &= middle_x * nx[row, i] + middle_y * ny[row, i] >= reach[row, i]
+    return meets
 
 
 def _coordinates(points: FloatArray) -> IntArray:

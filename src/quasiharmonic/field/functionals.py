@@ -302,19 +302,21 @@ def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) 
     gradient : (f,) complex128
         ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
     """
-    density, gradient = beltrami_terms(mesh, field, dw)
+    density, gradient = beltrami_terms(mesh.m, field, dw.p, dw.q)
     return 2.0 * float(density.sum()), gradient
 
 
-def beltrami_terms(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[FloatArray, ComplexArray]:
+def beltrami_terms(
+    m: FloatArray, field: TensorField, p: ComplexArray, q: ComplexArray
+) -> tuple[FloatArray, ComplexArray]:
     """As `beltrami_gradient`, with half of the energy of each triangle, (f,) float64, in place of their sum."""
-    residual = dw.q - field.mu * dw.p
-    weight = mesh.m / field.defect
+    residual = q - field.mu * p
+    weight = m / field.defect
     density = residual.real**2 + residual.imag**2
     density *= weight
-    gradient = dw.q.conj()
+    gradient = q.conj()
     gradient *= field.mu
-    np.subtract(dw.p.conj(), gradient, out=gradient)
+    np.subtract(p.conj(), gradient, out=gradient)
     gradient *= residual
     weight /= field.defect
     weight *= -4.0

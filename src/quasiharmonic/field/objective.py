@@ -10,11 +10,12 @@ from weakref import ref
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray
-from quasiharmonic.field.functionals import FUNCTIONALS, Functional, beltrami_gradient
+from quasiharmonic.field.functionals import FUNCTIONALS, Functional
+from quasiharmonic.field.passes import clip_moduli, stiffness_of, sweep
 from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, TensorField, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import FactoredLaplacian
-from quasiharmonic.mesh.reference import Derivatives, Reference, blocks
+from quasiharmonic.mesh.reference import Derivatives, Reference
 from quasiharmonic.problem import Problem
 
 
@@ -82,10 +83,7 @@ class Objective:
 
     def operator(self, field: TensorField) -> FactoredLaplacian:
         """The Laplacian of a tensor field, factored."""
-        stiffness = np.empty((3, field.xi.size))
-        for part in blocks(field.xi.size):
-            stiffness[:, part] = self.mesh[part].edge_stiffness(field[part].entries())
-        return self.laplacian.factor(stiffness)
+        return self.laplacian.factor(stiffness_of(self.mesh, field.parameterisation, field.xi))
 
     def own_tensor(self, w: ComplexArray) -> ComplexArray:
         """The μ of each triangle's own image, at which V₃ is least with the map held (eq. 39); (f,) complex128."""
@@ -126,18 +124,9 @@ class Objective:
         return self.evaluate(self.bounded(start.xi + step))
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
-        """``xi`` with moduli clipped to where the rounded tensor is still positive definite."""
-        bound = self.parameterisation.bound
-        inside = xi
-        for part in blocks(xi.size):
-            block = xi[part]
-            square = block.real**2 + block.imag**2
-            if square.max() > bound**2:
-                if inside is xi:
-                    inside = xi.copy()
-                far = square > bound**2
-                inside[part][far] *= bound / np.sqrt(square[far])
-        return inside
+        """``xi`` itself, moduli clipped in place to where the rounded tensor is still positive definite."""
+        clip_moduli(xi, self.parameterisation.bound)
+        return xi
 
 
 class Iterate:
@@ -184,16 +173,10 @@ class Iterate:
     @cached_property
     def _sweep(self) -> _Sweep:
         """All that the descent of V₃ asks for, in one pass over the triangles."""
-        flipped, energy, area, gradient = 0, 0.0, 0.0, np.empty(self.xi.size, dtype=np.complex128)
-        for part in blocks(self.xi.size):
-            mesh, field = self.objective.mesh[part], self.field[part]
-            dw = mesh.derivatives(self.w)
-            flipped += dw.area.size - int(np.count_nonzero(dw.area > 0))
-            area += float(dw.area.sum())
-            more, in_mu = beltrami_gradient(mesh, field, dw)
-            energy += more
-            gradient[part] = field.pull(in_mu)
-        return _Sweep(flipped, energy, area, gradient)
+        everything = np.array([0, self.xi.size])
+        sums, gradient = sweep(self.objective.mesh, self.field.parameterisation, self.xi, self.w, everything)
+        flipped, energy, area, covered = sums[0].tolist()
+        return _Sweep(int(flipped), energy, area if area > 0 else covered, gradient)
 
     @property
     def flipped(self) -> int:
@@ -214,8 +197,6 @@ class Iterate:
     def energy(self) -> float:
         """V₃ over the map's signed area (over the sum of unsigned areas where that is not positive)."""
         area = self._sweep.area
-        if not area > 0:
-            area = float(np.abs(self.dw.area).sum())
         return self.dirichlet / area if area > 0 else np.inf
 
     @cached_property

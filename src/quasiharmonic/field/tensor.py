@@ -29,6 +29,8 @@ class Parameterisation:
     ----------
     name : str
         How a user calls it.
+    number : int
+        How kernels do: its place in `PARAMETERISATIONS`.
     bound : float
         Largest ``|ξ|`` at which the tensor, rounded to doubles, is still safely positive definite.
     radial : callable
@@ -40,6 +42,7 @@ class Parameterisation:
     """
 
     name: str
+    number: int
     bound: float
     radial: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
     inverse: Callable[[FloatArray], FloatArray]
@@ -253,6 +256,11 @@ def _invert_si_log(r: FloatArray) -> FloatArray:
 # The eigenvalues of 𝒜 are e^{±2ρ} for tanh, and its entries are rounded at e^{2ρ} · 1e-16: beyond ρ = 9 the
 # smaller eigenvalue drowns. si-log comes nowhere near: its bound, which keeps |ξ|² finite, stands for
 # |μ| = 0.997, and what needs more distortion than that needs tanh.
-TANH = Parameterisation("tanh", 8.8, _tanh, np.arctanh, _bend_tanh)
-SI_LOG = Parameterisation("si-log", 1e150, _si_log, _invert_si_log, _bend_si_log)
+TANH = Parameterisation("tanh", 0, 8.8, _tanh, np.arctanh, _bend_tanh)
+SI_LOG = Parameterisation("si-log", 1, 1e150, _si_log, _invert_si_log, _bend_si_log)
 PARAMETERISATIONS = {p.name: p for p in (TANH, SI_LOG)}
+
+
+def parameterisation_of(number: int) -> Parameterisation:
+    """The parameterisation of this number."""
+    return (TANH, SI_LOG)[number]

@@ -1,27 +1,30 @@
 /* The extension: the kernels of all files, a file for each idea, as the Python files that they are for. */
 #include "arguments.h"
 
-extern PyMethodDef certificate_kernels[];
-extern PyMethodDef deformation_kernels[];
-extern PyMethodDef loops_kernels[];
-extern PyMethodDef mixtures_kernels[];
-extern PyMethodDef newton_system_kernels[];
-extern PyMethodDef pattern_kernels[];
-extern PyMethodDef reference_kernels[];
-extern PyMethodDef topology_kernels[];
+#define FILES(with) \
+    with(certificate) \
+    with(deformation) \
+    with(field) \
+    with(guard) \
+    with(laplacian) \
+    with(loops) \
+    with(mixtures) \
+    with(nested_grid) \
+    with(newton_system) \
+    with(pattern) \
+    with(placing) \
+    with(reference) \
+    with(topology) \
+    with(vector_adam)
+
+#define DECLARED(file) extern PyMethodDef file##_kernels[];
+#define LISTED(file) file##_kernels,
+
+FILES(DECLARED)
 
 static int fill(PyObject *module)
 {
-    PyMethodDef *const tables[] = {
-        certificate_kernels,
-        deformation_kernels,
-        loops_kernels,
-        mixtures_kernels,
-        newton_system_kernels,
-        pattern_kernels,
-        reference_kernels,
-        topology_kernels,
-    };
+    PyMethodDef *const tables[] = {FILES(LISTED)};
     for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
         if (PyModule_AddFunctions(module, tables[i]) < 0)
             return -1;

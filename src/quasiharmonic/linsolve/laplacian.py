@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve import make_solver, takes_order
 from quasiharmonic.linsolve.pattern import stiffness_pattern
 from quasiharmonic.mesh.dissection import nested_dissection
@@ -56,8 +57,6 @@ class Laplacian:
         linear_solver: str = "auto",
         points: FloatArray | None = None,
     ) -> None:
-        from scipy.sparse import csr_array
-
         self.n = n
         is_free = np.ones(n, dtype=bool)
         is_free[fixed] = False
@@ -72,11 +71,6 @@ class Laplacian:
         if order is not None:
             self.free = self.free[order]
         self._pattern = pattern = stiffness_pattern(F, self._place(), self.free.size)
-        self._diagonal = pattern.indptr[:-1]
-        self._above = np.arange(pattern.row.size) + pattern.row + 1
-        # The fastest gather at hand; reduceat takes twice as long.
-        ones = np.ones(pattern.halves.size)
-        self._sum = csr_array((ones, pattern.halves, pattern.offsets), shape=(pattern.row.size, F.size))
         self._values = np.empty(pattern.indices.size)
         self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver, ordered=order is not None)
         # Whose the one factor is may be asked only while nobody can overwrite it before the solve.
@@ -125,29 +119,28 @@ class Laplacian:
     def _refactor(self, operator: FactoredLaplacian) -> None:
         """Make the solver's one factor that of an operator; with the lock held."""
         self._factored = None
-        stiffness, size = operator.stiffness, self.free.size
-        above = self._sum @ stiffness
-        # Rows of Gᵀ A G sum to zero, so each half-edge is taken off the diagonal at both of its ends.
-        # Where no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
-        diagonal = np.bincount(self._pattern.row, above, size).astype(np.float64, copy=False)
-        diagonal += np.bincount(self._pattern.column, above, size)
-        diagonal += np.bincount(self._pattern.border_row, stiffness[self._pattern.border], size)
-        self._values[self._diagonal] = -diagonal
-        self._values[self._above] = above
+        of = self._pattern
+        assemble(
+            operator.stiffness,
+            of.indptr,
+            of.row,
+            of.column,
+            of.halves,
+            of.offsets,
+            of.border,
+            of.border_row,
+            self._values,
+        )
         self.solver.factor(self._values)
         self._factored = operator
 
-    def _solve(self, operator: FactoredLaplacian, load: ComplexArray) -> ComplexArray:
-        """One solve for both coordinates with an operator's factor; (n - k,) complex128."""
-        rhs = np.empty((load.size, 2), order="F")
-        rhs[:, 0], rhs[:, 1] = load.real, load.imag
+    def _solve(self, operator: FactoredLaplacian, load: FloatArray, out: ComplexArray) -> None:
+        """One solve for both coordinates (2, n - k) with an operator's factor, into the free vertices of a map."""
         with self._lock:
             if self._factored is not operator:
                 self._refactor(operator)
-            solution = self.solver.solve(rhs)
-        out = np.empty(load.size, dtype=np.complex128)
-        out.real, out.imag = solution[:, 0], solution[:, 1]
-        return out
+            solution = self.solver.solve(load.T)
+        put_at(np.ascontiguousarray(solution.T), self.free, out)
 
 
 class FactoredLaplacian:
@@ -180,12 +173,10 @@ class FactoredLaplacian:
         (n,) complex128
             Equal to ``w`` at the fixed vertices, to the last bit.
         """
-        of, pattern = self.pattern, self.pattern._pattern
-        pull = -self.stiffness[pattern.border] * w[pattern.border_fixed]
-        load = np.zeros(of.free.size, dtype=np.complex128)
-        np.add.at(load, pattern.border_row, pull)
-        out = w.copy()
-        out[of.free] = of._solve(self, load)
+        of, pattern, out = self.pattern, self.pattern._pattern, w.copy()
+        load = np.empty((2, of.free.size))
+        boundary_load(self.stiffness, pattern.border, pattern.border_row, pattern.border_fixed, w, load)
+        of._solve(self, load, out)
         return out
 
     def respond(self, load: ComplexArray) -> ComplexArray:
@@ -199,9 +190,9 @@ class FactoredLaplacian:
         -------
         (n,) complex128
         """
-        of = self.pattern
-        out = np.zeros(load.shape, dtype=np.complex128)
-        out[of.free] = of._solve(self, load[of.free])
+        of, out = self.pattern, np.zeros(load.shape, dtype=np.complex128)
+        given = load[of.free]
+        of._solve(self, np.stack([given.real, given.imag]), out)
         return out
 
     def flux(self, w: ComplexArray) -> ComplexArray:
@@ -224,3 +215,47 @@ class FactoredLaplacian:
         np.subtract.at(out, head, pull)
         out[of.free] = 0
         return out
+
+
+@compiled
+def assemble(
+    stiffness: FloatArray,
+    indptr: NDArray[np.int32],
+    row: IntArray,
+    column: IntArray,
+    halves: NDArray[np.int32],
+    offsets: NDArray[np.int32],
+    border: IntArray,
+    border_row: IntArray,
+    values: FloatArray,
+) -> None:
+    """Fill in the values of the upper triangle from the half-edges' stiffness (3 f,), by a `StiffnessPattern`."""
+    above, size = np.add.reduceat(stiffness[halves], offsets[:-1]), indptr.size - 1
+    # Rows of Gᵀ A G sum to zero, so each half-edge is taken off the diagonal at both of its ends.
+    # Where no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
+    on = np.bincount(row, above, size).astype(np.float64, copy=False)
+    on += np.bincount(column, above, size)
+    on += np.bincount(border_row, stiffness[border], size)
+    values[indptr[:-1]] = -on
+    values[np.arange(row.size) + row + 1] = above
+
+
+@compiled
+def boundary_load(
+    stiffness: FloatArray,
+    border: IntArray,
+    border_row: IntArray,
+    border_fixed: IntArray,
+    w: ComplexArray,
+    load: FloatArray,
+) -> None:
+    """Fill in both coordinates of the right-hand side (2, n - k), which half-edges to fixed vertices make."""
+    pull = -stiffness[border] * w[border_fixed]
+    for coordinate, some in zip(load, (pull.real, pull.imag), strict=True):
+        coordinate[:] = np.bincount(border_row, some, load.shape[1])
+
+
+@compiled
+def put_at(solution: FloatArray, free: IntArray, out: ComplexArray) -> None:
+    """Put both coordinates (2, k) in their places in a map."""
+    out.real[free], out.imag[free] = solution

@@ -108,6 +108,10 @@ class ReferenceMesh:
     gamma : (3, f) complex128
         Gradients of the hat functions. For equilateral triangles these arrays are one number seen
         f times (stride 0), which keeps them out of memory.
+    half_gamma : (2, f) complex128
+        Half of those of the last two corners; the three sum to zero.
+    stiffness_by_entry : (9, f) float64
+        How the stiffness of each edge depends on a11, a12, a22 of the tensor, edge after edge.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, kind: Reference) -> None:
@@ -126,19 +130,19 @@ class ReferenceMesh:
         gamma = 1j * opposite / (2 * m)
         self.m: FloatArray = np.broadcast_to(m, (f,))
         self.gamma: ComplexArray = np.broadcast_to(gamma, (3, f))
-        self._half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
+        self.half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
         # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22):
         # m ∇hᵢᵀ 𝒜 ∇hⱼ. It has no scale, so tiny and huge triangles are on a par.
         gx, gy = (1j * opposite).real, (1j * opposite).imag
         gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
         per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
-        self._edge_stiffness = np.broadcast_to(per_entry, (3, 3, f))
+        self.stiffness_by_entry: FloatArray = np.broadcast_to(per_entry.reshape(9, -1), (9, f))
 
     def __getitem__(self, part: slice) -> ReferenceMesh:
         """Some of the triangles, among the same vertices."""
         some = copy(self)
         some.F, some.m, some.gamma = self.F[part], self.m[part], self.gamma[:, part]
-        some._half_gamma, some._edge_stiffness = self._half_gamma[:, part], self._edge_stiffness[:, :, part]
+        some.half_gamma, some.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
         return some
 
     def edge_stiffness(self, a: FloatArray) -> FloatArray:
@@ -154,7 +158,7 @@ class ReferenceMesh:
         (3, f) float64
             For the edges (0,1), (1,2), (2,0) of each triangle.
         """
-        return np.einsum("eaf,af->ef", self._edge_stiffness, a)
+        return np.einsum("eaf,af->ef", self.stiffness_by_entry.reshape(3, 3, -1), a)
 
     def derivatives(self, w: ComplexArray) -> Derivatives:
         """Differentiate a complex map on every triangle.
@@ -170,7 +174,7 @@ class ReferenceMesh:
         """
         f = len(self.F)
         p, q, area = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
-        wirtinger(w, self.F, self._half_gamma, p, q, area)
+        wirtinger(w, self.F, self.half_gamma, p, q, area)
         return Derivatives(p, q, area)
 
 

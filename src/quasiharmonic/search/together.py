@@ -22,6 +22,7 @@ from quasiharmonic.descent import VectorAdam
 from quasiharmonic.descent.placing import Tries, placed_each
 from quasiharmonic.exact.side_by_side import certify_each
 from quasiharmonic.field.functionals import beltrami_terms
+from quasiharmonic.field.passes import clip_moduli, stiffness_of, sweep
 from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
@@ -150,27 +151,16 @@ class _SideBySide:
 
     def evaluate(self, xi: ComplexArray) -> _Maps:
         """As `Objective.evaluate` and what an `Iterate` computes."""
-        stiffness, gradient = np.empty((3, xi.size)), np.empty_like(xi)
-        for part in blocks(xi.size):
-            tensors = self._parameterisation.field(xi[part]).entries()
-            stiffness[:, part] = self._mesh[part].edge_stiffness(tensors)
+        stiffness = stiffness_of(self._mesh, self._parameterisation, xi)
         w = self.laplacian.factor(stiffness).extend(self._boundary)
         if not np.isfinite(w.view(np.float64)).all():
             raise NotPositiveDefinite("the solution is not finite")
-        density, area = np.empty(xi.size), np.empty(xi.size)
-        for part in blocks(xi.size):
-            mesh, tensor_field = self._mesh[part], self._parameterisation.field(xi[part])
-            dw = mesh.derivatives(w)
-            area[part] = dw.area
-            density[part], in_mu = beltrami_terms(mesh, tensor_field, dw)
-            gradient[part] = tensor_field.pull(in_mu)
-        # Areas that are not numbers are not positive either.
-        flipped = np.add.reduceat(~(area > 0), self.triangles[:-1], dtype=np.int64)
-        covered = np.add.reduceat(area, self.triangles[:-1])
-        covered = np.where(covered > 0, covered, np.add.reduceat(np.abs(area), self.triangles[:-1]))
+        sums, gradient = sweep(self._mesh, self._parameterisation, xi, w, self.triangles)
+        flipped, dirichlet, area, unsigned = sums.T
+        covered = np.where(area > 0, area, unsigned)
         with np.errstate(divide="ignore", invalid="ignore"):
-            energy = np.where(covered > 0, 2 * np.add.reduceat(density, self.triangles[:-1]) / covered, np.inf)
-        return _Maps(w, gradient, flipped, energy)
+            energy = np.where(covered > 0, dirichlet / covered, np.inf)
+        return _Maps(w, gradient, flipped.astype(np.int64), energy)
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
         """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
@@ -194,7 +184,7 @@ class _SideBySide:
             dw = mesh[part].derivatives(moved)
             field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
             mu[part], area[part] = field.mu, dw.area
-            density[part] = beltrami_terms(mesh[part], field, dw)[0]
+            density[part] = beltrami_terms(mesh.m[part], field, dw.p, dw.q)[0]
         energy = 2 * np.add.reduceat(density, starts) / np.add.reduceat(area, starts)
         noting = [self.members[some[k]] for k in good.tolist()]
         for member, k, tensors, value in zip(noting, good, np.split(mu, starts[1:]), energy.tolist(), strict=True):
@@ -203,10 +193,7 @@ class _SideBySide:
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
         """ξ with moduli clipped, in place, to where the rounded tensor is still positive definite."""
-        bound = self._parameterisation.bound
-        square = xi.real**2 + xi.imag**2
-        far = np.flatnonzero(square > bound**2)
-        xi[far] *= bound / np.sqrt(square[far])
+        clip_moduli(xi, self._parameterisation.bound)
         return xi
 
     def vertices_of(self, k: int) -> slice:
