@@ -253,3 +253,14 @@ def _(rng):
     form = *rng.normal(size=(2, f)), *numbers(rng, 4, f)
     slots = rng.integers(size - 1, size=(2, 2, 3, f)).astype(np.int32)
     return *form, gradients(rng, f), slots, rng.choice([-1.0, 1.0], (3, f)), rng.normal(size=size)
+for _indptr, _indices in (
+    ([0, 2, 4, 5], [0, 2, 1, 2, 2]),
+    ([0, 1, 1], [0]),
+    ([0, 1, 2], [0, 0]),
+    ([0, 3, 4, 5], [0, 2, 1, 1, 2]),
+    ([0, 2, 3], [0, 2, 1]),
+    ([0], []),
+):
+    arguments_of("wrong_pattern")(
+        lambda _, one=_indptr, other=_indices: (np.array(one, dtype=np.int32), np.array(other, dtype=np.int32))
+    )
