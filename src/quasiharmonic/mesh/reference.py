@@ -48,12 +48,19 @@ def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, Comp
     """
     # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
     exponent = int(np.frexp(np.max(np.abs(V)))[1])
-    coordinates = np.ldexp(V.T, -exponent, order="C")
     z1, z2 = np.empty(len(F)), np.empty(len(F), dtype=np.complex128)
+    lay_flat(V, np.ascontiguousarray(F, dtype=np.int64), exponent, z1, z2)
+    return z1, z2
+
+
+@compiled
+def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: ComplexArray) -> None:
+    """Fill in `rest_frames` (f,), computed in units of 2^exponent."""
+    coordinates = np.ldexp(V.T, -exponent, order="C")
     for part in blocks(len(F)):
         z1[part], z2.real[part], z2.imag[part] = _laid_flat(coordinates, F[part])
-    z1, z2 = np.ldexp(z1, exponent, out=z1), z2.view(np.float64)
-    return z1, np.ldexp(z2, exponent, out=z2).view(np.complex128)
+    np.ldexp(z1, exponent, out=z1)
+    np.ldexp(z2.view(np.float64), exponent, out=z2.view(np.float64))
 
 
 def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
