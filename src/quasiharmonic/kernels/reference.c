@@ -46,7 +46,7 @@ static double dot(const double *a, const double *b, Py_ssize_t dimension)
     return sum;
 }
 
-/* (V, F, exponent, z1, z2): triangles laid into the plane, computed in units of 2^exponent. */
+/* (V, F, exponent, z1, z2): triangles laid into the plane, computed in units of 2^exponent; how many have no area. */
 static PyObject *lay_flat(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -58,6 +58,7 @@ static PyObject *lay_flat(PyObject *module, PyObject *const *given, Py_ssize_t c
     double *z1 = a[3].data, *z2 = a[4].data;
     const Py_ssize_t f = a[3].size, dimension = a[0].columns, row = a[0].row_stride, step = a[0].stride;
     const Power into = power_of_two(-a[2].integer), back = power_of_two(a[2].integer);
+    Py_ssize_t flat = 0;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < f; j++) {
         double corner[3][3], one[3] = {0}, other[3] = {0};
@@ -80,9 +81,10 @@ static PyObject *lay_flat(PyObject *module, PyObject *const *given, Py_ssize_t c
         z1[j] = length * back.most * back.rest;
         z2[2 * j] = along / by * back.most * back.rest;
         z2[2 * j + 1] = across / by * back.most * back.rest;
+        flat += z1[j] == 0 || z2[2 * j + 1] == 0;
     }
     Py_END_ALLOW_THREADS
-    return done(a, LENGTH(a));
+    return done_with_integer(a, LENGTH(a), flat);
 }
 
 PyMethodDef reference_kernels[] = {KERNEL(lay_flat), KERNEL(wirtinger), END_OF_KERNELS};

@@ -13,6 +13,7 @@ of its own: vertex 0 at the origin and vertex 1 on the positive x axis, written 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from copy import copy
 from typing import Literal, NamedTuple
@@ -46,21 +47,32 @@ def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, Comp
     z2 : (f,) complex128
         Vertex 2. Its imaginary part is signed for planar meshes and not negative for curved ones.
     """
+    return _frames(V, F)[:2]
+
+
+def flat_triangles(V: FloatArray, F: NDArray[np.integer]) -> IntArray:
+    """Ascending indices (k,) of the triangles of a mesh that have no area, as `rest_frames` computes it."""
+    z1, z2, flat = _frames(V, F)
+    return np.flatnonzero((z1 == 0) | (z2.imag == 0)) if flat else np.empty(0, dtype=np.int64)
+
+
+def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray, int]:
+    """As `rest_frames`, and how many triangles have no area."""
     # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
-    exponent = int(np.frexp(np.max(np.abs(V)))[1])
+    exponent = math.frexp(max(V.max(initial=0), -V.min(initial=0)))[1]
     z1, z2 = np.empty(len(F)), np.empty(len(F), dtype=np.complex128)
-    lay_flat(V, np.ascontiguousarray(F, dtype=np.int64), exponent, z1, z2)
-    return z1, z2
+    return z1, z2, lay_flat(V, np.ascontiguousarray(F, dtype=np.int64), exponent, z1, z2)
 
 
 @compiled
-def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: ComplexArray) -> None:
-    """Fill in `rest_frames` (f,), computed in units of 2^exponent."""
+def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: ComplexArray) -> int:
+    """Fill in `rest_frames` (f,), computed in units of 2^exponent; how many triangles have no area."""
     coordinates = np.ldexp(V.T, -exponent, order="C")
     for part in blocks(len(F)):
         z1[part], z2.real[part], z2.imag[part] = _laid_flat(coordinates, F[part])
     np.ldexp(z1, exponent, out=z1)
     np.ldexp(z2.view(np.float64), exponent, out=z2.view(np.float64))
+    return int(np.count_nonzero((z1 == 0) | (z2.imag == 0)))
 
 
 def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
