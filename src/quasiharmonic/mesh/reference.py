@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from copy import copy
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -134,23 +135,16 @@ class ReferenceMesh:
         self.F = F
         self.n = len(V)
         if kind == "equilateral":
-            z1, z2 = np.ones(1), np.array([0.5 + np.sqrt(0.75) * 1j])
+            m, gamma, per_entry = _equilateral()
         else:
             z1, z2 = rest_frames(V, F)
             if kind == "corrected":
                 z1, z2 = _corrected(z1, z2)
-        opposite = np.stack([z2 - z1, -z2, z1 + 0j])
+            m, gamma, per_entry = _tables(z1, z2)
         f = len(F)
-        m = 0.5 * z1 * z2.imag
-        gamma = 1j * opposite / (2 * m)
         self.m: FloatArray = np.broadcast_to(m, (f,))
         self.gamma: ComplexArray = np.broadcast_to(gamma, (3, f))
         self._half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
-        # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22):
-        # m ∇hᵢᵀ 𝒜 ∇hⱼ. It has no scale, so tiny and huge triangles are on a par.
-        gx, gy = (1j * opposite).real, (1j * opposite).imag
-        gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
-        per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
         self._edge_stiffness = np.broadcast_to(per_entry, (3, 3, f))
 
     def __getitem__(self, part: slice) -> ReferenceMesh:
@@ -223,6 +217,23 @@ class Derivatives(NamedTuple):
     p: ComplexArray
     q: ComplexArray
     area: FloatArray
+
+
+@cache
+def _equilateral() -> tuple[FloatArray, ComplexArray, FloatArray]:
+    return _tables(np.ones(1), np.array([0.5 + np.sqrt(0.75) * 1j]))
+
+
+def _tables(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """Areas (f,), gradients of the hat functions (3, f), and stiffness of edges by the tensor's entries (3, 3, f)."""
+    opposite = np.stack([z2 - z1, -z2, z1 + 0j])
+    m = 0.5 * z1 * z2.imag
+    # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22): m ∇hᵢᵀ 𝒜 ∇hⱼ. It has
+    # no scale, so tiny and huge triangles are on a par.
+    gx, gy = (1j * opposite).real, (1j * opposite).imag
+    gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
+    per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
+    return m, 1j * opposite / (2 * m), per_entry
 
 
 def _corrected(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray]:
