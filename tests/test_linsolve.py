@@ -507,6 +507,7 @@ def test_ten_thousand_factorisations_and_a_thousand_analyses_take_no_memory(name
         ([0, 3, 4, 5], [0, 2, 1, 1, 2], "ascending within each row"),
         ([0, 2, 3], [0, 0, 1], "ascending within each row"),
         ([0, 2, 3], [0, 5, 1], "smaller than the number of rows"),
+        ([0, 2, 3], [0, 2**32 + 1, 1], "smaller than the number of rows"),
     ],
 )
 def test_malformed_patterns(indptr, indices, message):

@@ -456,3 +456,29 @@ def _(rng):
 @arguments_of("divide_cells")
 def _(rng):
     return divided_cells(rng, 0, 1, 0)
+for _indptr, _indices in (
+    ([0, 2, 4, 5], [0, 2, 1, 2, 2]),
+    ([0, 1, 1], [0]),
+    ([0, 1, 2], [0, 0]),
+    ([0, 3, 4, 5], [0, 2, 1, 1, 2]),
+    ([0, 2, 3], [0, 2, 1]),
+    ([0], []),
+):
+    arguments_of("wrong_pattern")(
+        lambda _, one=_indptr, other=_indices: (np.array(one, dtype=np.int32), np.array(other, dtype=np.int32))
+    )
+
+
+@arguments_of("lay_flat")
+def _(rng):
+    """Triangles in space, some of them without area, some with corners that coincide."""
+    V = rng.integers(-3, 4, (30, 3)) / 10
+    return V, soup(rng, 30, 200), -1, np.empty(200), np.empty(200, dtype=np.complex128)
+
+
+@arguments_of("lay_flat")
+def _(rng):
+    """In the plane, every other vertex of an array, near the largest doubles and among the smallest."""
+    exponent = (1024, -1070)[rng.integers(2)]
+    V = np.ldexp(rng.uniform(-0.5, 0.5, (60, 2)), exponent)[::2]
+    return V, soup(rng, 30, 200), exponent, np.empty(200), np.empty(200, dtype=np.complex128)

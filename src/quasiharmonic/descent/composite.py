@@ -101,8 +101,7 @@ def composite_map(objective: Objective) -> ComplexArray | None:
     if len(problem.domain.loops) != 1 or problem.domain.pins.size:
         return None
     loop = problem.domain.loops[0]
-    w = np.zeros(problem.n, dtype=np.complex128)
-    w[problem.fixed] = problem.frame.inward(problem.target)
+    w = problem.held.copy()
     outline = w[loop]
     F = polygon_triangles(outline)
     if F is None:

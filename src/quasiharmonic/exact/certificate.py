@@ -215,7 +215,7 @@ def certify(
     """
     true_or_false("boundary", boundary)
     F, uv = _taken(F, uv)
-    sign, nonfinite = _signs(F, uv)
+    sign, nonfinite = triangle_signs(F, uv)
     flipped = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []
     if not len(F):
@@ -278,7 +278,7 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
         When shapes are wrong or an index is out of range, as in `certify`.
     """
     F, uv = _taken(F, uv)
-    return len(F) > 0 and bool(_signs(F, uv)[0].min() > 0)
+    return len(F) > 0 and bool(triangle_signs(F, uv)[0].min() > 0)
 
 
 def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
@@ -301,7 +301,7 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
     ValueError
         When shapes are wrong or an index is out of range, as in `certify`.
     """
-    return np.flatnonzero(_signs(*_taken(F, uv))[0] <= 0)
+    return np.flatnonzero(triangle_signs(*_taken(F, uv))[0] <= 0)
 
 
 def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
@@ -319,8 +319,21 @@ def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     return triangles, places
 
 
-def _signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
-    """Orientation of every triangle, (f,), and the indices of those with a NaN or infinite coordinate."""
+def triangle_signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
+    """Decide the orientations of triangles (f, 3) int64 among places (n, 2) float64, both contiguous, exactly.
+
+    Returns
+    -------
+    sign : (f,) int8
+        1 for counterclockwise, -1 for clockwise, 0 for no area or a coordinate that is NaN or infinite.
+    nonfinite : (m,) int64
+        Ascending indices of the triangles with such a coordinate.
+
+    Raises
+    ------
+    ValueError
+        When ``F`` names vertices that are not there.
+    """
     sign, nonfinite = np.empty(len(F), dtype=np.int8), np.empty(0, dtype=np.int64)
     number = sure_signs(F, uv, sign)
     if number < 0:

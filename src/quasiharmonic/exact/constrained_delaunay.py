@@ -21,7 +21,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.exact.certificate import is_injective
+from quasiharmonic.exact.certificate import triangle_signs
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.mesh.topology import edge_keys, edges
 
@@ -93,7 +93,7 @@ def by_qhull(points: FloatArray) -> IntArray:
         F: IntArray = Delaunay(points - points.mean(axis=0)).simplices.astype(np.int64)
     except QhullError:
         return np.empty((0, 3), dtype=np.int64)
-    sign = orientation(*(points[F[:, k]] for k in range(3)))
+    sign, _ = triangle_signs(F, np.ascontiguousarray(points, dtype=np.float64))
     # What has no area lies on the hull, between points on a line.
     F, sign = F[sign != 0], sign[sign != 0]
     F[sign < 0] = F[sign < 0, ::-1]
@@ -101,15 +101,15 @@ def by_qhull(points: FloatArray) -> IntArray:
 
 
 def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
-    """Whether triangles cover a polygon once, using all points: they are positive, and it is their boundary."""
-    if not len(F) or len(np.unique(F)) < len(points):
+    """Whether positive triangles cover a polygon once, using all points: it is their boundary."""
+    if not len(F) or not np.bincount(F.ravel(), minlength=len(points)).all():
         return False
     found = edges(F, len(points))
     if found.nonmanifold.size or found.inconsistent.size or len(found.boundary) != len(hull):
         return False
     around = edge_keys(hull, np.roll(hull, -1), len(points))
     there = edge_keys(found.boundary[:, 0], found.boundary[:, 1], len(points))
-    return bool(np.array_equal(np.sort(around), np.sort(there))) and is_injective(F, points)
+    return bool(np.array_equal(np.sort(around), np.sort(there)))
 
 
 class Triangulation:

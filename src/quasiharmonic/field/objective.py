@@ -53,8 +53,6 @@ class Objective:
         self.parameterisation = PARAMETERISATIONS[parameterisation]
         self.laplacian = problem.domain.laplacian(linear_solver)
         self.functional: Functional = FUNCTIONALS[functional](problem, self.mesh)
-        self._boundary = np.zeros(problem.n, dtype=np.complex128)
-        self._boundary[problem.fixed] = problem.frame.inward(problem.target)
 
     def descending(self, functional: Functional) -> Objective:
         """The same with another functional, made for this problem and this mesh."""
@@ -76,7 +74,7 @@ class Objective:
         """
         field = self.parameterisation.field(xi)
         operator = self.operator(field)
-        w = operator.extend(self._boundary)
+        w = operator.extend(self.problem.held)
         if not np.isfinite(w.view(np.float64)).all():
             raise NotPositiveDefinite("the solution is not finite")
         return Iterate(self, field, w, operator)

@@ -1,4 +1,4 @@
-/* What `linsolve/pattern.py` has compiled. */
+/* What `linsolve/pattern.py` has compiled, and the check of patterns in `linsolve/base.py`. */
 #include "arguments.h"
 
 #include <stdlib.h>
@@ -131,4 +131,39 @@ static PyObject *find_pattern(PyObject *module, PyObject *const *given, Py_ssize
     return done(a, LENGTH(a));
 }
 
-PyMethodDef pattern_kernels[] = {KERNEL(find_pattern), END_OF_KERNELS};
+enum { RIGHT, EMPTY_ROW, NO_DIAGONAL, NOT_ASCENDING };
+
+static int wrong(const int32_t *indptr, const int32_t *indices, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        if (indptr[i + 1] <= indptr[i])
+            return EMPTY_ROW;
+    for (Py_ssize_t i = 0; i < n; i++)
+        if (indices[indptr[i]] != i)
+            return NO_DIAGONAL;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        for (int32_t k = indptr[i] + 1; k < indptr[i + 1]; k++)
+            if (indices[k] <= indices[k - 1])
+                return NOT_ASCENDING;
+        if (indices[indptr[i + 1] - 1] >= n)
+            return NOT_ASCENDING;
+    }
+    return RIGHT;
+}
+
+/* (indptr, indices): what is wrong with an upper triangle's rows, which are known to begin with 0 and to end with the
+ * number of entries. */
+static PyObject *wrong_pattern(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[2];
+    if (!take("wrong_pattern", given, count, "ii", a))
+        return NULL;
+    int found;
+    Py_BEGIN_ALLOW_THREADS
+    found = wrong(a[0].data, a[1].data, a[0].size - 1);
+    Py_END_ALLOW_THREADS
+    return done_with_integer(a, LENGTH(a), found);
+}
+
+PyMethodDef pattern_kernels[] = {KERNEL(find_pattern), KERNEL(wrong_pattern), END_OF_KERNELS};

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import import_module
 
 import numpy as np
@@ -34,6 +35,7 @@ BACKENDS = {
 QDLDL_UP_TO = 60_000
 
 
+@cache
 def _backend(name: str) -> type[LinearSolver]:
     module, attribute = BACKENDS[name]
     backend: type[LinearSolver] = getattr(import_module(f".{module}", __name__), attribute)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.arrays import FloatArray
 from quasiharmonic.hearing import still_at_it
+from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.linsolve.guard import ResidualTest
 
@@ -207,14 +208,32 @@ def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pa
     if columns.size > np.iinfo(np.int32).max:
         raise ValueError(f"the matrix has {columns.size} entries; at most 2^31 - 1 are supported")
     n = starts.size - 1
-    lengths = np.diff(starts)
-    if n and lengths.min() < 1:
-        raise ValueError(f"row {int(np.argmin(lengths))} has no entries; every row needs its diagonal entry")
-    off = np.flatnonzero(columns[starts[:-1]] != np.arange(n))
-    if off.size:
-        raise ValueError(f"row {int(off[0])} does not start with its diagonal entry")
-    ascending = columns[1:] > columns[:-1]
-    ascending[starts[1:-1] - 1] = True
-    if not ascending.all() or (n and columns.max() >= n):
+    if columns.dtype != np.int32:
+        # What 32 bits do not hold is out of range, and stays so.
+        columns = np.clip(columns, -1, n).astype(np.int32)
+    pattern = np.array(starts, dtype=np.int32), np.array(columns)
+    wrong = wrong_pattern(*pattern)
+    if wrong == _EMPTY_ROW:
+        raise ValueError(f"row {int(np.argmin(np.diff(starts)))} has no entries; every row needs its diagonal entry")
+    if wrong == _NO_DIAGONAL:
+        row = np.flatnonzero(columns[starts[:-1]] != np.arange(n))[0]
+        raise ValueError(f"row {row} does not start with its diagonal entry")
+    if wrong == _NOT_ASCENDING:
         raise ValueError("column indices must be ascending within each row and smaller than the number of rows")
-    return starts.astype(np.int32), columns.astype(np.int32)
+    return pattern
+
+
+_RIGHT, _EMPTY_ROW, _NO_DIAGONAL, _NOT_ASCENDING = range(4)
+
+
+@compiled
+def wrong_pattern(indptr: Pattern, indices: Pattern) -> int:
+    """What is wrong with the rows of an upper triangle, from 0 to all of the entries: one of the numbers above."""
+    n = indptr.size - 1
+    if n and np.diff(indptr).min() < 1:
+        return _EMPTY_ROW
+    if not np.array_equal(indices[indptr[:-1]], np.arange(n)):
+        return _NO_DIAGONAL
+    ascending = indices[1:] > indices[:-1]
+    ascending[indptr[1:-1] - 1] = True
+    return _RIGHT if ascending.all() and indices.max(initial=-1) < n else _NOT_ASCENDING

@@ -13,8 +13,10 @@ of its own: vertex 0 at the origin and vertex 1 on the positive x axis, written 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from copy import copy
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -46,14 +48,32 @@ def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, Comp
     z2 : (f,) complex128
         Vertex 2. Its imaginary part is signed for planar meshes and not negative for curved ones.
     """
+    return _frames(V, F)[:2]
+
+
+def flat_triangles(V: FloatArray, F: NDArray[np.integer]) -> IntArray:
+    """Ascending indices (k,) of the triangles of a mesh that have no area, as `rest_frames` computes it."""
+    z1, z2, flat = _frames(V, F)
+    return np.flatnonzero((z1 == 0) | (z2.imag == 0)) if flat else np.empty(0, dtype=np.int64)
+
+
+def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray, int]:
+    """As `rest_frames`, and how many triangles have no area."""
     # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
-    exponent = int(np.frexp(np.max(np.abs(V)))[1])
-    coordinates = np.ldexp(V.T, -exponent, order="C")
+    exponent = math.frexp(max(V.max(initial=0), -V.min(initial=0)))[1]
     z1, z2 = np.empty(len(F)), np.empty(len(F), dtype=np.complex128)
+    return z1, z2, lay_flat(V, np.ascontiguousarray(F, dtype=np.int64), exponent, z1, z2)
+
+
+@compiled
+def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: ComplexArray) -> int:
+    """Fill in `rest_frames` (f,), computed in units of 2^exponent; how many triangles have no area."""
+    coordinates = np.ldexp(V.T, -exponent, order="C")
     for part in blocks(len(F)):
         z1[part], z2.real[part], z2.imag[part] = _laid_flat(coordinates, F[part])
-    z1, z2 = np.ldexp(z1, exponent, out=z1), z2.view(np.float64)
-    return z1, np.ldexp(z2, exponent, out=z2).view(np.complex128)
+    np.ldexp(z1, exponent, out=z1)
+    np.ldexp(z2.view(np.float64), exponent, out=z2.view(np.float64))
+    return int(np.count_nonzero((z1 == 0) | (z2.imag == 0)))
 
 
 def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -119,23 +139,16 @@ class ReferenceMesh:
         self.F = F
         self.n = len(V)
         if kind == "equilateral":
-            z1, z2 = np.ones(1), np.array([0.5 + np.sqrt(0.75) * 1j])
+            m, gamma, per_entry = _equilateral()
         else:
             z1, z2 = rest_frames(V, F)
             if kind == "corrected":
                 z1, z2 = _corrected(z1, z2)
-        opposite = np.stack([z2 - z1, -z2, z1 + 0j])
+            m, gamma, per_entry = _tables(z1, z2)
         f = len(F)
-        m = 0.5 * z1 * z2.imag
-        gamma = 1j * opposite / (2 * m)
         self.m: FloatArray = np.broadcast_to(m, (f,))
         self.gamma: ComplexArray = np.broadcast_to(gamma, (3, f))
         self.half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
-        # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22):
-        # m ∇hᵢᵀ 𝒜 ∇hⱼ. It has no scale, so tiny and huge triangles are on a par.
-        gx, gy = (1j * opposite).real, (1j * opposite).imag
-        gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
-        per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
         self.stiffness_by_entry: FloatArray = np.broadcast_to(per_entry.reshape(9, -1), (9, f))
 
     def __getitem__(self, part: slice) -> ReferenceMesh:
@@ -208,6 +221,23 @@ class Derivatives(NamedTuple):
     p: ComplexArray
     q: ComplexArray
     area: FloatArray
+
+
+@cache
+def _equilateral() -> tuple[FloatArray, ComplexArray, FloatArray]:
+    return _tables(np.ones(1), np.array([0.5 + np.sqrt(0.75) * 1j]))
+
+
+def _tables(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """Areas (f,), gradients of the hat functions (3, f), and stiffness of edges by the tensor's entries (3, 3, f)."""
+    opposite = np.stack([z2 - z1, -z2, z1 + 0j])
+    m = 0.5 * z1 * z2.imag
+    # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22): m ∇hᵢᵀ 𝒜 ∇hⱼ. It has
+    # no scale, so tiny and huge triangles are on a par.
+    gx, gy = (1j * opposite).real, (1j * opposite).imag
+    gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
+    per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
+    return m, 1j * opposite / (2 * m), per_entry
 
 
 def _corrected(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray]:

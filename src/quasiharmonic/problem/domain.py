@@ -20,7 +20,7 @@ from quasiharmonic.arrays import (
     vertex_array,
 )
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.reference import Reference, ReferenceMesh, rest_frames
+from quasiharmonic.mesh.reference import Reference, ReferenceMesh, flat_triangles
 from quasiharmonic.mesh.surface import surface_edges
 from quasiharmonic.mesh.topology import trace_loops
 
@@ -128,8 +128,7 @@ class Domain(ReadOnly):
 
     def check_areas(self) -> None:
         """Raise a ValueError that names triangles without area at rest, for methods that look at their shapes."""
-        z1, z2 = rest_frames(self.V, self.F)
-        flat = np.flatnonzero((z1 == 0) | (z2.imag == 0))
+        flat = flat_triangles(self.V, self.F)
         if flat.size:
             raise ValueError(
                 f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh; "
@@ -179,6 +178,8 @@ class Domain(ReadOnly):
         functionals have no scale.
         """
         if kind not in self._meshes:
-            exponent = int(np.frexp(np.max(np.abs(self.V)))[1])
-            self._meshes[kind] = ReferenceMesh(np.ldexp(self.V, -exponent), self.F, kind)
+            V = self.V
+            if kind != "equilateral":
+                V = np.ldexp(V, -int(np.frexp(np.max(np.abs(V)))[1]))
+            self._meshes[kind] = ReferenceMesh(V, self.F, kind)
         return self._meshes[kind]

@@ -218,13 +218,21 @@ class Problem(ReadOnly, Shown):
         return uv
 
     @cached_property
+    def held(self) -> ComplexArray:
+        """The fixed vertices' places in the frame, zero elsewhere (n,) complex128; not to be written to."""
+        w = np.zeros(self.n, dtype=np.complex128)
+        w[self.fixed] = self.frame.inward(self.target)
+        return w
+
+    @cached_property
     def encloses_area(self) -> bool:
         """Whether the target's boundary may enclose a positive area, as the triangles of an injective map add up to.
 
         False only where it certainly does not: all positions are equal, or the boundary is wound the wrong way.
         """
-        w = np.zeros(self.n, dtype=np.complex128)
-        w[self.fixed] = self.frame.inward(self.target)
-        area = sum(0.5 * float((w[loop].conj() * np.roll(w[loop], -1)).imag.sum()) for loop in self.domain.loops)
+        area = 0.0
+        for loop in self.domain.loops:
+            x, y = self.held[loop].view(np.float64).reshape(-1, 2).T
+            area += 0.5 * float((x[:-1] * y[1:] - y[:-1] * x[1:]).sum() + (x[-1] * y[0] - y[-1] * x[0]))
         # The frame is of unit size, so rounding stays far below this.
         return area > -1e-12 and bool(np.any(self.target != self.target[0]))

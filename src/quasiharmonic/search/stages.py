@@ -302,7 +302,7 @@ class Search:
 
     def _note(self, step: Step) -> None:
         """Write a step down, whatever its number was where it was made."""
-        step = replace(step, iteration=len(self.history))
+        step = Step(len(self.history), step.flipped, step.energy)
         self.history.append(step)
         if self.callback is not None:
             self.callback(step)
