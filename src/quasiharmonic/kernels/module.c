@@ -2,10 +2,11 @@
 #include "arguments.h"
 
 extern PyMethodDef reference_kernels[];
+extern PyMethodDef removal_kernels[];
 
 static int fill(PyObject *module)
 {
-    PyMethodDef *const tables[] = {reference_kernels};
+    PyMethodDef *const tables[] = {reference_kernels, removal_kernels};
     for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
         if (PyModule_AddFunctions(module, tables[i]) < 0)
             return -1;
