@@ -85,10 +85,11 @@ def _best(ring: FloatArray) -> FloatArray:
         candidates = _candidates(around, place.take(poor, axis=1), towards, inwards)
         shapes = _shape(candidates, around)
         best = shapes.argmin(axis=0)
-        lowest = np.take_along_axis(shapes, best[None], axis=0)[0]
+        lowest = shapes[best, np.arange(poor.size)]
         better = np.flatnonzero(lowest < shape.take(poor))
-        place[:, poor[better]] = candidates[best[better], :, better].T
-        shape[poor[better]] = lowest[better]
+        at, best = poor.take(better), best.take(better)
+        place[0, at], place[1, at] = candidates[best, 0, better], candidates[best, 1, better]
+        shape[at] = lowest.take(better)
         poor = poor[np.isinf(shape.take(poor))]
     return place
 
@@ -98,33 +99,37 @@ def _candidates(
 ) -> FloatArray:
     """Places (c, 2, r) that rings (d, 2, r), whose middles are given, may be seen from."""
     apex = ring[0]
-    arm = ring[1:] - apex
-    length = _length(arm)
-    right, left = arm[:-1], arm[1:]
-    cosine = right[:, 0] * left[:, 0] + right[:, 1] * left[:, 1]
-    sine = right[:, 0] * left[:, 1] - right[:, 1] * left[:, 0]
-    room = (sine / _length(left - right)).min(axis=0)
+    arm_x, arm_y = ((ring[1:] - apex)[:, i] for i in (0, 1))
+    length = _length(arm_x, arm_y)
+    right_x, right_y, left_x, left_y = arm_x[:-1], arm_y[:-1], arm_x[1:], arm_y[1:]
+    turn_x = right_x * left_x + right_y * left_y
+    turn_y = right_x * left_y - right_y * left_x
+    room = (turn_y / _length(left_x - right_x, left_y - right_y)).min(axis=0)
     # A fan of positive triangles turns from the first arm to the last; half that turn leads inwards. Half of a
     # triangle's part of it is where the sum of both its arms' unit vectors points.
     size = length[1:] * length[:-1]
-    turn = np.stack([cosine / size + 1, sine / size], axis=1)
-    turn /= _length(turn)[:, None]
-    product = turn[0]
-    for part in turn[1:]:
-        product = _times(product, part)
-    step = _times(room / length[0] * arm[0], product)
-    return np.stack([apex + t * (middle - apex) for t in towards] + [apex + t * step for t in inwards])
+    turn_x /= size
+    turn_x += 1
+    turn_y /= size
+    unit = _length(turn_x, turn_y)
+    turn_x /= unit
+    turn_y /= unit
+    x, y = turn_x[0], turn_y[0]
+    for by_x, by_y in zip(turn_x[1:], turn_y[1:], strict=True):
+        x, y = x * by_x - y * by_y, x * by_y + y * by_x
+    room /= length[0]
+    first_x, first_y = room * arm_x[0], room * arm_y[0]
+    step = np.stack([first_x * x - first_y * y, first_x * y + first_y * x])
+    places = np.concatenate([np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)])
+    places += apex
+    return places
 
 
-def _times(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Products of complex numbers (2, r)."""
-    return np.stack([one[0] * other[0] - one[1] * other[1], one[0] * other[1] + one[1] * other[0]])
-
-
-def _length(arm: FloatArray) -> FloatArray:
-    """Of vectors (k, 2, r); (k, r)."""
-    length: FloatArray = np.sqrt(arm[:, 0] * arm[:, 0] + arm[:, 1] * arm[:, 1])
-    return length
+def _length(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Of vectors."""
+    square = x * x
+    square += y * y
+    return np.sqrt(square, out=square)
 
 
 def _shape(place: FloatArray, ring: FloatArray) -> FloatArray:
