@@ -456,6 +456,8 @@ def _(rng):
 @arguments_of("divide_cells")
 def _(rng):
     return divided_cells(rng, 0, 1, 0)
+
+
 for _indptr, _indices in (
     ([0, 2, 4, 5], [0, 2, 1, 2, 2]),
     ([0, 1, 1], [0]),

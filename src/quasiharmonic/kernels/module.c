@@ -13,7 +13,9 @@
     with(newton_system) \
     with(pattern) \
     with(placing) \
+    with(prolongation) \
     with(reference) \
+    with(removal) \
     with(topology) \
     with(vector_adam)
 
