@@ -117,7 +117,7 @@ def scatter(series: list[tuple[str, FloatArray, FloatArray]], x_label: str, y_la
     width = 7 if count <= 200 else 5 if count <= 2000 else 3
     for css, x, y in shown:
         # Dots on one pixel are one.
-        pixels = np.unique(np.round(np.column_stack([x_axis.place(x), y_axis.place(y)])).astype(int), axis=0)
+        pixels = np.unique(np.round(np.column_stack([x_axis.place(x), y_axis.place(y)])).astype(np.int64), axis=0)
         path = "".join(f"M{a} {b}h0" for a, b in pixels.tolist())
         parts.append(f'<path class="{css} dots" stroke-width="{width}" d="{path}"/>')
     return _svg(parts)

@@ -1,0 +1,108 @@
+"""What is tested on Linux alone assumes little of it: file names, integers, what a system has and what it has not."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import quasiharmonic
+from shared.datasets import record_of, write_stars
+
+ROOT = Path(quasiharmonic.__file__).parent
+HERE = Path(__file__).parent
+# Python's modules that one system or another is without.
+SOMEWHERE = {"curses", "fcntl", "grp", "msvcrt", "posix", "pty", "pwd", "resource", "syslog", "termios", "winreg"}
+# Types whose size is the system's: `int` as a type of arrays is C's `long` in NumPy 1, `longdouble` is anything.
+SIZED_BY_THE_SYSTEM = re.compile(
+    r"\b(np|ctypes)\.(c_u?long|u?int_?|u?long|c?longdouble|float128|complex256)\b|dtype=int\b|astype\(int\b"
+)
+
+
+def sources():
+    """Names and texts of the package's files."""
+    for path in sorted(ROOT.rglob("*.py")):
+        yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+
+
+def minded(tree):
+    """Imports in the body of a `try` that has a word for their failure."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Try) and node.handlers:
+            yield from (id(inner) for step in node.body for inner in ast.walk(step) if isinstance(inner, ast.Import))
+
+
+@pytest.mark.parametrize("folder", [ROOT, HERE], ids=["the package", "tests"])
+def test_names_of_files_are_good_everywhere(folder):
+    """No two differ by case alone, none is a device of Windows' or has a sign that Windows does not take."""
+    names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if "__pycache__" not in path.parts]
+    assert names
+    assert max(Counter(name.lower() for name in names).values()) == 1
+    devices = re.compile(r"(^|/)(con|prn|aux|nul|com\d|lpt\d)(\.|/|$)", re.IGNORECASE)
+    assert not [name for name in names if devices.search(name) or re.search(r'[<>:"\\|?*]|[. ](/|$)', name)]
+
+
+def test_no_type_of_the_systems_size():
+    assert SIZED_BY_THE_SYSTEM.search("np.zeros(3, dtype=int)")
+    assert not SIZED_BY_THE_SYSTEM.search("np.zeros(3, dtype=np.int64)")
+    lines = [(name, line) for name, text in sources() for line in text.splitlines() if ">>> " not in line]
+    assert not [(name, line) for name, line in lines if SIZED_BY_THE_SYSTEM.search(line)]
+
+
+def test_what_a_system_may_lack_is_imported_where_that_is_minded():
+    seen = set()
+    for name, text in sources():
+        if not re.search(rf"import ({'|'.join(SOMEWHERE)})\b|from ({'|'.join(SOMEWHERE)}) ", text):
+            continue
+        tree = ast.parse(text)
+        well = set(minded(tree))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                assert node.module not in SOMEWHERE, f"{name}:{node.lineno}"
+            elif isinstance(node, ast.Import) and SOMEWHERE & {alias.name for alias in node.names}:
+                assert id(node) in well, f"{name}:{node.lineno}"
+                seen.add(name)
+    assert "batch/lock.py" in seen, "this test sees nothing"
+
+
+# Loaded by every process of Python's that has it on its path: a system without what is Unix's, and without /proc.
+_ELSEWHERE = """
+import builtins, io, os, signal, sys
+for name in ("fcntl", "resource", "pwd", "grp", "termios", "pty", "psutil"):
+    sys.modules[name] = None
+for module, names in {
+    os: ("fork", "getuid", "geteuid", "sched_getaffinity", "getpgid", "killpg", "mkfifo", "sysconf"),
+    signal: ("SIGALRM", "SIGHUP", "SIGUSR1", "alarm", "setitimer"),
+}.items():
+    for name in names:
+        delattr(module, name)
+opened = io.open
+def opens(file, *more, **named):
+    if str(file).startswith("/proc"):
+        raise FileNotFoundError(file)
+    return opened(file, *more, **named)
+io.open = builtins.open = opens
+"""
+
+
+def test_a_data_set_is_solved_on_a_system_without_what_is_unixs(tmp_path):
+    """In an encoding that has few signs, too, and names that it does not have."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "sitecustomize.py").write_text(_ELSEWHERE, encoding="utf-8")
+    stars = write_stars(tmp_path / "sét", ["Größe", "b"])
+    path = os.pathsep.join([str(tmp_path / "elsewhere"), str(ROOT.parent)])
+    surroundings = os.environ | {"PYTHONPATH": path, "PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}
+    command = [sys.executable, "-m", "quasiharmonic", "batch", str(stars), "-o", str(tmp_path / "out"), "--jobs", "1"]
+    seen = [sys.executable, "-c", "import os, fcntl"]
+    assert b"fcntl" in subprocess.run(seen, env=surroundings, capture_output=True).stderr, "this test changes nothing"
+    done = subprocess.run(command, env=surroundings, capture_output=True, timeout=120)
+    assert done.returncode == 0, done.stderr.decode("cp1252", "replace")
+    record = record_of(tmp_path / "out", "Größe")
+    assert record["outcome"] == "injective"
+    assert record["peak_memory"] is None
