@@ -31,8 +31,9 @@ BACKENDS = {
     "superlu": ("superlu", "SuperLU"),
 }
 # Up to this many entries in the upper triangle QDLDL is tried before rslab, whose supernodes then cost more than they
-# save: 15,000 unknowns of a Laplacian, 8,500 of a Newton system, whose rows are twice as long.
-QDLDL_UP_TO = 60_000
+# save: analysis and ten factorisations take the same at 40,000 entries of a Laplacian (10,000 unknowns), and at 15,000
+# to 20,000 of a Newton system (2,500), whose rows are twice as long.
+QDLDL_UP_TO = 25_000
 
 
 @cache
