@@ -27,7 +27,6 @@ from quasiharmonic.linsolve import (
     mkl,
     qdldl,
     rslab,
-    superlu,
 )
 from quasiharmonic.mesh.dissection import nested_dissection
 
@@ -298,6 +297,23 @@ def test_an_indefinite_matrix_is_an_event_and_the_next_one_is_solved(name, share
             np.testing.assert_allclose(both(A) @ solver.solve(np.ones(225)), 1, rtol=1e-10)
 
 
+@pytest.mark.parametrize("decades", [10, 60])
+def test_an_indefinite_matrix_of_any_scaling_is_an_event(name, decades):
+    A = stiffness(12)
+    smallest = np.linalg.eigvalsh(both(A).toarray())[0]
+    scale = 2.0 ** np.round(np.random.default_rng(5).uniform(-decades, decades, 144) * np.log2(10))
+    for share, definite in [(0.5, True), (1.5, False)]:
+        shifted = A.copy()
+        shifted.data[A.indptr[:-1]] -= share * smallest
+        scaled = upper(diagonal(scale) @ both(shifted) @ diagonal(scale))
+        with solver_for(scaled, name) as solver:
+            if definite:
+                solver.factor(scaled.data)
+            else:
+                with pytest.raises(NotPositiveDefinite, match="not positive definite"):
+                    solver.factor(scaled.data)
+
+
 @pytest.mark.parametrize("contrast", [0.0, 3.0])
 @pytest.mark.parametrize("side", [3, 20])
 def test_a_semidefinite_matrix_is_an_event(name, side, contrast):
@@ -346,17 +362,16 @@ def test_bad_right_hand_sides(name, bad):
 # ---- the residual test --------------------------------------------------------------------------------------------
 
 
-def broken(monkeypatch, damage):
+def broken(damage, name="superlu"):
     """A solver whose backend's solutions go through `damage` before they come out, and the list of its calls."""
     A, calls = stiffness(15), []
 
-    class Damaged(superlu.SuperLU):
+    class Damaged(type(solver_for(A, name))):
         def _solve(self, b):
             calls.append(b)
             return damage(super()._solve(b))
 
-    monkeypatch.setattr(superlu, "SuperLU", Damaged)
-    solver = solver_for(A, "superlu")
+    solver = Damaged(A.indptr, A.indices)
     solver.factor(A.data)
     return A, solver, calls
 
@@ -380,23 +395,35 @@ def one_wrong_entry(x):
     ],
 )
 @pytest.mark.parametrize("unit", [1.0, 1e-30, 1e180])
-def test_a_wrong_solution_does_not_come_out(monkeypatch, damage, unit):
-    _, solver, calls = broken(monkeypatch, damage)
+def test_a_wrong_solution_does_not_come_out(damage, unit):
+    _, solver, calls = broken(damage)
     rhs = np.random.default_rng(1).standard_normal((225, 2)) * [1, unit]
     with pytest.raises(NotPositiveDefinite, match=r"not numerically positive definite: the residual .* superlu"):
         solver.solve(rhs)
     assert len(calls) == 2, "one step of refinement, and no more"
 
 
-def test_an_inaccurate_solution_is_refined(monkeypatch):
-    A, solver, calls = broken(monkeypatch, lambda x: x * (1 + 1e-6))
+def test_an_inaccurate_solution_is_refined():
+    A, solver, calls = broken(lambda x: x * (1 + 1e-6))
     rhs = np.random.default_rng(1).standard_normal((225, 2))
     np.testing.assert_allclose(both(A) @ solver.solve(rhs), rhs, rtol=0, atol=1e-9)
     assert len(calls) == 2
 
 
-def test_a_right_solution_is_not_touched(monkeypatch):
-    _, solver, calls = broken(monkeypatch, lambda x: x)
+def test_every_backends_solutions_are_judged(name):
+    """Wrong in one entry, also when they are solved for again; inaccurate ones are refined."""
+    rhs = np.random.default_rng(1).standard_normal((225, 2))
+    _, wrong, _ = broken(one_wrong_entry, name)
+    with wrong, pytest.raises(NotPositiveDefinite, match="not numerically positive definite"):
+        wrong.solve(rhs)
+    A, inaccurate, calls = broken(lambda x: x * (1 + 1e-6), name)
+    with inaccurate:
+        np.testing.assert_allclose(both(A) @ inaccurate.solve(rhs), rhs, rtol=0, atol=1e-9)
+    assert len(calls) == 2
+
+
+def test_a_right_solution_is_not_touched():
+    _, solver, calls = broken(lambda x: x)
     solver.solve(np.random.default_rng(1).standard_normal((225, 3)))
     assert len(calls) == 1
 
