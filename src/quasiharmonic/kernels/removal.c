@@ -33,6 +33,8 @@ typedef struct {
     Wing *stars;
     /* In which order vertices are to go (n); infinite for those that are not, and once it or a neighbour has been chosen. */
     double *order;
+    /* Which apex to prefer (n); infinite for held vertices. */
+    double *burden;
     /* Chosen vertices, in the end by degree (n). */
     int32_t *chosen;
     Py_ssize_t number;
@@ -75,17 +77,21 @@ static void choose(Round *round)
     for (Py_ssize_t v = 0; v < round->n; v++) {
         const Py_ssize_t d = degree(round, v);
         order[v] = round->free[v] && d && d <= MOST_NEIGHBOURS ? round->dice[v] + PER_NEIGHBOUR * (double)d : INFINITY;
+        round->burden[v] = round->free[v] ? (double)d + round->dice[v] : INFINITY;
     }
     for (int pass = 0; pass < PASSES; pass++) {
         const Py_ssize_t before = round->number;
         for (Py_ssize_t v = 0; v < round->n; v++) {
             if (order[v] == INFINITY)
                 continue;
-            const Wing *wing = round->stars + round->start[v], *end = round->stars + round->start[v + 1];
-            while (wing < end && order[v] < order[wing->tail])
-                wing++;
-            if (wing == end)
-                round->chosen[round->number++] = (int32_t)v;
+            const Wing *const end = round->stars + round->start[v + 1];
+            double soonest = INFINITY;
+            for (const Wing *wing = round->stars + round->start[v]; wing < end; wing++) {
+                const double at = order[wing->tail];
+                soonest = at < soonest ? at : soonest;
+            }
+            round->chosen[round->number] = (int32_t)v;
+            round->number += order[v] < soonest;
         }
         for (Py_ssize_t i = before; i < round->number; i++) {
             const int32_t v = round->chosen[i];
@@ -96,31 +102,25 @@ static void choose(Round *round)
     }
 }
 
-/* The neighbours of a vertex counterclockwise from that of least burden; 0 if they form no ring. */
+/* The neighbours of a vertex counterclockwise from that of least burden; 0 if they form no ring. Which of a few numbers is
+ * the least, or is equal, is as good as random: to look at all of them takes less time than to guess wrong. */
 static int turn_around(const Round *round, int32_t vertex, int64_t *ring)
 {
     const Wing *star = round->stars + round->start[vertex];
     const Py_ssize_t d = degree(round, vertex);
     double least = INFINITY;
-    ring[0] = star[0].tail;
+    int32_t here = star[0].tail;
     for (Py_ssize_t k = 0; k < d; k++) {
-        const int32_t v = star[k].tail;
-        const double burden = round->free[v] ? (double)degree(round, v) + round->dice[v] : INFINITY;
-        if (burden < least) {
-            least = burden;
-            ring[0] = v;
-        }
+        const double burden = round->burden[star[k].tail];
+        here = burden < least ? star[k].tail : here;
+        least = burden < least ? burden : least;
     }
-    int64_t here = ring[0];
-    for (Py_ssize_t i = 1; i <= d; i++) {
-        Py_ssize_t k = 0;
-        while (k < d && star[k].tail != here)
-            k++;
-        if (k == d)
-            return 0;
-        here = star[k].head;
-        if (i < d)
-            ring[i] = here;
+    for (Py_ssize_t i = 0; i < d; i++) {
+        int32_t next = -1;
+        ring[i] = here;
+        for (Py_ssize_t k = 0; k < d; k++)
+            next = star[k].tail == here ? star[k].head : next;
+        here = next;
     }
     return here == ring[0];
 }
@@ -149,9 +149,9 @@ static int claim(Round *round, int64_t one, int64_t other)
 /* Whether a ring may be filled by a fan: from a free apex to free vertices, by edges that are new. */
 static int fits(Round *round, const int64_t *ring, Py_ssize_t d)
 {
-    int good = round->free[ring[0]];
+    int good = round->burden[ring[0]] < INFINITY;
     for (Py_ssize_t i = 2; i < d - 1; i++)
-        good &= round->free[ring[i]];
+        good &= round->burden[ring[i]] < INFINITY;
     if (!good)
         return 0;
     for (Py_ssize_t i = 2; i < d - 1; i++)
@@ -211,11 +211,12 @@ static int reserve(Round *round)
     round->start = malloc(n * sizeof(*round->start));
     round->stars = malloc(3 * f * sizeof(*round->stars));
     round->order = malloc(n * sizeof(*round->order));
+    round->burden = malloc(n * sizeof(*round->burden));
     round->chosen = malloc(n * sizeof(*round->chosen));
     round->last = malloc(n * sizeof(*round->last));
     round->claims = malloc(f * sizeof(*round->claims));
     round->gone = malloc(n);
-    return round->start && round->stars && round->order && round->chosen && round->last && round->claims && round->gone;
+    return round->start && round->stars && round->order && round->burden && round->chosen && round->last && round->claims && round->gone;
 }
 
 static void release(Round *round)
@@ -223,6 +224,7 @@ static void release(Round *round)
     free(round->start);
     free(round->stars);
     free(round->order);
+    free(round->burden);
     free(round->chosen);
     free(round->last);
     free(round->claims);
