@@ -52,7 +52,7 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (Iterate, "_sweep", "gradient"),
     (stages.Search, "run", "optimiser"),
     (solving, "certify", "certificate"),
-    (stages, "flipped_triangles", "certificate"),
+    (stages, "triangle_signs", "certificate"),
 )
 
 

@@ -46,6 +46,8 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
     array = _array(name, values)
     if array.dtype.kind not in "iufb":
         raise ValueError(f"{name} must hold real numbers, not {_held(values, array)}")
+    if array.dtype == np.float64:
+        return np.array(array, order="C")
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float64, order="C")
 

@@ -122,18 +122,25 @@ def _(rng):
     return F, rng.normal(size=(7, 2)), np.zeros(5, dtype=np.int8)
 
 
-def curves(rng, places: Any) -> Arguments:
-    """Closed curves of three, four and twice as many places as are left, and room for what may meet."""
-    k = len(places) - 7
-    vertices = rng.permutation(len(places))
-    starts = np.array([0, 3, 7, 7 + k])
-    return places, vertices, starts, np.zeros((9 * len(places), 2), dtype=np.int64)
+@arguments_of("count_turns")
+def _(rng):
+    """On whole numbers many corners are level; one is nowhere."""
+    uv = np.append(rng.integers(0, 5, (29, 2)), [[0, np.nan]], axis=0)
+    return soup(rng, 30, 400), uv, rng.integers(0, 3, 30)
+
+
+def curves(places: Any, lengths: Any) -> Arguments:
+    """Closed curves one after another, and room for what may meet."""
+    starts = np.cumsum([0, *lengths])
+    tails, heads = np.arange(len(places)), np.arange(1, len(places) + 1)
+    heads[starts[1:] - 1] = starts[:-1]
+    return places, tails, heads, starts, np.zeros((9 * len(places), 2), dtype=np.int64)
 
 
 @arguments_of("doubtful_pairs")
 def _(rng):
     """Places on a coarse grid: edges cross, touch, overlap, turn back and have no length."""
-    return curves(rng, rng.integers(0, 9, (60, 2)) * 0.1)
+    return curves(rng.integers(0, 9, (60, 2)) * 0.1, [3, 4, 53])
 
 
 @arguments_of("doubtful_pairs")
@@ -141,8 +148,15 @@ def _(rng):
     """A star-shaped curve, and the same within rounding of a line."""
     angle = np.sort(rng.uniform(0, 2 * np.pi, 300))
     star = rng.uniform(0.5, 1, (300, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    places = np.concatenate([star, star * [1, 1e-17] + [0, 0.5]])
-    return places, np.arange(600), np.array([0, 300, 600]), np.zeros((9000, 2), dtype=np.int64)
+    return curves(np.concatenate([star, star[::5] * [1, 1e-17] + [0, 0.5]]), [300, 60])
+
+
+@arguments_of("doubtful_pairs")
+def _(rng):
+    """Segments between any of a few places, of no length too, in one group; and none at all."""
+    tails, heads = rng.integers(0, 20, (2, 40 * rng.integers(2)))
+    places = rng.integers(0, 9, (20, 2)) * 0.1
+    return places, tails, heads, np.array([0, len(tails)]), np.zeros((800, 2), dtype=np.int64)
 
 
 def pattern_of(F: Any, place: Any) -> Arguments:

@@ -374,8 +374,10 @@ def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> st
 
 def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
     """Boundary loops, or why there are none to be judged."""
-    repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
-    parts = edges(F, n)
+    parts, repeated = edges(F, n), np.empty(0, dtype=np.int64)
+    # An edge from a vertex to itself is never between two triangles that traverse it in opposite directions.
+    if any((some[:, 0] == some[:, 1]).any() for some in (parts.boundary, parts.inconsistent, parts.nonmanifold)):
+        repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
     wrong = (
         (repeated.tolist(), "triangles repeat a vertex"),
         (_dashed(parts.nonmanifold), "edges are in three or more triangles"),
@@ -399,19 +401,26 @@ def _dashed(pairs: IntArray) -> list[str]:
 
 
 def _overwound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
-    """Interior vertices, all triangles around them positive, around which these wind more than once.
+    """Interior vertices, all triangles around them positive, around which these wind more than once."""
+    turns = np.zeros(len(uv), dtype=np.int64)
+    count_turns(F, uv, turns)
+    turns[F[sign <= 0]] = 0
+    turns[np.concatenate(loops)] = 0
+    return np.flatnonzero(turns > 1)
+
+
+@compiled
+def count_turns(F: IntArray, uv: FloatArray, turns: IntArray) -> None:
+    """Add to every vertex (n,) how often the triangles around it wind around it, if they are positive.
 
     Positive triangles turn counterclockwise around their vertex by less than half a turn each, so one
     of them passes the direction of the x axis exactly if its next corner lies below the vertex and
     its last does not; as many do as there are turns.
     """
-    y, turns = uv[:, 1].copy(), np.zeros(len(uv), dtype=np.int64)
+    y = uv[:, 1].copy()
     for start in range(0, len(F), TRIANGLE_CHUNK):
         chunk = F[start : start + TRIANGLE_CHUNK]
         level = y.take(chunk)
         for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             passing = (level[:, following] < level[:, corner]) & (level[:, last] >= level[:, corner])
             np.add.at(turns, chunk[:, corner].compress(passing), 1)
-    turns[F[sign <= 0]] = 0
-    turns[np.concatenate(loops)] = 0
-    return np.flatnonzero(turns > 1)

@@ -6,7 +6,7 @@ reported as a list of `Reason`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.predicates import (
     SegmentRelation,
-    box_pairs,
     box_pairs_within,
     orientation,
     segment_relation,
@@ -104,11 +103,11 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
     Contacts
         Pairs without a common end that meet, and pairs with one that overlap.
     """
-    tail, head = ends.T
+    tail, head = np.ascontiguousarray(ends.T)
     p, q = positions[tail], positions[head]
     found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
     number = 0
-    for i, j in box_pairs(np.minimum(p, q), np.maximum(p, q)):
+    for i, j in _doubtful(positions, tail, head, np.array([0, len(ends)])):
         relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
         near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
         i, j, relation = i[near], j[near], relation[near]
@@ -120,6 +119,68 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
         if number > most:
             break
     return Contacts(np.concatenate(found)[:most], np.concatenate(relations)[:most], number <= most)
+
+
+def _doubtful(
+    places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray
+) -> Iterable[tuple[IntArray, IntArray]]:
+    """Pairs of segments to decide exactly, in portions: those of `doubtful_pairs`, and more where there are many."""
+    # As a rule there are none or a few; where a boundary has collapsed, billions.
+    pairs = np.empty((len(tails), 2), dtype=np.int64)
+    number = doubtful_pairs(np.ascontiguousarray(places, dtype=np.float64), tails, heads, starts, pairs)
+    if number < 0:
+        p, q = places[tails], places[heads]
+        return box_pairs_within(np.minimum(p, q), np.maximum(p, q), starts)
+    i, j = pairs[:number].T
+    return [(i, j)] if number else []
+
+
+@compiled
+def doubtful_pairs(places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray, pairs: IntArray) -> int:
+    """List pairs of segments of the same group that may have more in common than an end, as far as doubles can tell.
+
+    Segments (m,) are group after group, ``starts`` (g + 1,). How many pairs (k, 2) there are, -1 for want of room.
+    """
+    p, q = places[tails], places[heads]
+    found, number = [np.empty((0, 2), dtype=np.int64)], 0
+    for i, j in box_pairs_within(np.minimum(p, q), np.maximum(p, q), starts):
+        tail, head = tails[i] == tails[j], heads[i] == heads[j]
+        ahead, behind = heads[i] == tails[j], tails[i] == heads[j]
+        shared = np.add(tail, head, dtype=np.int8) + ahead + behind
+        doubtful = shared > 1
+        one = np.flatnonzero(shared == 1)
+        at_tail, others_tail = (tail | behind)[one, None], (tail | ahead)[one, None]
+        here, there = i[one], j[one]
+        doubtful[one] = _may_overlap(
+            np.where(at_tail, p[here], q[here]),
+            np.where(at_tail, q[here], p[here]),
+            np.where(others_tail, q[there], p[there]),
+        )
+        apart = np.flatnonzero(shared == 0)
+        here, there = i[apart], j[apart]
+        doubtful[apart] = _may_meet(p[here], q[here], p[there], q[there])
+        found.append(np.stack([i[doubtful], j[doubtful]], axis=1))
+        number += len(found[-1])
+        if number > len(pairs):
+            return -1
+    listed = np.concatenate(found)
+    pairs[:number] = listed[np.lexsort(listed.T[::-1])]
+    return number
+
+
+def _may_overlap(start: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
+    """Whether segments from a place to two others may overlap: one of them is a point, or they may run the same way."""
+    same_way = ((one < start) == (other < start)).all(axis=1) & ((one > start) == (other > start)).all(axis=1)
+    same_way[same_way] = sure_orientation(one[same_way], start[same_way], other[same_way]) == 0
+    points: BoolArray = (start == one).all(axis=1) | (start == other).all(axis=1)
+    return points | same_way
+
+
+def _may_meet(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> BoolArray:
+    """Whether the segments pq and rs may have anything in common."""
+    near: BoolArray = sure_orientation(p, q, r) * sure_orientation(p, q, s) <= 0
+    near[near] = sure_orientation(r[near], s[near], p[near]) * sure_orientation(r[near], s[near], q[near]) <= 0
+    return near
 
 
 def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
@@ -137,57 +198,19 @@ def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
     (k,) bool
     """
     simple = np.ones(len(loops), dtype=bool)
-    vertices, starts = np.concatenate(loops), np.cumsum([0, *map(len, loops)])
-    # Hardly ever are there any; where a boundary has collapsed, billions.
-    pairs = np.empty((len(vertices), 2), dtype=np.int64)
-    number = doubtful_pairs(uv, vertices, starts, pairs)
-    if number == 0:
-        return simple
-    curves = _Curves.of(loops, uv)
-    p, q, following = curves.p, curves.q, curves.following
-    # An edge without length shares all it is with the edges before and after it.
-    point = (p == q).all(axis=1)
-    simple[curves.owner[point]] = False
-    portions = curves.boxes_that_meet() if number < 0 else [pairs[:number].T]
-    for i, j in portions:
+    vertices, starts, following = _in_turn(loops)
+    p = uv.take(vertices, 0)
+    for i, j in _doubtful(p, np.arange(len(p)), following, starts):
+        q = p[following]
         relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
         joined = (following[i] == j) | (following[j] == i)
         met = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
-        simple[curves.owner[i[met]]] = False
+        # An edge without length shares all it is with the edges before and after it.
+        met |= (p.take(i, 0) == q.take(i, 0)).all(axis=1) | (p.take(j, 0) == q.take(j, 0)).all(axis=1)
+        simple[np.searchsorted(starts, i[met], side="right") - 1] = False
         if not simple.any():
             break
     return simple
-
-
-@compiled
-def doubtful_pairs(uv: FloatArray, vertices: IntArray, starts: IntArray, pairs: IntArray) -> int:
-    """List pairs of edges of the same loop that may have more in common than an end, by what floating point is sure of.
-
-    Loops are one after another, ``starts`` (l + 1,). How many pairs (m, 2) there are, -1 where they have no room.
-    """
-    curves = _Curves.of(np.split(vertices, starts[1:-1]), uv)
-    p, q, following = curves.p, curves.q, curves.following
-    # Edges overlap with the next where the curve turns back, or one of them has no length.
-    beyond = q[following]
-    back = ((p < q) == (beyond < q)).all(axis=1) & ((p > q) == (beyond > q)).all(axis=1)
-    back[back] = sure_orientation(p[back], q[back], beyond[back]) == 0
-    at = np.flatnonzero(back | (p == q).all(axis=1))
-    found = [np.sort(np.stack([at, following[at]], axis=1), axis=1)]
-    for i, j in curves.boxes_that_meet():
-        apart = (following[i] != j) & (following[j] != i)
-        i, j = i[apart], j[apart]
-        r, s = p.take(j, 0), q.take(j, 0)
-        near = sure_orientation(p.take(i, 0), q.take(i, 0), r) * sure_orientation(p.take(i, 0), q.take(i, 0), s) <= 0
-        i, j, r, s = i[near], j[near], r[near], s[near]
-        near = sure_orientation(r, s, p.take(i, 0)) * sure_orientation(r, s, q.take(i, 0)) <= 0
-        found.append(np.stack([i[near], j[near]], axis=1))
-        if sum(map(len, found)) > len(pairs):
-            return -1
-    listed = np.unique(np.concatenate(found), axis=0)
-    if len(listed) > len(pairs):
-        return -1
-    pairs[: len(listed)] = listed
-    return len(listed)
 
 
 def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
@@ -270,21 +293,19 @@ class _Curves:
     following: IntArray
     """(k,) The next edge of the same loop."""
 
-    def boxes_that_meet(self) -> Iterator[tuple[IntArray, IntArray]]:
-        """Pairs of edges of the same loop, the smaller first, whose boxes meet; in portions."""
-        return box_pairs_within(np.minimum(self.p, self.q), np.maximum(self.p, self.q), self.start)
-
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
-        length = np.array([len(loop) for loop in loops])
-        start = np.concatenate([[0], np.cumsum(length)])
-        tail = np.concatenate(loops)
-        following = np.arange(1, len(tail) + 1)
-        following[start[1:] - 1] = start[:-1]
-        head = tail[following]
-        return cls(
-            start, np.repeat(np.arange(len(loops)), length), np.stack([tail, head], 1), uv[tail], uv[head], following
-        )
+        tail, start, following = _in_turn(loops)
+        head, owner = tail[following], np.repeat(np.arange(len(loops)), np.diff(start))
+        return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
+
+
+def _in_turn(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+    """Vertices loop after loop (k,), where each starts and the last ends (l + 1,), and what follows each vertex (k,)."""
+    starts = np.cumsum([0, *map(len, loops)])
+    following = np.arange(1, starts[-1] + 1)
+    following[starts[1:] - 1] = starts[:-1]
+    return np.concatenate(loops), starts, following
 
 
 def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
@@ -314,7 +335,7 @@ def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
     point = (curves.p == curves.q).all(axis=1)
     swallowed = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)
     pairs = np.concatenate([swallowed, contacts(uv, curves.ends, _MOST_CROSSINGS).pairs])
-    return np.unique(pairs, axis=0)[:_MOST_CROSSINGS]
+    return np.unique(pairs, axis=0)[:_MOST_CROSSINGS] if len(pairs) else pairs
 
 
 def _misplaced(curves: _Curves) -> list[Reason]:
@@ -342,6 +363,8 @@ def _misplaced(curves: _Curves) -> list[Reason]:
 def _containing(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray]:
     """Pairs of loops, the first around the second; ``anchor`` (l, 2) has a vertex of each loop."""
     number = len(anchor)
+    if number == 1:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     turns: dict[int, int] = {}
     for edge, point, turn in _passed(anchor, curves.p, curves.q):
         key, at = np.unique(curves.owner[edge] * number + point, return_inverse=True)

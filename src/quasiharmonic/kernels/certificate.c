@@ -29,4 +29,24 @@ static PyObject *sure_signs(PyObject *module, PyObject *const *given, Py_ssize_t
     return done_with_integer(a, LENGTH(a), open);
 }
 
-PyMethodDef certificate_kernels[] = {KERNEL(sure_signs), END_OF_KERNELS};
+/* (F, uv, turns): how often triangles wind around their vertices, added up. */
+static PyObject *count_turns(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[3];
+    if (!take("count_turns", given, count, "qdQ", a))
+        return NULL;
+    const int64_t *F = a[0].data;
+    const double *uv = a[1].data;
+    int64_t *turns = a[2].data;
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t j = 0; j < a[0].size; j += 3) {
+        const double level[] = {uv[2 * F[j] + 1], uv[2 * F[j + 1] + 1], uv[2 * F[j + 2] + 1]};
+        for (int corner = 0; corner < 3; corner++)
+            turns[F[j + corner]] += level[(corner + 1) % 3] < level[corner] && level[(corner + 2) % 3] >= level[corner];
+    }
+    Py_END_ALLOW_THREADS
+    return done(a, LENGTH(a));
+}
+
+PyMethodDef certificate_kernels[] = {KERNEL(sure_signs), KERNEL(count_turns), END_OF_KERNELS};

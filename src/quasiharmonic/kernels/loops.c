@@ -4,28 +4,33 @@
 
 #include <stdlib.h>
 
-/* Edges in a leaf of a tree of boxes. */
+/* Segments in a leaf of a tree of boxes. */
 #define LEAF 4
 
 typedef struct {
     double low[2], high[2];
 } Box;
 
-/* A closed curve: its vertices' places in turn. */
+/* Segments between places: the numbers of their ends. */
 typedef struct {
-    const double *uv;
-    const int64_t *vertices;
+    const double *places;
+    const int64_t *tails, *heads;
     Py_ssize_t size;
-} Curve;
+} Segments;
 
-static const double *place(const Curve *curve, Py_ssize_t i)
+static const double *tail(const Segments *of, Py_ssize_t i)
 {
-    return curve->uv + 2 * curve->vertices[i < curve->size ? i : 0];
+    return of->places + 2 * of->tails[i];
 }
 
-static Box edge_box(const Curve *curve, Py_ssize_t i)
+static const double *head(const Segments *of, Py_ssize_t i)
 {
-    const double *p = place(curve, i), *q = place(curve, i + 1);
+    return of->places + 2 * of->heads[i];
+}
+
+static Box box_of(const Segments *of, Py_ssize_t i)
+{
+    const double *p = tail(of, i), *q = head(of, i);
     Box box;
     for (int axis = 0; axis < 2; axis++) {
         box.low[axis] = p[axis] < q[axis] ? p[axis] : q[axis];
@@ -50,36 +55,48 @@ static void enlarge(Box *box, const Box *by)
     }
 }
 
-/* Whether an edge may overlap with the one after it: one of them is a point, or the curve may turn right back. */
-static int doubtful_turn(const Curve *curve, Py_ssize_t i)
+static int same_place(const double *one, const double *other)
 {
-    const double *p = place(curve, i), *q = place(curve, i + 1), *beyond = place(curve, i + 1 < curve->size ? i + 2 : 1);
-    if (p[0] == q[0] && p[1] == q[1])
-        return 1;
-    for (int axis = 0; axis < 2; axis++)
-        if ((p[axis] < q[axis]) != (beyond[axis] < q[axis]) || (p[axis] > q[axis]) != (beyond[axis] > q[axis]))
-            return 0;
-    return !sure_orientation(p, q, beyond);
+    return one[0] == other[0] && one[1] == other[1];
 }
 
-/* Whether two edges without common end may meet. */
-static int doubtful_pair(const Curve *curve, Py_ssize_t i, Py_ssize_t j)
+/* Whether segments from one place to two others may overlap: one of them is a point, or they may run the same way. */
+static int doubtful_overlap(const double *from, const double *one, const double *other)
 {
-    const double *p = place(curve, i), *q = place(curve, i + 1), *r = place(curve, j), *s = place(curve, j + 1);
+    if (same_place(from, one) || same_place(from, other))
+        return 1;
+    for (int axis = 0; axis < 2; axis++)
+        if ((one[axis] < from[axis]) != (other[axis] < from[axis]) || (one[axis] > from[axis]) != (other[axis] > from[axis]))
+            return 0;
+    return !sure_orientation(one, from, other);
+}
+
+/* Whether two segments may have more in common than an end that they share. */
+static int doubtful(const Segments *of, Py_ssize_t i, Py_ssize_t j)
+{
+    const double *p = tail(of, i), *q = head(of, i), *r = tail(of, j), *s = head(of, j);
+    const int tails = of->tails[i] == of->tails[j], heads = of->heads[i] == of->heads[j];
+    const int ahead = of->heads[i] == of->tails[j], behind = of->tails[i] == of->heads[j];
+    if (tails + heads + ahead + behind > 1)
+        return 1;
+    if (tails || behind)
+        return doubtful_overlap(p, q, tails ? s : r);
+    if (heads || ahead)
+        return doubtful_overlap(q, p, heads ? r : s);
     return sure_orientation(p, q, r) * sure_orientation(p, q, s) <= 0 &&
            sure_orientation(r, s, p) * sure_orientation(r, s, q) <= 0;
 }
 
-/* A tree of boxes around edges: box 1 around all, boxes 2 k and 2 k + 1 in box k, and the last `width` around LEAF edges
- * each. */
-static void grow(const Curve *curve, Box *tree, Py_ssize_t width)
+/* A tree of boxes around segments: box 1 around all, boxes 2 k and 2 k + 1 in box k, and the last `width` around LEAF
+ * segments each. */
+static void grow(const Segments *of, Box *tree, Py_ssize_t width)
 {
     for (Py_ssize_t leaf = 0; leaf < width; leaf++) {
         Box *box = tree + width + leaf;
         *box = (Box){{HUGE_VAL, HUGE_VAL}, {-HUGE_VAL, -HUGE_VAL}};
-        for (Py_ssize_t i = LEAF * leaf; i < LEAF * (leaf + 1) && i < curve->size; i++) {
-            const Box edge = edge_box(curve, i);
-            enlarge(box, &edge);
+        for (Py_ssize_t i = LEAF * leaf; i < LEAF * (leaf + 1) && i < of->size; i++) {
+            const Box one = box_of(of, i);
+            enlarge(box, &one);
         }
     }
     for (Py_ssize_t k = width - 1; k > 0; k--) {
@@ -88,31 +105,19 @@ static void grow(const Curve *curve, Box *tree, Py_ssize_t width)
     }
 }
 
-/* Pairs of edges that are listed, and how many there may be. */
+/* Pairs of segments that are listed, and how many there may be. */
 typedef struct {
     int64_t *pairs;
     Py_ssize_t found, most;
 } List;
 
-/* 0 where there is no room left. */
-static int add(List *list, Py_ssize_t i, Py_ssize_t j)
+/* List the doubtful pairs of one group of segments, the first of which has the number `first`; 0 where there is no room.
+ * `tree` is for 2 width boxes. */
+static int list_pairs(const Segments *of, Box *tree, Py_ssize_t width, Py_ssize_t first, List *list)
 {
-    if (list->found == list->most)
-        return 0;
-    list->pairs[2 * list->found] = i;
-    list->pairs[2 * list->found + 1] = j;
-    list->found++;
-    return 1;
-}
-
-/* List the doubtful pairs of one curve's edges, which are numbered from `first` on; 0 where there is no room. `tree` is
- * for 2 width boxes. */
-static int list_pairs(const Curve *curve, Box *tree, Py_ssize_t width, Py_ssize_t first, List *list)
-{
-    const Py_ssize_t size = curve->size;
-    grow(curve, tree, width);
-    for (Py_ssize_t i = 0; i < size; i++) {
-        const Box box = edge_box(curve, i);
+    grow(of, tree, width);
+    for (Py_ssize_t i = 0; i < of->size; i++) {
+        const Box box = box_of(of, i);
         /* From box to box, each before those in it; below box k there are `span` of the last ones. */
         for (Py_ssize_t k = 1, span = width; k;) {
             const Py_ssize_t begin = LEAF * (k * span - width);
@@ -122,18 +127,15 @@ static int list_pairs(const Curve *curve, Box *tree, Py_ssize_t width, Py_ssize_
                 span /= 2;
                 continue;
             }
-            for (Py_ssize_t j = begin > i ? begin : i + 1; !passed && j < begin + LEAF && j < size; j++) {
-                int doubtful;
-                if (j == i + 1)
-                    doubtful = doubtful_turn(curve, i);
-                else if (i == 0 && j == size - 1)
-                    doubtful = doubtful_turn(curve, j);
-                else {
-                    const Box other = edge_box(curve, j);
-                    doubtful = meet(&other, &box) && doubtful_pair(curve, i, j);
-                }
-                if (doubtful && !add(list, first + i, first + j))
+            for (Py_ssize_t j = begin > i ? begin : i + 1; !passed && j < begin + LEAF && j < of->size; j++) {
+                const Box other = box_of(of, j);
+                if (!meet(&other, &box) || !doubtful(of, i, j))
+                    continue;
+                if (list->found == list->most)
                     return 0;
+                list->pairs[2 * list->found] = first + i;
+                list->pairs[2 * list->found + 1] = first + j;
+                list->found++;
             }
             while (k % 2) {
                 k /= 2;
@@ -145,35 +147,40 @@ static int list_pairs(const Curve *curve, Box *tree, Py_ssize_t width, Py_ssize_
     return 1;
 }
 
-/* (uv, vertices, starts, pairs): pairs of edges of the same closed curve of which floating point does not say that they
- * have nothing in common but an end that they share; how many there are, or -1 where there are more than there is room
- * for. */
+/* As many leaves as it takes, a power of two. */
+static Py_ssize_t leaves(Py_ssize_t segments)
+{
+    Py_ssize_t width = 1;
+    while (LEAF * width < segments)
+        width *= 2;
+    return width;
+}
+
+/* (places, tails, heads, starts, pairs): pairs of segments of the same group of which floating point does not say that
+ * they have nothing in common but an end that they share; how many there are, or -1 where there are more than there is
+ * room for. */
 static PyObject *doubtful_pairs(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
-    Argument a[4];
-    if (!take("doubtful_pairs", given, count, "dqqQ", a))
+    Argument a[5];
+    if (!take("doubtful_pairs", given, count, "dqqqQ", a))
         return NULL;
-    const int64_t *vertices = a[1].data, *starts = a[2].data;
-    List list = {a[3].data, 0, a[3].size / 2};
-    Py_ssize_t longest = 0, width = 1;
-    for (Py_ssize_t g = 0; g + 1 < a[2].size; g++)
-        if (starts[g + 1] - starts[g] > longest)
-            longest = starts[g + 1] - starts[g];
-    while (LEAF * width < longest)
-        width *= 2;
-    Box *tree = malloc(2 * (size_t)width * sizeof(*tree));
+    const int64_t *tails = a[1].data, *heads = a[2].data, *starts = a[3].data;
+    List list = {a[4].data, 0, a[4].size / 2};
+    Py_ssize_t largest = 0;
+    for (Py_ssize_t g = 0; g + 1 < a[3].size; g++)
+        if (starts[g + 1] - starts[g] > largest)
+            largest = starts[g + 1] - starts[g];
+    Box *tree = malloc(2 * (size_t)leaves(largest) * sizeof(*tree));
     if (!tree) {
         Py_DECREF(done(a, LENGTH(a)));
         return PyErr_NoMemory();
     }
     int room = 1;
     Py_BEGIN_ALLOW_THREADS
-    for (Py_ssize_t g = 0; g + 1 < a[2].size && room; g++) {
-        const Curve curve = {a[0].data, vertices + starts[g], starts[g + 1] - starts[g]};
-        for (width = 1; LEAF * width < curve.size;)
-            width *= 2;
-        room = list_pairs(&curve, tree, width, starts[g], &list);
+    for (Py_ssize_t g = 0; g + 1 < a[3].size && room; g++) {
+        const Segments group = {a[0].data, tails + starts[g], heads + starts[g], starts[g + 1] - starts[g]};
+        room = list_pairs(&group, tree, leaves(group.size), starts[g], &list);
     }
     Py_END_ALLOW_THREADS
     free(tree);

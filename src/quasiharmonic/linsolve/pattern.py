@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,20 +52,25 @@ def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> Stiff
     size : int
         How many are free.
     """
-    halves = F.size
+    most = F.size
     made = StiffnessPattern(
-        np.empty(size + 1, dtype=np.int32),
-        np.empty(size + halves, dtype=np.int32),
-        *(np.empty(halves, dtype=np.int64) for _ in range(2)),
-        *(np.empty(halves + more, dtype=np.int32) for more in range(2)),
-        *(np.empty(halves, dtype=np.int64) for _ in range(3)),
+        indptr=np.empty(size + 1, dtype=np.int32),
+        indices=np.empty(size + most, dtype=np.int32),
+        row=np.empty(most, dtype=np.int64),
+        column=np.empty(most, dtype=np.int64),
+        halves=np.empty(most, dtype=np.int32),
+        offsets=np.empty(most + 1, dtype=np.int32),
+        border=np.empty(most, dtype=np.int64),
+        border_row=np.empty(most, dtype=np.int64),
+        border_fixed=np.empty(most, dtype=np.int64),
     )
     sizes = np.empty(3, dtype=np.int64)
     find_pattern(np.ascontiguousarray(F, dtype=np.int64), place, *made, sizes)
     entries, inner, border = sizes.tolist()
     # What memory is not needed is given back, none of it touched yet.
     lengths = size + 1, size + entries, entries, entries, inner, entries + 1, border, border, border
-    for array, length in zip(made, lengths, strict=True):
+    arrays: list[NDArray[Any]] = list(made)
+    for array, length in zip(arrays, lengths, strict=True):
         array.resize(length, refcheck=False)
     return made
 

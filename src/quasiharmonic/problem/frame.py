@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
@@ -23,7 +25,7 @@ class Frame:
         # Halved first: the extent of numbers near the largest double must not overflow.
         low, high = target.min(axis=0) / 2, target.max(axis=0) / 2
         self.centre = low + high
-        self._exponent = int(np.frexp(np.max(high - low))[1])
+        self._exponent = math.frexp((high - low).max())[1]
 
     def inward(self, uv: FloatArray) -> ComplexArray:
         """Positions (n, 2) as complex numbers in the frame; (n,) complex128."""

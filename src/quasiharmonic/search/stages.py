@@ -17,7 +17,7 @@ from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Combing, Descent, Newton, Patches, Untangling, VectorAdam
 from quasiharmonic.descent.base import FunctionalDescent, Runner, SearchStage, SoFar, Steps
 from quasiharmonic.energy.polishing import polish_map
-from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.exact.certificate import triangle_signs
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.field.tensor import TANH, TensorField, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite, available
@@ -279,7 +279,7 @@ class Search:
         if status in (Status.INJECTIVE, Status.INTERRUPTED):
             w = coarse.prolong(problem.frame.inward(uv))
             mesh = self.problem.domain.mesh("equilateral")
-            flipped = flipped_triangles(self.problem.F, self.problem.positions(w)).size
+            flipped = self._not_positive(w)
             self.best = flipped, 0.0 if flipped == 0 else np.inf
             self.best_map, self.best_reference = w, mesh.kind
             dw = mesh.derivatives(w)
@@ -378,8 +378,8 @@ class Search:
         """Take note of an iterate."""
         flipped = here.flipped
         if flipped == 0:
-            # Decided on the coordinates that are handed back, not on the solver's own.
-            flipped = flipped_triangles(self.problem.F, self.problem.positions(here.w)).size
+            # Not on the solver's own coordinates.
+            flipped = self._not_positive(here.w)
             self._rounded |= flipped > 0
         step = Step(len(self.history), flipped, here.energy)
         self._note(step)
@@ -391,6 +391,11 @@ class Search:
         if tensors and (self.deepest is None or here.energy < self.deepest.energy):
             self.deepest = here
         return step
+
+    def _not_positive(self, w: ComplexArray) -> int:
+        """How many triangles are not, decided exactly on the coordinates that are handed back."""
+        sign, _ = triangle_signs(self.problem.F, self.problem.positions(w))
+        return int(np.count_nonzero(sign <= 0))
 
 
 class _Patience:
