@@ -14,6 +14,7 @@
     with(pattern) \
     with(placing) \
     with(prolongation) \
+    with(point_location) \
     with(reference) \
     with(removal) \
     with(topology) \
