@@ -13,8 +13,8 @@
     with(newton_system) \
     with(pattern) \
     with(placing) \
-    with(prolongation) \
     with(point_location) \
+    with(prolongation) \
     with(reference) \
     with(removal) \
     with(topology) \
