@@ -498,3 +498,21 @@ def _(rng):
     exponent = (1024, -1070)[rng.integers(2)]
     V = np.ldexp(rng.uniform(-0.5, 0.5, (60, 2)), exponent)[::2]
     return V, soup(rng, 30, 200), exponent, np.empty(200), np.empty(200, dtype=np.complex128)
+
+
+@arguments_of("find_cells")
+def _(rng):
+    """In 3 × 2 cells, of which two are divided, and one of their parts again."""
+    parts = np.full(6 + 3 * 16, -1)
+    parts[[1, 4, 6 + 7]] = 6 + 16 * np.arange(3)
+    points = rng.random((50, 2)) * [3 / 4, 2 / 4]
+    points[:3] = [0, 0], [0.25, 0.25], [0.75 - 2.0**-53, 0.5 - 2.0**-53]
+    return points, 3, 38, parts, np.empty(50, dtype=np.int64)
+
+
+@arguments_of("sure_hits")
+def _(rng):
+    """Among points are corners of the triangles, and middles of their sides; some have no triangle listed."""
+    rows, begin = rng.integers(0, 9, (30, 6)) / 8.0, rng.integers(0, 40, 60)
+    points = np.concatenate([rng.random((40, 2)), rows[:10, :2], rows[:10, :2] / 2 + rows[:10, 2:4] / 2])
+    return points, begin, begin + rng.integers(0, 20, 60), rng.integers(0, 30, 60, np.int32), rows, np.empty(60, int)

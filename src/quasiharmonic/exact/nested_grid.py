@@ -124,15 +124,8 @@ class NestedGrid:
         -------
         begin, end : (k,) int64
         """
-        x, y = _coordinates(points).T
-        shift = self._shift
-        cell = (y >> shift) * self._columns + (x >> shift)
-        deeper = np.flatnonzero(self._parts[cell] >= 0)
-        while deeper.size:
-            shift -= 2
-            part = (((y[deeper] >> shift) & 3) << 2) | ((x[deeper] >> shift) & 3)
-            cell[deeper] = self._parts[cell[deeper]] + part
-            deeper = deeper[self._parts[cell[deeper]] >= 0]
+        cell = np.empty(len(points), dtype=np.int64)
+        find_cells(np.ascontiguousarray(points), self._columns, self._shift, self._parts, cell)
         return self._begin[cell], self._begin[cell + 1]
 
     def _first_shift(self) -> int:
@@ -192,6 +185,19 @@ class NestedGrid:
         inner = np.indices((lines, columns))[::-1].reshape(2, -1).T
         place = (corner[:, None, :] + inner).reshape(-1, 2)
         return _Level(place, length, listed[:room], np.zeros(size, dtype=np.bool_))
+
+
+@compiled
+def find_cells(points: FloatArray, columns: int, shift: int, parts: IntArray, cell: IntArray) -> None:
+    """Fill in the numbers of the cells that points of the unit box lie in, (k,)."""
+    x, y = _coordinates(points).T
+    cell[:] = (y >> shift) * columns + (x >> shift)
+    deeper = np.flatnonzero(parts[cell] >= 0)
+    while deeper.size:
+        shift -= 2
+        part = (((y[deeper] >> shift) & 3) << 2) | ((x[deeper] >> shift) & 3)
+        cell[deeper] = parts[cell[deeper]] + part
+        deeper = deeper[parts[cell[deeper]] >= 0]
 
 
 @compiled

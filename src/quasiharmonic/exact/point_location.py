@@ -10,13 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.exact.nested_grid import NestedGrid
 from quasiharmonic.exact.predicates import orientation, twice_area
+from quasiharmonic.kernels import compiled
 
 # The determinant l − r of differences of up to 1 is off by no more: (3u + O(u²)) · 2 with u = 2⁻⁵³.
 _UNSURE = 2.0**-50
+# What stands for a triangle where that is so.
+_UNDECIDED = -2
 # The same as a part of |l| + |r|; and below it what underflow may do.
 _RELATIVE_BOUND, _UNDERFLOW_BOUND = 2.0**-51, 2.0**-1000
 # Barycentric coordinates are taken from determinants whose error is this part of the triangle's own at most.
@@ -60,10 +64,13 @@ class PointLocator:
         found = np.full(len(points), -1, dtype=np.int64)
         for start in range(0, len(points), _POINTS):
             here = points[start : start + _POINTS]
-            for point, triangle in self._candidates(here):
-                # A point's candidates ascend: written backwards, the smallest is the last to be written.
-                hits = np.flatnonzero(self._contain(here, point, triangle))[::-1]
-                found[start + point[hits]] = triangle[hits]
+            boxed = np.flatnonzero(((here >= self._low) & (here <= self._high)).all(axis=1))
+            scaled, hits = np.ldexp(here[boxed], self._exponent), np.empty(boxed.size, dtype=np.int64)
+            begin, end = self._grid.lists(scaled - self._origin)
+            sure_hits(scaled, begin, end, self._grid.listed, self._rows, hits)
+            unsure = np.flatnonzero(hits == _UNDECIDED)
+            hits[unsure] = self._decided(here[boxed[unsure]], begin[unsure], end[unsure])
+            found[start + boxed] = hits
         return found
 
     def barycentric(self, points: FloatArray, triangle: IntArray) -> FloatArray:
@@ -86,28 +93,19 @@ class PointLocator:
             weights[chunk] = self._weights(points[chunk], triangle[chunk])
         return weights
 
-    def _candidates(self, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-        """Pairs of a point and a triangle that may contain it, by point and then by triangle, in portions."""
-        boxed = np.flatnonzero(((points >= self._low) & (points <= self._high)).all(axis=1))
-        begin, end = self._grid.lists(np.ldexp(points[boxed], self._exponent) - self._origin)
-        count = end - begin
-        upto = np.cumsum(count)
-        start = done = 0
-        while start < boxed.size:
-            stop = max(int(np.searchsorted(upto, done + _PAIRS, side="right")), start + 1)
-            which = np.repeat(np.arange(start, stop), count[start:stop])
-            entry = np.arange(done, int(upto[stop - 1])) + (end - upto)[which]
-            yield boxed[which], self._grid.listed[entry].astype(np.int64)
-            start, done = stop, int(upto[stop - 1])
+    def _decided(self, points: FloatArray, begin: IntArray, end: IntArray) -> IntArray:
+        """What `find` returns, for points where floating point does not tell."""
+        found = np.full(len(points), -1, dtype=np.int64)
+        for point, entry in _pairs(begin, end):
+            triangle = self._grid.listed[entry].astype(np.int64)
+            # A point's candidates ascend: written backwards, the smallest is the last to be written.
+            hits = np.flatnonzero(self._contain(points, point, triangle))[::-1]
+            found[point[hits]] = triangle[hits]
+        return found
 
     def _contain(self, points: FloatArray, point: IntArray, triangle: IntArray) -> BoolArray:
         """Whether the closed triangles contain the points paired with them."""
-        x, y = (axis[point] for axis in np.ldexp(points, self._exponent).T)
-        corner = self._rows.take(triangle, axis=0)
-        ax, bx, cx = (corner[:, i] - x for i in (0, 2, 4))
-        ay, by, cy = (corner[:, i] - y for i in (1, 3, 5))
-        least = np.minimum(ax * by - ay * bx, bx * cy - by * cx)
-        np.minimum(least, cx * ay - cy * ax, out=least)
+        least = _least_determinants(np.ldexp(points, self._exponent)[point], self._rows.take(triangle, axis=0))
         contain: BoolArray = least > _UNSURE
         unsure = np.flatnonzero(np.abs(least) <= _UNSURE)
         if unsure.size:
@@ -128,6 +126,49 @@ class PointLocator:
         if poor.size:
             area[:, poor] = _careful_areas(points[poor], self._corners[triangle[poor]])
         return (area / area.sum(axis=0)).T
+
+
+def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of a point and an entry of its list, by point and then by entry, in portions."""
+    count = end - begin
+    upto = np.cumsum(count)
+    start = done = 0
+    while start < begin.size:
+        stop = max(int(np.searchsorted(upto, done + _PAIRS, side="right")), start + 1)
+        point = np.repeat(np.arange(start, stop), count[start:stop])
+        yield point, np.arange(done, int(upto[stop - 1])) + (end - upto)[point]
+        start, done = stop, int(upto[stop - 1])
+
+
+@compiled
+def sure_hits(
+    points: FloatArray,
+    begin: IntArray,
+    end: IntArray,
+    listed: NDArray[np.int32],
+    rows: FloatArray,
+    hits: IntArray,
+) -> None:
+    """Fill in the first of each point's listed triangles that is not surely outside, if it surely contains the point.
+
+    -2 if that is not sure, -1 where all are surely outside. rows: the triangles' corners (f, 6).
+    """
+    hits[:] = -1
+    for point, entry in _pairs(begin, end):
+        triangle = listed[entry]
+        least = _least_determinants(points[point], rows.take(triangle, axis=0))
+        possible = np.flatnonzero(least >= -_UNSURE)[::-1]
+        # Written backwards, the first is the last to be written.
+        hits[point[possible]] = np.where(least > _UNSURE, triangle, _UNDECIDED)[possible]
+
+
+def _least_determinants(points: FloatArray, rows: FloatArray) -> FloatArray:
+    """The least of the determinants of a point with the edges of a triangle, positive inside, for pairs of them."""
+    x, y = points.T
+    ax, bx, cx = (rows[:, i] - x for i in (0, 2, 4))
+    ay, by, cy = (rows[:, i] - y for i in (1, 3, 5))
+    least: FloatArray = np.minimum(ax * by - ay * bx, bx * cy - by * cx)
+    return np.minimum(least, cx * ay - cy * ax, out=least)
 
 
 def _careful_areas(points: FloatArray, corners: FloatArray) -> FloatArray:

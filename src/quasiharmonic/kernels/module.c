@@ -13,6 +13,7 @@
     with(newton_system) \
     with(pattern) \
     with(placing) \
+    with(point_location) \
     with(prolongation) \
     with(reference) \
     with(removal) \

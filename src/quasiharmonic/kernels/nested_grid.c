@@ -102,4 +102,36 @@ static PyObject *divide_cells(PyObject *module, PyObject *const *given, Py_ssize
     return done_with_integer(a, LENGTH(a), together);
 }
 
-PyMethodDef nested_grid_kernels[] = {KERNEL(divide_cells), END_OF_KERNELS};
+/* Coordinate of the finest cell. */
+static int64_t finest(double along)
+{
+    const int64_t last = ((int64_t)1 << BITS) - 1, at = (int64_t)(along * 0x1p40);
+    return at < last ? at : last;
+}
+
+/* (points, columns, shift, parts, cell): the cells that points of the unit box lie in. */
+static PyObject *find_cells(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[5];
+    if (!take("find_cells", given, count, "dnnqQ", a))
+        return NULL;
+    const double *points = a[0].data;
+    const int64_t columns = a[1].integer, *parts = a[3].data;
+    int64_t *cell = a[4].data;
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < a[4].size; i++) {
+        const int64_t x = finest(points[2 * i]), y = finest(points[2 * i + 1]);
+        int shift = (int)a[2].integer;
+        int64_t at = (y >> shift) * columns + (x >> shift);
+        while (parts[at] >= 0) {
+            shift -= 2;
+            at = parts[at] + ((y >> shift & 3) << 2 | (x >> shift & 3));
+        }
+        cell[i] = at;
+    }
+    Py_END_ALLOW_THREADS
+    return done(a, LENGTH(a));
+}
+
+PyMethodDef nested_grid_kernels[] = {KERNEL(divide_cells), KERNEL(find_cells), END_OF_KERNELS};
