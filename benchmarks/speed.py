@@ -187,7 +187,8 @@ def _peak() -> float:
     status = Path("/proc/self/status")
     if status.exists():
         # Linux's resource usage counts what the parent held before this process became another program.
-        return next(float(line.split()[1]) for line in status.read_text().splitlines() if "VmHWM" in line) / 1024
+        lines = status.read_text(encoding="utf-8").splitlines()
+        return next(float(line.split()[1]) for line in lines if "VmHWM" in line) / 1024
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
@@ -228,7 +229,7 @@ def machine() -> str:
     """Processor, cores, threads asked for, versions."""
     model = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
     versions = [f"Python {platform.python_version()}"]
     for package in ("quasiharmonic", "numpy", "scipy", "mkl", "qdldl", "rslab", "libigl", "mouette"):
@@ -290,7 +291,7 @@ def _time(record: Record | None) -> str:
 
 def write_csv(records: list[Record], path: Path) -> None:
     """One line for each tool and problem."""
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         out = csv.writer(file)
         out.writerow(["problem", "triangles", "tool", "seconds", "injective", "iterations", "megabytes", *phases.NAMES])
         for r in records:
@@ -302,7 +303,7 @@ def write_csv(records: list[Record], path: Path) -> None:
 def read_csv(path: Path) -> list[Record]:
     """What `write_csv` wrote, medians for seconds."""
     records = []
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             record = Record(row["problem"], int(row["triangles"]), row["tool"])
             record.seconds = [] if row["seconds"] == "nan" else [float(row["seconds"])]

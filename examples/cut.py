@@ -88,7 +88,7 @@ def main(output: Path, size: int = 12) -> dict[str, Any]:
             source, written, report = (str(Path(folder, file)) for file in ("in.obj", "out.obj", "report.json"))
             io.write_obj(source, io.MeshData(V, F))
             status = qhm(["map", source, "--to", to, "--cut", "--refine", "-o", written, "--json", report])
-            facts = json.loads(Path(report).read_text())
+            facts = json.loads(Path(report).read_text(encoding="utf-8"))
             flat = io.read_mesh(written)
         plot_surface(V, F, axes[0][k])
         mapped = io.mapped(flat)

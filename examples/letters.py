@@ -65,7 +65,7 @@ def main(output: Path, size: int = 20) -> dict[str, Any]:
             source, written, report = (str(Path(folder, file)) for file in ("in.obj", "out.obj", "report.json"))
             io.write_obj(source, io.MeshData(V, F))
             status = qhm(["map", source, "--to", f"letter:{letter}", "-o", written, "--json", report])
-            facts = json.loads(Path(report).read_text())
+            facts = json.loads(Path(report).read_text(encoding="utf-8"))
             uv = io.map_of(io.read_mesh(written))
         fixed = np.concatenate(boundary_loops(F, len(V)))
         problem = Problem(V, F, fixed, uv[fixed])

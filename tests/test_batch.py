@@ -444,11 +444,11 @@ class TestRun:
 
     def test_a_drawing_is_part_of_the_input(self, stars, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        Path("outline.csv").write_text("0,0\n2,0\n2,1\n0,1\n")
+        Path("outline.csv").write_text("0,0\n2,0\n2,1\n0,1\n", encoding="utf-8")
         settings = batch.Settings(to="outline.csv")
         assert batch.run(stars / "a", "out", settings).solved == 1
         assert batch.run(stars / "a", "out", settings).resumed == 1
-        Path("outline.csv").write_text("0,0\n3,0\n3,1\n0,1\n")
+        Path("outline.csv").write_text("0,0\n3,0\n3,1\n0,1\n", encoding="utf-8")
         assert batch.run(stars / "a", "out", settings).resumed == 0
         with pytest.raises(ValueError, match="blob"):
             batch.run(stars, "other", batch.Settings(to="blob:3"))

@@ -234,7 +234,7 @@ class TestPage:
 class TestAgainst:
     def test_only_common_problems_are_compared(self, tmp_path):
         ours = made(tmp_path, 100)
-        with open(tmp_path / "tlc.csv", "w") as file:
+        with open(tmp_path / "tlc.csv", "w", encoding="utf-8") as file:
             file.write("problem,seconds,mips\n")
             file.writelines(f"{row['problem']},{row['seconds'] * 20},3\n" for row in ours[:60])
             file.write("elsewhere/1,5,1\n")

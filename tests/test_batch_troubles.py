@@ -33,7 +33,7 @@ def children_of(process):
 def runs(child):
     """Whether a process is there and not merely waiting for its parent to take notice of its end."""
     try:
-        return Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{child}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
 

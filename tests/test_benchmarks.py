@@ -249,7 +249,7 @@ def test_summary_counts_what_each_fallback_adds():
 )
 def test_wrong_calls_of_the_speed_benchmark_are_refused(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    Path("other.csv").write_text("name,value\na,1\n")
+    Path("other.csv").write_text("name,value\na,1\n", encoding="utf-8")
     with pytest.raises(SystemExit) as ended:
         speed.main(arguments)
     assert ended.value.code == 2

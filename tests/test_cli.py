@@ -208,7 +208,7 @@ class TestReportFails:
         if not Path("/dev/full").exists():
             pytest.skip("no /dev/full on this system")
         command = [sys.executable, "-m", "quasiharmonic", "map", str(star), "-o", str(tmp_path / "o.obj")]
-        with open("/dev/full", "w") as full:
+        with open("/dev/full", "w", encoding="utf-8") as full:
             done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
         assert done.returncode == 3
         assert "is written, but the report failed" in done.stderr
@@ -221,7 +221,7 @@ class TestReportFails:
             pytest.skip("no /dev/full on this system")
         written = tmp_path / ("o.obj" if both else "o.csv")
         command = [sys.executable, "-m", "quasiharmonic", *arguments.format(star, written).split()]
-        with open("/dev/full", "w") as full:
+        with open("/dev/full", "w", encoding="utf-8") as full:
             done = subprocess.run(command, stdout=full, stderr=full if both else subprocess.DEVNULL)
         assert done.returncode == 3
         assert written.exists()

@@ -32,7 +32,7 @@ def test_the_command_offers_every_measure():
 def test_csv_holds_every_digit(stretched, tmp_path):
     path, V, F, uv = stretched
     assert main(["measure", str(path), "--export", str(tmp_path / "faces.csv")]) == 0
-    with open(tmp_path / "faces.csv", newline="") as file:
+    with open(tmp_path / "faces.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     found = distortion(V, F, uv).per_triangle()
     assert [int(row["triangle"]) for row in rows] == list(range(len(F)))

@@ -171,7 +171,7 @@ def nobody_is_left():
 
 
 def parent(pid):
-    with open(f"/proc/{pid}/stat") as file:
+    with open(f"/proc/{pid}/stat", encoding="utf-8") as file:
         return int(file.read().rpartition(")")[2].split()[1])
 
 

@@ -341,4 +341,4 @@ def test_neither_matplotlib_nor_mkl_is_loaded():
         bpy.ops.uv.qhm_fit(to=to)
     assert not [name for name in sys.modules if name.split(".")[0] in {"matplotlib", "mkl", "shapely", "PIL"}]
     maps = Path("/proc/self/maps")
-    assert not maps.exists() or "mkl_" not in maps.read_text()
+    assert not maps.exists() or "mkl_" not in maps.read_text(encoding="utf-8")

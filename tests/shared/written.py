@@ -35,7 +35,7 @@ class Written(NamedTuple):
 def written(path):
     """Read a file of triangles in which every vertex has one place."""
     rows = {"v": [], "vt": [], "f": []}
-    for line in Path(path).read_text().splitlines():
+    for line in Path(path).read_text(encoding="utf-8").splitlines():
         word, *rest = line.split() or [""]
         if word in rows:
             rows[word].append(rest)

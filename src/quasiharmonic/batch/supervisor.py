@@ -316,7 +316,7 @@ def _pump(source: BinaryIO, answers: SimpleQueue[bytes | None]) -> None:
 def resident(pid: int) -> int | None:
     """Resident memory of a process in bytes; None where it cannot be told."""
     with suppress(OSError, IndexError, ValueError, AttributeError):
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     try:
         import psutil
     except ImportError:

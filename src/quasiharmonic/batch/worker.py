@@ -309,13 +309,13 @@ def _versions() -> str:
 def _forget_peak() -> None:
     """Let the highest memory use be counted anew, where the system can do that (Linux)."""
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
 def _peak() -> int | None:
     """Highest resident memory, bytes: since `_forget_peak` on Linux, of the process elsewhere; None if nobody knows."""
     with suppress(OSError, IndexError):
-        return 1024 * int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+        return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
     try:
         import resource
     except ImportError:
