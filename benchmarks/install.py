@@ -1,7 +1,7 @@
 """What an installation takes: seconds, megabytes and the largest packages, for the base and for each extra named.
 
     python benchmarks/install.py              # the base and [mkl]
-    python benchmarks/install.py cut shapes   # the base and these
+    python benchmarks/install.py shapes batch   # the base and these
 
 Each goes into a fresh environment, from this checkout, as the README's first command has it, and makes the demo's
 picture there; with `uv` too where that is installed. Packages come from a cache or the network, which decides the
