@@ -1,6 +1,6 @@
 """What an installation takes: seconds, megabytes and the largest packages, for the base and for each extra named.
 
-    python benchmarks/install.py              # the base and [mkl]
+    python benchmarks/install.py                # the base and [mkl]
     python benchmarks/install.py shapes batch   # the base and these
 
 Each goes into a fresh environment, from this checkout, as the README's first command has it, and makes the demo's
