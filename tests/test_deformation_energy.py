@@ -7,9 +7,20 @@ import pytest
 
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.derivatives import derivative_error
-from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, QuadraticForm, SymmetricDirichlet, UnsignedARAP
+from quasiharmonic.energy.energies import (
+    ARAP,
+    MIPS,
+    AreaPreserving,
+    Combination,
+    Isotropic,
+    QuadraticForm,
+    SymmetricDirichlet,
+    UnsignedARAP,
+    conformal_area_blend,
+)
 from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energy.polishing import ENERGIES
 from quasiharmonic.energy.springs import MassSpring
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.surfaces import grid, random_delaunay
@@ -54,6 +65,61 @@ def test_the_mean_is_that_of_the_measures(name, V, F):
         assert DeformationEnergy(V, F, energy, area=area).value(w) == pytest.approx(
             found.summary(measure).mean, rel=1e-12
         )
+
+
+class Restated(Isotropic):
+    """Another energy, told by its methods alone, so that nobody knows what it is a sum of."""
+
+    barrier = True
+
+    def __init__(self, energy):
+        self.energy = energy
+
+    def density(self, d):
+        return self.energy.density(d)
+
+    def slopes(self, d):
+        return self.energy.slopes(d)
+
+    def bends(self, d):
+        return self.energy.bends(d)
+
+
+@pytest.mark.parametrize("energy", [*ENERGIES.values(), Combination((2.0, conformal_area_blend()), (0.5, MIPS()))])
+def test_energies_of_the_package_are_what_their_methods_say(energy, rng):
+    V, F, w = bowl(300)
+    weights = rng.uniform(0, 2, len(F))
+    one, other = (DeformationEnergy(V, F, each, area=2.0, weights=weights) for each in (energy, Restated(energy)))
+    d = one.deform(w)
+    assert one.value_of(d) == pytest.approx(other.value_of(d), rel=1e-13)
+    np.testing.assert_allclose(one.gradient_of(d, len(V)), other.gradient_of(d, len(V)), rtol=1e-9, atol=1e-12)
+    for negative in (-1.0, 0.0, 1.0):
+        forms = (each.curvature_of(d, negative=negative).matrices() for each in (one, other))
+        np.testing.assert_allclose(*forms, rtol=1e-10, atol=1e-12)
+
+
+def test_an_energy_that_changes_a_part_of_another_is_asked_for_it():
+    """What it has left as it was is the other's, and what it has changed is its own."""
+
+    class Doubled(SymmetricDirichlet):
+        def density(self, d):
+            return 2 * super().density(d)
+
+    class Bent(SymmetricDirichlet):
+        def bends(self, d):
+            return tuple(3 * bend for bend in super().bends(d))
+
+    V, F, w = bowl()
+    plain, doubled, bent, both = (
+        DeformationEnergy(V, F, each)
+        for each in (SymmetricDirichlet(), Doubled(), Bent(), Combination((1, Doubled()), (1, MIPS())))
+    )
+    d = plain.deform(w)
+    assert doubled.value_of(d) == pytest.approx(2 * plain.value_of(d))
+    assert bent.value_of(d) == plain.value_of(d)
+    assert both.value_of(d) == pytest.approx(2 * plain.value_of(d) + DeformationEnergy(V, F, MIPS()).value_of(d))
+    np.testing.assert_array_equal(doubled.gradient_of(d, len(V)), plain.gradient_of(d, len(V)))
+    assert (bent.curvature_of(d, negative=1.0).pp > 1.1 * plain.curvature_of(d, negative=1.0).pp).mean() > 0.5
 
 
 def test_scale_of_map_and_surface_do_not_matter_when_normalised():

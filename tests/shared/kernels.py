@@ -261,6 +261,12 @@ def _(rng):
     return MIXTURES[rng.integers(7)], p, q, det, share, negative, *fields[0], *fields[1]
 
 
+@arguments_of("rigid_proxies")
+def _(rng):
+    p, q, det = strained(rng)
+    return p, q, np.maximum(det, 1e-6), 10.0 ** rng.uniform(0.5, 3), rng.normal(size=p.size), numbers(rng, p.size)
+
+
 @arguments_of("add_up")
 def _(rng):
     """Pairs of entries anywhere, often at the same place."""

@@ -97,7 +97,7 @@ class DeformationEnergy:
 
     def value_of(self, d: Deformation) -> float:
         """The mean energy of a deformation at hand."""
-        mixture = mixture_of(self.energy)
+        mixture = mixture_of(self.energy, "density")
         if mixture is None:
             return float(np.sum(self.share * self.energy.density(d)))
         return mixed_energy(mixture, d.p, d.q, d.det, self.share)
@@ -108,7 +108,7 @@ class DeformationEnergy:
 
     def gradient_of(self, d: Deformation, n: int) -> ComplexArray:
         """The derivative by ``n`` positions for a deformation at hand."""
-        mixture = mixture_of(self.energy)
+        mixture = mixture_of(self.energy, "slopes", "gradient")
         if mixture is None:
             by_p, by_q = (np.ascontiguousarray(by, dtype=np.complex128) for by in self.energy.gradient(d))
         else:
@@ -127,7 +127,7 @@ class DeformationEnergy:
         negative : float
             What negative eigenvalues are multiplied by; see `Energy.curvature`.
         """
-        mixture = mixture_of(self.energy)
+        mixture = mixture_of(self.energy, "slopes", "bends", "curvature")
         if mixture is None:
             return self.energy.curvature(d, negative=negative).scaled(self.share)
         return curvature_of_mixture(mixture, d, self.share, negative)

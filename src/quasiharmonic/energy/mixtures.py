@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
@@ -22,22 +24,30 @@ from quasiharmonic.mesh.reference import blocks
 #: Of which a mixture is made, in the order of its factors.
 OWN: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
 
-_SINGLE: dict[type[Energy], FloatArray] = {
-    type(energy): factors for energy, factors in zip(OWN, np.eye(len(OWN)), strict=True)
-}
 
+def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
+    """The factors of `OWN` of which an energy is the sum, (4,) float64; None where it is something else.
 
-def mixture_of(energy: Energy) -> FloatArray | None:
-    """The factors of `OWN` of which an energy is the sum, (4,) float64; None where it is something else."""
+    ``parts`` are the methods that matter: who derives from one of `OWN` and leaves these as they are counts as it.
+    """
     if type(energy) is not Combination:
-        return _SINGLE.get(type(energy))
+        return _factors(type(energy), parts)
     factors = np.zeros(len(OWN))
     for factor, term in energy.terms:
-        part = mixture_of(term)
+        part = mixture_of(term, *parts)
         if part is None:
             return None
         factors += factor * part
     return factors
+
+
+@cache
+def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
+    for energy, factors in zip(OWN, np.eye(len(OWN)), strict=True):
+        own = type(energy)
+        if issubclass(kind, own) and all(getattr(kind, part) is getattr(own, part) for part in parts):
+            return factors
+    return None
 
 
 def energy_of(mixture: FloatArray) -> Isotropic:

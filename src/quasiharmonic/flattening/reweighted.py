@@ -21,8 +21,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.energy.energies import Deformation, QuadraticForm, SymmetricDirichlet, inverse
+from quasiharmonic.kernels import compiled
+from quasiharmonic.mesh.reference import blocks
 
 #: How far a triangle aims at least and at most, in multiples of its size.
 NEAREST, FARTHEST = 5.0, 1000.0
@@ -50,17 +52,28 @@ class ReweightedDirichlet(SymmetricDirichlet):
 
         ``negative`` plays no part: the form is positive definite.
         """
-        size_p, size_q = np.abs(d.p), np.abs(d.q)
-        larger = size_p + size_q
-        k1, k2 = self._factor(larger), self._factor(d.det / larger)
-        # Twice the angle of u₁ is that of p q; a triangle that is not sheared has no u₁, and k₁ = k₂.
-        turn = (d.p * d.q).conj() * inverse(size_p) * inverse(size_q)
-        none = np.zeros(turn.shape, dtype=np.complex128)
-        return QuadraticForm(pp=k1 + k2, qq=k1 + k2, p2=none, q2=none, pq=2 * (k1 - k2) * turn, pqc=none)
+        both, mixed, none = np.empty(d.det.size), np.empty_like(d.p), np.zeros_like(d.p)
+        rigid_proxies(d.p, d.q, d.det, self.aim, both, mixed)
+        return QuadraticForm(pp=both, qq=both, p2=none, q2=none, pq=mixed, pqc=none)
 
-    def _factor(self, sigma: FloatArray) -> FloatArray:
-        """``(2σ − 2σ⁻³)/(σ − σ*)``, positive at ``σ = σ* = 1`` too."""
-        rigid = 2 * (sigma + 1) * (sigma**2 + 1) / sigma**3
-        # Of σ − 1 and σ − σ* the first is the longer way where σ* is held back.
-        held = np.where(sigma < 1, (self.aim - 1) * sigma, (1 - 1 / self.aim) * sigma)
-        return rigid * np.maximum(1, np.abs(sigma - 1) / held)
+
+@compiled
+def rigid_proxies(
+    p: ComplexArray, q: ComplexArray, det: FloatArray, aim: float, both: FloatArray, mixed: ComplexArray
+) -> None:
+    """Fill in ``k₁ + k₂`` and ``2 (k₁ − k₂)`` times the conjugate of p q over its absolute value, (f,)."""
+    for part in blocks(det.size):
+        size_p, size_q = np.abs(p[part]), np.abs(q[part])
+        larger = size_p + size_q
+        k1, k2 = _factor(larger, aim), _factor(det[part] / larger, aim)
+        # Twice the angle of u₁ is that of p q; a triangle that is not sheared has no u₁, and k₁ = k₂.
+        both[part] = k1 + k2
+        mixed[part] = 2 * (k1 - k2) * (p[part] * q[part]).conj() * inverse(size_p) * inverse(size_q)
+
+
+def _factor(sigma: FloatArray, aim: float) -> FloatArray:
+    """``(2σ − 2σ⁻³)/(σ − σ*)``, positive at ``σ = σ* = 1`` too."""
+    rigid = 2 * (sigma + 1) * (sigma**2 + 1) / sigma**3
+    # Of σ − 1 and σ − σ* the first is the longer way where σ* is held back.
+    held = np.where(sigma < 1, (aim - 1) * sigma, (1 - 1 / aim) * sigma)
+    return rigid * np.maximum(1, np.abs(sigma - 1) / held)

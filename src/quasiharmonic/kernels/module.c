@@ -16,6 +16,7 @@
     with(point_location) \
     with(prolongation) \
     with(reference) \
+    with(reweighted) \
     with(removal) \
     with(topology) \
     with(vector_adam)

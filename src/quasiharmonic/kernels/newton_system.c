@@ -3,8 +3,8 @@
 
 #include <string.h>
 
-/* Triangles at a time: their blocks stay in the core's first cache, and are made by loops without jumps. */
-enum { CHUNK = 64 };
+/* Triangles at a time: their blocks stay in the core's first cache, and of each array enough is read at once. */
+enum { CHUNK = 256 };
 
 /* What the real and the imaginary part of g₁ conj(g₂) and of g₁ g₂ are multiplied by in the entries of a block. */
 typedef struct {
