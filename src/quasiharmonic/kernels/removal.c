@@ -193,15 +193,7 @@ static void take_out(Round *round, int64_t *vertices, int64_t *rings, int64_t *o
         memcpy(rings, ring, (size_t)d * sizeof(*ring));
         rings += d;
         of_degree[d]++;
-        round->gone[v] = 1;
     }
-}
-
-static void keep_others(const Round *round, uint8_t *kept)
-{
-    const int64_t *a = round->T, *b = a + round->f, *c = b + round->f;
-    for (Py_ssize_t j = 0; j < round->f; j++)
-        kept[j] = !(round->gone[a[j]] | round->gone[b[j]] | round->gone[c[j]]);
 }
 
 /* Memory for a round; 0 if there is not enough. A ring claims fewer edges than it has triangles. */
@@ -231,14 +223,14 @@ static void release(Round *round)
     free(round->gone);
 }
 
-/* (T, free, dice, vertices, rings, of_degree, kept): the vertices that one round takes out. */
+/* (T, free, dice, vertices, rings, of_degree): the vertices that one round takes out. */
 static PyObject *remove_vertices(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
-    Argument a[7];
-    if (!take("remove_vertices", given, count, "qbdQQQB", a))
+    Argument a[6];
+    if (!take("remove_vertices", given, count, "qbdQQQ", a))
         return NULL;
-    Round round = {.n = a[1].size, .f = a[6].size, .T = a[0].data, .free = a[1].data, .dice = a[2].data};
+    Round round = {.n = a[1].size, .f = a[0].columns, .T = a[0].data, .free = a[1].data, .dice = a[2].data};
     if (!reserve(&round)) {
         release(&round);
         Py_DECREF(done(a, LENGTH(a)));
@@ -249,7 +241,6 @@ static PyObject *remove_vertices(PyObject *module, PyObject *const *given, Py_ss
     choose(&round);
     sort_chosen(&round);
     take_out(&round, a[3].data, a[4].data, a[5].data);
-    keep_others(&round, a[6].data);
     Py_END_ALLOW_THREADS
     release(&round);
     return done(a, LENGTH(a));
@@ -267,7 +258,7 @@ static Py_ssize_t fill_with_fans(const int64_t *rings, int64_t r, Py_ssize_t d, 
     return k;
 }
 
-/* (T, kept, rings, of_degree, filled): the triangles after a round. */
+/* (T, there, rings, of_degree, filled): the triangles after a round. */
 static PyObject *fill_rings(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -275,18 +266,20 @@ static PyObject *fill_rings(PyObject *module, PyObject *const *given, Py_ssize_t
     if (!take("fill_rings", given, count, "qbqqQ", a))
         return NULL;
     const int64_t *T = a[0].data, *rings = a[2].data, *of_degree = a[3].data;
-    const uint8_t *kept = a[1].data;
+    const uint8_t *there = a[1].data;
     int64_t *filled = a[4].data;
-    const Py_ssize_t before = a[1].size, after = a[4].size / 3;
+    const Py_ssize_t before = a[0].columns, after = a[4].columns;
     Py_BEGIN_ALLOW_THREADS
     Py_ssize_t k = 0;
-    for (Py_ssize_t j = 0; j < before; j++)
-        if (kept[j]) {
-            filled[k] = T[j];
-            filled[after + k] = T[before + j];
-            filled[2 * after + k] = T[2 * before + j];
+    for (Py_ssize_t j = 0; j < before; j++) {
+        const int64_t one = T[j], two = T[before + j], three = T[2 * before + j];
+        if (there[one] & there[two] & there[three]) {
+            filled[k] = one;
+            filled[after + k] = two;
+            filled[2 * after + k] = three;
             k++;
         }
+    }
     for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++) {
         k = fill_with_fans(rings, of_degree[d], d, filled, after, k);
         rings += of_degree[d] * d;
