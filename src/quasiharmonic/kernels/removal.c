@@ -31,7 +31,7 @@ typedef struct {
     /* Where the stars start (n + 1), and they themselves (3 f). */
     int32_t *start;
     Wing *stars;
-    /* In which order vertices are to go (n); infinite for those that are not, and once it or a neighbour has been chosen. */
+    /* In which order vertices are to go (n); infinite for those that are not to, or that are chosen or beside a chosen one. */
     double *order;
     /* Which apex to prefer (n); infinite for held vertices. */
     double *burden;
@@ -42,7 +42,8 @@ typedef struct {
     int32_t *last;
     Claim *claims;
     Py_ssize_t claimed;
-    uint8_t *gone;
+    /* Room for marks of vertices (n), all 0. */
+    uint8_t *marks;
 } Round;
 
 static Py_ssize_t degree(const Round *round, int64_t vertex)
@@ -50,6 +51,7 @@ static Py_ssize_t degree(const Round *round, int64_t vertex)
     return round->start[vertex + 1] - round->start[vertex];
 }
 
+/* Stars of all vertices, by counting. */
 static void gather_stars(Round *round)
 {
     const Py_ssize_t n = round->n, f = round->f;
@@ -102,8 +104,8 @@ static void choose(Round *round)
     }
 }
 
-/* The neighbours of a vertex counterclockwise from that of least burden; 0 if they form no ring. Which of a few numbers is
- * the least, or is equal, is as good as random: to look at all of them takes less time than to guess wrong. */
+/* The neighbours of a vertex counterclockwise from that of least burden; 0 if they form no ring. Here as above all of a
+ * star is looked at: which of its numbers is the least is as good as random, and to have guessed wrong takes longer. */
 static int turn_around(const Round *round, int32_t vertex, int64_t *ring)
 {
     const Wing *star = round->stars + round->start[vertex];
@@ -163,17 +165,16 @@ static int fits(Round *round, const int64_t *ring, Py_ssize_t d)
 static void sort_chosen(Round *round)
 {
     Py_ssize_t place[MOST_NEIGHBOURS + 2] = {0};
-    memset(round->gone, 0, (size_t)round->n);
     for (Py_ssize_t i = 0; i < round->number; i++) {
-        round->gone[round->chosen[i]] = 1;
+        round->marks[round->chosen[i]] = 1;
         place[degree(round, round->chosen[i]) + 1]++;
     }
     for (int d = 1; d <= MOST_NEIGHBOURS; d++)
         place[d] += place[d - 1];
     for (Py_ssize_t v = 0; v < round->n; v++)
-        if (round->gone[v]) {
+        if (round->marks[v]) {
             round->chosen[place[degree(round, v)]++] = (int32_t)v;
-            round->gone[v] = 0;
+            round->marks[v] = 0;
         }
 }
 
@@ -207,8 +208,9 @@ static int reserve(Round *round)
     round->chosen = malloc(n * sizeof(*round->chosen));
     round->last = malloc(n * sizeof(*round->last));
     round->claims = malloc(f * sizeof(*round->claims));
-    round->gone = malloc(n);
-    return round->start && round->stars && round->order && round->burden && round->chosen && round->last && round->claims && round->gone;
+    round->marks = calloc(n, 1);
+    return round->start && round->stars && round->order && round->burden && round->chosen && round->last &&
+           round->claims && round->marks;
 }
 
 static void release(Round *round)
@@ -220,7 +222,7 @@ static void release(Round *round)
     free(round->chosen);
     free(round->last);
     free(round->claims);
-    free(round->gone);
+    free(round->marks);
 }
 
 /* (T, free, dice, vertices, rings, of_degree): the vertices that one round takes out. */
@@ -270,8 +272,10 @@ static PyObject *fill_rings(PyObject *module, PyObject *const *given, Py_ssize_t
     int64_t *filled = a[4].data;
     const Py_ssize_t before = a[0].columns, after = a[4].columns;
     Py_BEGIN_ALLOW_THREADS
-    Py_ssize_t k = 0;
-    for (Py_ssize_t j = 0; j < before; j++) {
+    Py_ssize_t k = 0, stay = after;
+    for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++)
+        stay -= of_degree[d] * (d - 2);
+    for (Py_ssize_t j = 0; j < before && k < stay; j++) {
         const int64_t one = T[j], two = T[before + j], three = T[2 * before + j];
         if (there[one] & there[two] & there[three]) {
             filled[k] = one;

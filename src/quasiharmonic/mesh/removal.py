@@ -1,7 +1,7 @@
 """One round of coarsening: which vertices go, and the triangles that fill the rings they leave.
 
-No two vertices that go are neighbours, each of them and the apex of its ring are free, and no fan brings in an edge that is
-there already or that another fan brings in too. So a round may be taken in any order, and undone in any.
+No two vertices that go are neighbours, and no fan brings in an edge that ends at a held vertex, that is there already, or that
+another fan brings in too. So the vertices may be taken out, and put back, in any order.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ _PER_NEIGHBOUR = 0.35
 def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """What `remove_vertices` fills for triangles (3, f): rings of vertices that are no neighbours share none of them."""
     f = T.shape[1]
-    return tuple(np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
+    vertices, rings, of_degree = (np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
+    return vertices, rings, of_degree
 
 
 @compiled
@@ -189,7 +190,7 @@ def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Bo
     lost[np.delete(repeated, first)] = True
     sizes = [rings.shape[1] for rings in candidates]
     number = np.split(np.arange(sum(sizes)), np.cumsum(sizes))
-    claimant = np.concatenate([some.repeat(len(rings) - 3) for some, rings in zip(number, candidates)])
+    claimant = np.concatenate([some.repeat(len(rings) - 3) for some, rings in zip(number[:-1], candidates, strict=True)])
     good = np.ones(sum(sizes), dtype=bool)
     good[claimant[lost]] = False
     return [good[some] for some in number[:-1]]
