@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.arrays import BoolArray, IntArray
 from quasiharmonic.hearing import still_at_it
 from quasiharmonic.mesh.removal import by_degree, fill_rings, remove_vertices, room_for_round
 

@@ -1,7 +1,7 @@
 """One round of coarsening: which vertices go, and the triangles that fill the rings they leave.
 
-No two vertices that go are neighbours, and no fan brings in an edge that ends at a held vertex, that is there already, or that
-another fan brings in too. So the vertices may be taken out, and put back, in any order.
+No two vertices that go are neighbours, and no fan brings in an edge that ends at a held vertex, that is there already,
+or that another fan brings in too. So the vertices may be taken out, and put back, in any order.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PER_NEIGHBOUR = 0.35
 
 
 def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """What `remove_vertices` fills for triangles (3, f): rings of vertices that are no neighbours share none of them."""
+    """Room for vertices, rings and degrees of a round; vertices that are no neighbours have no triangle in common."""
     f = T.shape[1]
     vertices, rings, of_degree = (np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
     return vertices, rings, of_degree
@@ -65,7 +65,7 @@ def remove_vertices(
     new = _bring_new_edges(T, free.size, [around for _, around in candidates])
     begin = done = 0
     for (some, around), taken in zip(candidates, new, strict=True):
-        d, r = len(around), np.count_nonzero(taken)
+        d, r = len(around), int(taken.sum())
         of_degree[d] = r
         vertices[done : done + r] = some.compress(taken)
         rings[begin : begin + d * r].reshape(r, d).T[:] = around.compress(taken, axis=1)
@@ -183,14 +183,13 @@ def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Bo
     keys = 2 * np.concatenate([*there, claims])
     keys[keys.size - claims.size :] += 1
     keys.sort()
-    step, claimed = np.diff(keys), (keys[1:] & 1).astype(bool)
-    lost = np.isin(claims, keys[1:][claimed & (step == 1)] >> 1)
-    repeated = np.flatnonzero(np.isin(claims, keys[1:][claimed & (step == 0)] >> 1))
+    step, is_claim = np.diff(keys), (keys[1:] & 1).astype(bool)
+    lost = np.isin(claims, keys[1:][is_claim & (step == 1)] >> 1)
+    repeated = np.flatnonzero(np.isin(claims, keys[1:][is_claim & (step == 0)] >> 1))
     _, first = np.unique(claims[repeated], return_index=True)
     lost[np.delete(repeated, first)] = True
-    sizes = [rings.shape[1] for rings in candidates]
-    number = np.split(np.arange(sum(sizes)), np.cumsum(sizes))
-    claimant = np.concatenate([some.repeat(len(rings) - 3) for some, rings in zip(number[:-1], candidates, strict=True)])
-    good = np.ones(sum(sizes), dtype=bool)
-    good[claimant[lost]] = False
-    return [good[some] for some in number[:-1]]
+    size = [rings.shape[1] for rings in candidates]
+    claimed = np.repeat([len(rings) - 3 for rings in candidates], size)
+    good = np.ones(claimed.size, dtype=bool)
+    good[np.arange(claimed.size).repeat(claimed)[lost]] = False
+    return np.split(good, np.cumsum(size)[:-1])
