@@ -13,7 +13,8 @@ from quasiharmonic import Problem, Status, distortion, flipped_triangles, is_inj
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.coarsening import coarsen, touching
-from quasiharmonic.mesh.prolongation import places, prolong
+from quasiharmonic.mesh.prolongation import places, prolong, smooth
+from quasiharmonic.mesh.removal import by_degree, remove_vertices, room_for_round
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.problem import Domain
 from quasiharmonic.search import stages
@@ -22,7 +23,7 @@ from quasiharmonic.search.stages import CoarseToFine
 from quasiharmonic.search.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
-from shared.meshes import boundary_of, lift, random_annulus, signed_areas
+from shared.meshes import boundary_of, lift, random_annulus, signed_areas, tangled
 from shared.told import Told
 
 
@@ -102,6 +103,58 @@ class TestCoarsen:
         np.testing.assert_array_equal(coarse.F, again.F)
 
 
+def removed_by_hand(T, free, dice):
+    """Vertices that a round takes out, with their rings, and what kept others in; vertex by vertex."""
+    triangles = T.T.tolist()
+    following = {v: {} for v in range(free.size)}
+    for t in triangles:
+        for i in range(3):
+            following[t[i]][t[i - 2]] = t[i - 1]
+    left = {v: dice[v] + 0.35 * len(ring) for v, ring in following.items() if free[v] and len(ring) <= 8}
+    chosen = []
+    for _ in range(3):
+        soon = [v for v in left if all(left[v] < left.get(other, np.inf) for other in following[v])]
+        for v in soon:
+            for near in (v, *following[v]):
+                left.pop(near, None)
+        chosen += soon
+    rings, claimed, why = {}, set(), Counter()
+    for v in sorted(chosen, key=lambda v: (len(following[v]), v)):
+        ring = [min(following[v], key=lambda other: (not free[other], len(following[other]) + dice[other]))]
+        while len(ring) < len(following[v]):
+            ring.append(following[v][ring[-1]])
+        if not all(free[other] for other in (ring[0], *ring[2:-1])):
+            why["held"] += 1
+            continue
+        new = {frozenset((ring[0], other)) for other in ring[2:-1]}
+        there = any(set(edge) <= {*following[u], u} for edge in new for u in edge)
+        why["there"] += there
+        why["claimed"] += bool(new & claimed)
+        if not there and not new & claimed:
+            rings[v] = ring
+        claimed |= new
+    return rings, why
+
+
+def test_rounds_take_out_what_they_should():
+    """And the meshes are such that every reason to stay occurs."""
+    whys = Counter()
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        T, free = tangled(rng, 150)
+        dice = 12 * rng.random(free.size)  # so that few neighbours hardly count
+        vertices, rings, of_degree = room_for_round(T)
+        remove_vertices(T, free, dice, vertices, rings, of_degree)
+        found = [ring for some in by_degree(rings, of_degree) for ring in some.tolist()]
+        expected, why = removed_by_hand(T, free, dice)
+        assert dict(zip(vertices.tolist(), found, strict=False)) == expected
+        assert vertices[: len(found)].tolist() == list(expected)
+        whys += why
+    assert whys["held"] > 10
+    assert whys["there"] > 2
+    assert whys["claimed"] > 2
+
+
 def test_touching():
     F = np.array([[0, 1, 2], [2, 1, 3], [3, 4, 5]])
     np.testing.assert_array_equal(
@@ -136,6 +189,32 @@ class TestPlaces:
     def test_are_the_middle_of_a_regular_ring(self):
         ring = 3 + 2 * np.exp(2j * np.pi * np.arange(6) / 6)[None]
         assert places(ring)[0] == pytest.approx(3)
+
+
+class TestSmoothing:
+    def test_takes_vertices_to_the_middle_of_their_neighbours(self, rng):
+        V, F = disk(6)
+        held = np.zeros(len(V), dtype=bool)
+        held[[*boundary_of(F), 7]] = True
+        w = V @ (1, 1j) + 0.01 * rng.random(len(V))
+        pairs = np.unique(np.concatenate([F[:, (0, 1)], F[:, (1, 2)], F[:, (2, 0)]]), axis=0)
+        neighbours = [pairs[pairs[:, 0] == v, 1] for v in range(len(V))]
+        expected = [w[v] if held[v] else w[neighbours[v]].mean() for v in range(len(V))]
+        smooth(w, F, held)
+        np.testing.assert_allclose(w, expected, atol=1e-15)
+
+    def test_inverts_nothing(self):
+        """A spiral, through whose arms the middles of neighbours go."""
+        V, F = disk(30)
+        held = np.zeros(len(V), dtype=bool)
+        held[boundary_of(F)] = True
+        z = V @ (1, 1j)
+        w = np.abs(z) ** 3 * np.exp(10j * np.abs(z)) * z
+        before = w.copy()
+        assert flipped_triangles(F, w.view(float).reshape(-1, 2)).size == 0
+        smooth(w, F, held)
+        assert flipped_triangles(F, w.view(float).reshape(-1, 2)).size == 0
+        assert 0.05 < np.mean(w[~held] == before[~held]) < 0.95
 
 
 @pytest.mark.parametrize(("name", "V", "F", "pins"), meshes(), ids=lambda x: x if isinstance(x, str) else "")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from quasiharmonic.mesh.removal import remove_vertices, room_for_round
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk
+from shared.meshes import tangled
 
 Arguments = tuple[Any, ...]
 ARGUMENTS: dict[str, list[Callable[[np.random.Generator], Arguments]]] = {}
@@ -522,3 +525,67 @@ def _(rng):
     rows, begin = rng.integers(0, 9, (30, 6)) / 8.0, rng.integers(0, 40, 60)
     points = np.concatenate([rng.random((40, 2)), rows[:10, :2], rows[:10, :2] / 2 + rows[:10, 2:4] / 2])
     return points, begin, begin + rng.integers(0, 20, 60), rng.integers(0, 30, 60, np.int32), rows, np.empty(60, int)
+
+
+def round_of_coarsening(rng: np.random.Generator, size: int) -> Arguments:
+    """Arguments of `remove_vertices`: a mesh of which no vertex has been taken out yet."""
+    T, free = tangled(rng, size)
+    return T, free, 12 * rng.random(free.size), *(np.zeros_like(each) for each in room_for_round(T))
+
+
+for size in (0, 1, 60, 300):
+    arguments_of("remove_vertices")(partial(round_of_coarsening, size=size))
+
+
+@arguments_of("remove_vertices")
+def _(rng):
+    """No triangles, and a vertex without."""
+    T = np.empty((3, 0), dtype=np.int64)
+    return T, np.ones(1, dtype=bool), rng.random(1), *(np.zeros_like(each) for each in room_for_round(T))
+
+
+@arguments_of("fill_rings")
+def _(rng):
+    T, free, dice, vertices, rings, of_degree = round_of_coarsening(rng, 200)
+    remove_vertices(T, free, dice, vertices, rings, of_degree)
+    gone = of_degree.sum()
+    there = np.ones(free.size, dtype=bool)
+    there[vertices[:gone]] = False
+    return T, there, rings, of_degree, np.empty((3, T.shape[1] - 2 * gone), dtype=np.int64)
+
+
+@arguments_of("fill_rings")
+def _(rng):
+    """Nothing that goes."""
+    T, free, _, _, rings, of_degree = round_of_coarsening(rng, 20)
+    return T, np.ones(free.size, dtype=bool), rings, of_degree, np.empty_like(T)
+
+
+def rings(rng: np.random.Generator, d: int) -> Arguments:
+    """Some that have a good place, some with a place next to the apex alone, some with none, and odd ones."""
+    ring = np.exp(2j * np.pi * (np.sort(rng.random((200, d)), axis=1))) * 2.0 ** rng.uniform(-3, 0, (200, d))
+    ring[50:80] = numbers(rng, 30, d)
+    ring[80:90, rng.integers(d)] = ring[80:90, rng.integers(d)]
+    ring[90:95], ring[95:98, 1], ring[98:, 2] = 0, np.nan, np.where(np.arange(102) % 9, ring[98:, 2], np.inf)
+    return ring, numbers(rng, 200)
+
+
+for d in range(3, 9):
+    arguments_of("find_places")(partial(rings, d=d))
+arguments_of("find_places")(lambda rng: (numbers(rng, 1, 5), numbers(rng, 1)))
+arguments_of("find_places")(lambda rng: (numbers(rng, 0, 4), numbers(rng, 0)))
+
+
+@arguments_of("smooth")
+def _(rng):
+    """A map that is injective nearly everywhere, and gets inverted triangles."""
+    V, F = disk(9)
+    held = rng.random(len(V)) < 0.1
+    return V[:, 0] * (1 + 9 * V[:, 0] ** 2) + 0.3 * rng.random(len(V)) / 9 + 1j * V[:, 1], F, held
+
+
+@arguments_of("smooth")
+def _(rng):
+    """Triangles corner by corner, and vertices that none of them has."""
+    V, F = disk(5)
+    return numbers(rng, len(V)), np.asfortranarray(F[: len(F) // 2]), np.zeros(len(V), dtype=bool)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.surfaces import annulus, random_delaunay
+from quasiharmonic.surfaces import annulus, disk, random_delaunay
 
 
 def bend(points):
@@ -25,11 +25,11 @@ def lift(points):
 
 def surfaces():
     """(name, V, F): planar and curved, with one loop and with two."""
-    disk, disk_faces = random_delaunay(150, seed=3)
+    flat, flat_faces = random_delaunay(150, seed=3)
     ring, ring_faces = annulus(8)
     return [
-        ("disk", disk, disk_faces),
-        ("bowl", lift(disk), disk_faces),
+        ("disk", flat, flat_faces),
+        ("bowl", lift(flat), flat_faces),
         ("annulus", ring, ring_faces),
         ("curved annulus", lift(ring), ring_faces),
         ("random annulus", *random_annulus()),
@@ -59,3 +59,21 @@ def random_xi(F, scale=0.7, seed=0):
     """A random ξ per triangle."""
     rng = np.random.default_rng(seed)
     return scale * (rng.standard_normal(len(F)) + 1j * rng.standard_normal(len(F)))
+
+
+def tangled(rng, size):
+    """Triangles (3, f) of a disk, many vertices of which have few neighbours, and the same; which are interior (n,)."""
+    V, F = disk(3)
+    F, n = F.tolist(), len(V)
+    for new in range(n, n + size):
+        a, b, c = F[rng.integers(len(F))]
+        split = [t for t in F if a in t and b in t]
+        if len(split) == 2 and rng.random() < 0.7:
+            halves = [[new if v == end else v for v in t] for t in split for end in (a, b)]
+        else:
+            split, halves = [[a, b, c]], [[a, b, new], [b, c, new], [c, a, new]]
+        F = [t for t in F if t not in split] + halves
+    T = np.array(F, dtype=np.int64)
+    free = np.ones(n + size, dtype=bool)
+    free[boundary_of(T)] = False
+    return np.ascontiguousarray(T.T), free

@@ -31,7 +31,7 @@ typedef struct {
     /* Where the stars start (n + 1), and they themselves (3 f). */
     int32_t *start;
     Wing *stars;
-    /* In which order vertices are to go (n); infinite for those that are not, and once it or a neighbour has been chosen. */
+    /* In which order vertices are to go (n); infinite for those that are not to, or that are chosen or beside a chosen one. */
     double *order;
     /* Which apex to prefer (n); infinite for held vertices. */
     double *burden;
@@ -42,7 +42,8 @@ typedef struct {
     int32_t *last;
     Claim *claims;
     Py_ssize_t claimed;
-    uint8_t *gone;
+    /* Room for marks of vertices (n), all 0. */
+    uint8_t *marks;
 } Round;
 
 static Py_ssize_t degree(const Round *round, int64_t vertex)
@@ -50,6 +51,7 @@ static Py_ssize_t degree(const Round *round, int64_t vertex)
     return round->start[vertex + 1] - round->start[vertex];
 }
 
+/* Stars of all vertices, by counting. */
 static void gather_stars(Round *round)
 {
     const Py_ssize_t n = round->n, f = round->f;
@@ -102,8 +104,8 @@ static void choose(Round *round)
     }
 }
 
-/* The neighbours of a vertex counterclockwise from that of least burden; 0 if they form no ring. Which of a few numbers is
- * the least, or is equal, is as good as random: to look at all of them takes less time than to guess wrong. */
+/* The neighbours of a vertex counterclockwise from that of least burden; 0 if they form no ring. Here as above all of a
+ * star is looked at: which of its numbers is the least is as good as random, and to have guessed wrong takes longer. */
 static int turn_around(const Round *round, int32_t vertex, int64_t *ring)
 {
     const Wing *star = round->stars + round->start[vertex];
@@ -163,17 +165,16 @@ static int fits(Round *round, const int64_t *ring, Py_ssize_t d)
 static void sort_chosen(Round *round)
 {
     Py_ssize_t place[MOST_NEIGHBOURS + 2] = {0};
-    memset(round->gone, 0, (size_t)round->n);
     for (Py_ssize_t i = 0; i < round->number; i++) {
-        round->gone[round->chosen[i]] = 1;
+        round->marks[round->chosen[i]] = 1;
         place[degree(round, round->chosen[i]) + 1]++;
     }
     for (int d = 1; d <= MOST_NEIGHBOURS; d++)
         place[d] += place[d - 1];
     for (Py_ssize_t v = 0; v < round->n; v++)
-        if (round->gone[v]) {
+        if (round->marks[v]) {
             round->chosen[place[degree(round, v)]++] = (int32_t)v;
-            round->gone[v] = 0;
+            round->marks[v] = 0;
         }
 }
 
@@ -193,15 +194,7 @@ static void take_out(Round *round, int64_t *vertices, int64_t *rings, int64_t *o
         memcpy(rings, ring, (size_t)d * sizeof(*ring));
         rings += d;
         of_degree[d]++;
-        round->gone[v] = 1;
     }
-}
-
-static void keep_others(const Round *round, uint8_t *kept)
-{
-    const int64_t *a = round->T, *b = a + round->f, *c = b + round->f;
-    for (Py_ssize_t j = 0; j < round->f; j++)
-        kept[j] = !(round->gone[a[j]] | round->gone[b[j]] | round->gone[c[j]]);
 }
 
 /* Memory for a round; 0 if there is not enough. A ring claims fewer edges than it has triangles. */
@@ -215,8 +208,9 @@ static int reserve(Round *round)
     round->chosen = malloc(n * sizeof(*round->chosen));
     round->last = malloc(n * sizeof(*round->last));
     round->claims = malloc(f * sizeof(*round->claims));
-    round->gone = malloc(n);
-    return round->start && round->stars && round->order && round->burden && round->chosen && round->last && round->claims && round->gone;
+    round->marks = calloc(n, 1);
+    return round->start && round->stars && round->order && round->burden && round->chosen && round->last &&
+           round->claims && round->marks;
 }
 
 static void release(Round *round)
@@ -228,17 +222,17 @@ static void release(Round *round)
     free(round->chosen);
     free(round->last);
     free(round->claims);
-    free(round->gone);
+    free(round->marks);
 }
 
-/* (T, free, dice, vertices, rings, of_degree, kept): the vertices that one round takes out. */
+/* (T, free, dice, vertices, rings, of_degree): the vertices that one round takes out. */
 static PyObject *remove_vertices(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
-    Argument a[7];
-    if (!take("remove_vertices", given, count, "qbdQQQB", a))
+    Argument a[6];
+    if (!take("remove_vertices", given, count, "qbdQQQ", a))
         return NULL;
-    Round round = {.n = a[1].size, .f = a[6].size, .T = a[0].data, .free = a[1].data, .dice = a[2].data};
+    Round round = {.n = a[1].size, .f = a[0].columns, .T = a[0].data, .free = a[1].data, .dice = a[2].data};
     if (!reserve(&round)) {
         release(&round);
         Py_DECREF(done(a, LENGTH(a)));
@@ -249,7 +243,6 @@ static PyObject *remove_vertices(PyObject *module, PyObject *const *given, Py_ss
     choose(&round);
     sort_chosen(&round);
     take_out(&round, a[3].data, a[4].data, a[5].data);
-    keep_others(&round, a[6].data);
     Py_END_ALLOW_THREADS
     release(&round);
     return done(a, LENGTH(a));
@@ -267,7 +260,7 @@ static Py_ssize_t fill_with_fans(const int64_t *rings, int64_t r, Py_ssize_t d, 
     return k;
 }
 
-/* (T, kept, rings, of_degree, filled): the triangles after a round. */
+/* (T, there, rings, of_degree, filled): the triangles after a round. */
 static PyObject *fill_rings(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -275,18 +268,22 @@ static PyObject *fill_rings(PyObject *module, PyObject *const *given, Py_ssize_t
     if (!take("fill_rings", given, count, "qbqqQ", a))
         return NULL;
     const int64_t *T = a[0].data, *rings = a[2].data, *of_degree = a[3].data;
-    const uint8_t *kept = a[1].data;
+    const uint8_t *there = a[1].data;
     int64_t *filled = a[4].data;
-    const Py_ssize_t before = a[1].size, after = a[4].size / 3;
+    const Py_ssize_t before = a[0].columns, after = a[4].columns;
     Py_BEGIN_ALLOW_THREADS
-    Py_ssize_t k = 0;
-    for (Py_ssize_t j = 0; j < before; j++)
-        if (kept[j]) {
-            filled[k] = T[j];
-            filled[after + k] = T[before + j];
-            filled[2 * after + k] = T[2 * before + j];
+    Py_ssize_t k = 0, stay = after;
+    for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++)
+        stay -= of_degree[d] * (d - 2);
+    for (Py_ssize_t j = 0; j < before && k < stay; j++) {
+        const int64_t one = T[j], two = T[before + j], three = T[2 * before + j];
+        if (there[one] & there[two] & there[three]) {
+            filled[k] = one;
+            filled[after + k] = two;
+            filled[2 * after + k] = three;
             k++;
         }
+    }
     for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++) {
         k = fill_with_fans(rings, of_degree[d], d, filled, after, k);
         rings += of_degree[d] * d;

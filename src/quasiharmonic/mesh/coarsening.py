@@ -28,9 +28,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.arrays import BoolArray, IntArray
 from quasiharmonic.hearing import still_at_it
-from quasiharmonic.mesh.removal import MOST_NEIGHBOURS, by_degree, fill_rings, remove_vertices
+from quasiharmonic.mesh.removal import by_degree, fill_rings, remove_vertices, room_for_round
 
 # Where so small a share of the vertices is all that a round can take out, it is the last.
 _FEW = 0.04
@@ -89,7 +89,7 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
     goal : int
         How many vertices to leave; more are left where no other can be taken out.
     """
-    names, free = np.arange(n), ~held
+    names, free, there = np.arange(n), ~held, np.ones(n, dtype=bool)
     dice = np.random.default_rng(0).random(n)
     # Corner by corner, (3, f): what is done to all first corners at once is done quickly.
     T: IntArray = np.ascontiguousarray(F.T)
@@ -99,19 +99,19 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
     while left > goal:
         still_at_it()
         if left < _SPARSE * len(names):
-            T, names, free, dice = _renumbered(T, names, free, dice)
-        f = T.shape[1]
-        # No two of the vertices have a triangle in common.
-        vertices, rings, kept = np.empty(f // 3, dtype=np.int64), np.empty(f, dtype=np.int64), np.empty(f, dtype=bool)
-        of_degree = np.empty(MOST_NEIGHBOURS + 1, dtype=np.int64)
-        remove_vertices(T, free, dice, vertices, rings, of_degree, kept)
+            # Numbers for those that are left alone, in the same order.
+            T = (np.cumsum(there) - 1).take(T)
+            names, free, dice, there = names[there], free[there], dice[there], there[there]
+        vertices, rings, of_degree = room_for_round(T)
+        remove_vertices(T, free, dice, vertices, rings, of_degree)
         gone = int(of_degree.sum())
         if gone < _FEW * left:
             break
         if 2 * left <= halved:
             levels[len(rounds)], halved = names[T].T if rounds else F, left
-        filled = np.empty((3, f - 2 * gone), dtype=np.int64)
-        fill_rings(T, kept, rings, of_degree, filled)
+        there[vertices[:gone]] = False
+        filled = np.empty((3, T.shape[1] - 2 * gone), dtype=np.int64)
+        fill_rings(T, there, rings, of_degree, filled)
         T = filled
         rounds.append(_removals(names, vertices, rings, of_degree))
         left -= gone
@@ -122,18 +122,6 @@ def touching(T: IntArray, marked: BoolArray) -> BoolArray:
     """Which triangles have a marked corner; (f,) bool."""
     corners = marked.take(T)
     return corners[:, 0] | corners[:, 1] | corners[:, 2]
-
-
-def _renumbered(
-    T: IntArray, names: IntArray, free: BoolArray, dice: FloatArray
-) -> tuple[IntArray, IntArray, BoolArray, FloatArray]:
-    """The same without the vertices that have gone."""
-    used = np.zeros(len(names), dtype=bool)
-    used[T] = True
-    left = np.flatnonzero(used)
-    number = np.empty(len(names), dtype=np.int64)
-    number[left] = np.arange(left.size)
-    return number.take(T), names[left], free[left], dice[left]
 
 
 def _removals(names: IntArray, vertices: IntArray, rings: IntArray, of_degree: IntArray) -> list[Removal]:

@@ -1,7 +1,7 @@
 """One round of coarsening: which vertices go, and the triangles that fill the rings they leave.
 
-No two vertices that go are neighbours, each of them and the apex of its ring are free, and no fan brings in an edge that is
-there already or that another fan brings in too. So a round may be taken in any order, and undone in any.
+No two vertices that go are neighbours, and no fan brings in an edge that ends at a held vertex, that is there already,
+or that another fan brings in too. So the vertices may be taken out, and put back, in any order.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ _PASSES = 3
 _PER_NEIGHBOUR = 0.35
 
 
+def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Room for vertices, rings and degrees of a round; vertices that are no neighbours have no triangle in common."""
+    f = T.shape[1]
+    vertices, rings, of_degree = (np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
+    return vertices, rings, of_degree
+
+
 @compiled
 def remove_vertices(
-    T: IntArray,
-    free: BoolArray,
-    dice: FloatArray,
-    vertices: IntArray,
-    rings: IntArray,
-    of_degree: IntArray,
-    kept: BoolArray,
+    T: IntArray, free: BoolArray, dice: FloatArray, vertices: IntArray, rings: IntArray, of_degree: IntArray
 ) -> None:
     """Choose the vertices that one round takes out.
 
@@ -48,26 +49,23 @@ def remove_vertices(
         Filled with their neighbours, vertex after vertex, each ring counterclockwise from its apex.
     of_degree : (MOST_NEIGHBOURS + 1,) int64
         Filled with how many of the vertices have so many neighbours.
-    kept : (f,) bool
-        Filled: which triangles stay.
     """
     degree = np.bincount(T.ravel(), minlength=free.size)
     chosen = _independent(T, free, degree, dice)
     # A fan takes edges from the apex's neighbours and gives them to the apex: best if that has few.
     burden = np.where(free, degree + dice, np.inf)
     candidates = []
-    for some, around, triangles in _rings(T, chosen, degree):
+    for some, around in _rings(T, chosen, degree):
         around = _from_apex(around, burden)
         fits = free.take(around[0]) & free.take(around[2:-1]).all(axis=0)
-        candidates.append([each.compress(fits, axis=-1) for each in (some, around, triangles)])
-    of_degree[:], kept[:] = 0, True
+        candidates.append((some.compress(fits), around.compress(fits, axis=1)))
+    of_degree[:] = 0
     if not candidates:
         return
-    new = _bring_new_edges(T, free.size, [around for _, around, _ in candidates])
+    new = _bring_new_edges(T, free.size, [around for _, around in candidates])
     begin = done = 0
-    for (some, around, triangles), taken in zip(candidates, new, strict=True):
-        d, r = len(around), np.count_nonzero(taken)
-        kept[triangles.compress(taken, axis=1)] = False
+    for (some, around), taken in zip(candidates, new, strict=True):
+        d, r = len(around), int(taken.sum())
         of_degree[d] = r
         vertices[done : done + r] = some.compress(taken)
         rings[begin : begin + d * r].reshape(r, d).T[:] = around.compress(taken, axis=1)
@@ -75,8 +73,11 @@ def remove_vertices(
 
 
 @compiled
-def fill_rings(T: IntArray, kept: BoolArray, rings: IntArray, of_degree: IntArray, filled: IntArray) -> None:
-    """Fill in the triangles after a round (3, f − 2r): those of (3, f) that stay, and the fans of r rings."""
+def fill_rings(T: IntArray, there: BoolArray, rings: IntArray, of_degree: IntArray, filled: IntArray) -> None:
+    """Fill in the triangles after a round: those of T (3, f) whose corners are all there, and the fans of the rings."""
+    kept = there.take(T[0])
+    for corner in T[1:]:
+        kept &= there.take(corner)
     parts = [T.compress(kept, axis=1)]
     for some in by_degree(rings, of_degree):
         r, d = some.shape
@@ -115,14 +116,14 @@ def _independent(T: IntArray, free: BoolArray, degree: IntArray, dice: FloatArra
     return chosen
 
 
-def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
-    """Chosen vertices, all interior and no two neighbours, with their rings and triangles, degree by degree.
+def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Chosen vertices, all interior and no two neighbours, with their rings, degree by degree.
 
     Yields
     ------
     vertices : (r,) int64
-    rings, triangles : (d, r) int64
-        Neighbours counterclockwise; triangles in any order.
+    rings : (d, r) int64
+        Neighbours counterclockwise.
     """
     from scipy.sparse import csr_array
 
@@ -143,21 +144,18 @@ def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[I
         np.concatenate([T[(corner + step) % 3].take(place) for corner, place in enumerate(places)]).take(order)
         for step in (1, 2)
     )
-    triangle = np.concatenate(places).take(order)
     del places, order
     begin = done = 0
     for d, count in enumerate(np.bincount(of_degree, minlength=MOST_NEIGHBOURS + 1).tolist()):
         if d < 3 or not count:
             continue
-        tails, heads, triangles = (
-            np.ascontiguousarray(part[begin : begin + d * count].reshape(-1, d).T) for part in (tail, head, triangle)
-        )
+        tails, heads = (np.ascontiguousarray(part[begin : begin + d * count].reshape(-1, d).T) for part in (tail, head))
         rings = np.empty_like(tails)
         rings[0], rings[1] = tails[0], heads[0]
         for i in range(2, d):
             # The triangle whose tail is the last vertex found has the next one for its head.
             rings[i] = (heads[1:] * (tails[1:] == rings[i - 1])).sum(axis=0)
-        yield vertices[done : done + count], rings, triangles
+        yield vertices[done : done + count], rings
         begin, done = begin + d * count, done + count
 
 
@@ -185,14 +183,13 @@ def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Bo
     keys = 2 * np.concatenate([*there, claims])
     keys[keys.size - claims.size :] += 1
     keys.sort()
-    step, claimed = np.diff(keys), (keys[1:] & 1).astype(bool)
-    lost = np.isin(claims, keys[1:][claimed & (step == 1)] >> 1)
-    repeated = np.flatnonzero(np.isin(claims, keys[1:][claimed & (step == 0)] >> 1))
+    step, is_claim = np.diff(keys), (keys[1:] & 1).astype(bool)
+    lost = np.isin(claims, keys[1:][is_claim & (step == 1)] >> 1)
+    repeated = np.flatnonzero(np.isin(claims, keys[1:][is_claim & (step == 0)] >> 1))
     _, first = np.unique(claims[repeated], return_index=True)
     lost[np.delete(repeated, first)] = True
-    sizes = [rings.shape[1] for rings in candidates]
-    number = np.split(np.arange(sum(sizes)), np.cumsum(sizes))
-    claimant = np.concatenate([some.repeat(len(rings) - 3) for some, rings in zip(number, candidates)])
-    good = np.ones(sum(sizes), dtype=bool)
-    good[claimant[lost]] = False
-    return [good[some] for some in number[:-1]]
+    size = [rings.shape[1] for rings in candidates]
+    claimed = np.repeat([len(rings) - 3 for rings in candidates], size)
+    good = np.ones(claimed.size, dtype=bool)
+    good[np.arange(claimed.size).repeat(claimed)[lost]] = False
+    return np.split(good, np.cumsum(size)[:-1])
