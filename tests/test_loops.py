@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from quasiharmonic.exact.certificate import certify, triangle_signs
 from quasiharmonic.exact.loops import contacts, simple_loops
 from quasiharmonic.exact.predicates import SegmentRelation
+from quasiharmonic.mesh.topology import boundary_loops, components
 from shared.exact import exact_orientation, exact_relation
 
 lattice = st.integers(-2, 2).map(float)
@@ -101,3 +102,7 @@ def test_vertices_that_are_not_there():
         certify([[0, 1, 2], [0, 2, 7]], np.eye(4, 2))
     with pytest.raises(ValueError, match=r"F refers to vertex -1"):
         triangle_signs(np.array([[0, 1, -1]]), np.eye(4, 2))
+    with pytest.raises(ValueError, match=r"F refers to vertices 5, 9, but there are only vertices 0 … 3"):
+        boundary_loops([[0, 1, 2], [0, 5, 9]], 4)
+    with pytest.raises(ValueError, match=r"refers to node 9"):
+        components([[0, 1, 2], [0, 2, 9]], 4)
