@@ -87,6 +87,12 @@ def _(rng):
     return rng.integers(0, 50, 30), rng.integers(0, 50, 30), np.empty(50, dtype=np.int64)
 
 
+@arguments_of("link_nodes")
+def _(rng):
+    """A node that is not there, in the first link."""
+    return np.array([9, 0]), np.array([0, 1]), np.arange(9)
+
+
 @arguments_of("follow_loops")
 def _(rng):
     """A short loop, and a long one."""

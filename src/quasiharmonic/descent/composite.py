@@ -163,8 +163,9 @@ def _within(F: IntArray, k: int) -> BoolArray:
     pair = np.flatnonzero(keys[order][1:] == keys[order][:-1])
     one, other = owner[open_[order[pair]]], owner[open_[order[pair + 1]]]
     part = linked(one, other, len(F))
-    inside: BoolArray = np.isin(part, part[owner[forward]])
-    return inside
+    inside: BoolArray = np.zeros(len(F), dtype=bool)
+    inside[part[owner[forward]]] = True
+    return inside[part]
 
 
 def _corners_of_disk(outline: ComplexArray) -> ComplexArray:

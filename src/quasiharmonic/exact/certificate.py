@@ -355,11 +355,10 @@ def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
     """Fill in orientations (f,), 0 where floating point is not sure; how many of these, -1 for ``F`` out of range."""
     if F.size and (F.min() < 0 or F.max() >= len(uv)):
         return -1
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        for start in range(0, len(F), TRIANGLE_CHUNK):
-            chunk = slice(start, start + TRIANGLE_CHUNK)
-            corners = uv.take(F[chunk], axis=0)
-            sign[chunk] = sure_orientation(corners[:, 0], corners[:, 1], corners[:, 2])
+    for start in range(0, len(F), TRIANGLE_CHUNK):
+        chunk = slice(start, start + TRIANGLE_CHUNK)
+        corners = uv.take(F[chunk], axis=0)
+        sign[chunk] = sure_orientation(corners[:, 0], corners[:, 1], corners[:, 2])
     return sign.size - int(np.count_nonzero(sign))
 
 

@@ -107,8 +107,9 @@ def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[
 
 
 def sure_orientation(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
-    """As `orientation` where floating point is sure of it, and 0 elsewhere; NaN and infinity may warn."""
-    return _filtered(a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
+    """As `orientation` where floating point is sure of it, and 0 elsewhere."""
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        return _filtered(a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
 
 
 def _filtered(

@@ -133,7 +133,8 @@ static int64_t root(int64_t *label, int64_t node)
     return node;
 }
 
-/* (tail, head, label): the smallest node of the component of every node of a graph. */
+/* (tail, head, label): the smallest node of the component of every node of a graph; 0 where there is no such node as a
+ * link names. */
 static PyObject *link_nodes(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -143,13 +144,19 @@ static PyObject *link_nodes(PyObject *module, PyObject *const *given, Py_ssize_t
     const int64_t *tails = a[0].data, *heads = a[1].data;
     int64_t *label = a[2].data;
     const Py_ssize_t n = a[2].size, rows = a[0].rows, columns = a[0].columns;
+    int known = 1;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < n; i++)
         label[i] = i;
-    for (Py_ssize_t i = 0; i < rows; i++)
-        for (Py_ssize_t j = 0; j < columns; j++) {
-            const int64_t one = root(label, tails[i * a[0].row_stride + j * a[0].stride]);
-            const int64_t other = root(label, heads[i * a[1].row_stride + j * a[1].stride]);
+    for (Py_ssize_t i = 0; i < rows && known; i++)
+        for (Py_ssize_t j = 0; j < columns && known; j++) {
+            int64_t one = tails[i * a[0].row_stride + j * a[0].stride];
+            int64_t other = heads[i * a[1].row_stride + j * a[1].stride];
+            known = one >= 0 && one < n && other >= 0 && other < n;
+            if (!known)
+                break;
+            one = root(label, one);
+            other = root(label, other);
             if (one < other)
                 label[other] = one;
             else
@@ -159,7 +166,7 @@ static PyObject *link_nodes(PyObject *module, PyObject *const *given, Py_ssize_t
     for (Py_ssize_t i = 0; i < n; i++)
         label[i] = label[label[i]];
     Py_END_ALLOW_THREADS
-    return done(a, LENGTH(a));
+    return done_with_integer(a, LENGTH(a), known);
 }
 
 typedef struct {

@@ -259,13 +259,17 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
         The smallest node of the component.
     """
     label = np.empty(n, dtype=np.int64)
-    link_nodes(tail, head, label)
+    if not link_nodes(tail, head, label):
+        for nodes in (tail, head):
+            check_range("a link", nodes, n, "node", "nodes")
     return label
 
 
 @compiled
-def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> None:
-    """Fill in the smallest node of every node's component (n,)."""
+def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> int:
+    """Fill in the smallest node of every node's component (n,); 0 where a link is out of range, else 1."""
+    if tail.size and (min(tail.min(), head.min()) < 0 or max(tail.max(), head.max()) >= label.size):
+        return 0
     # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
     # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
     # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
@@ -283,3 +287,4 @@ def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> None:
         tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
         np.minimum.at(here, np.maximum(one, other), np.minimum(one, other))
     label[:] = here
+    return 1

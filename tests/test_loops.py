@@ -1,0 +1,108 @@
+"""What floating point decides in a hurry about loops and triangles, against rational arithmetic."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quasiharmonic.exact.certificate import certify, triangle_signs
+from quasiharmonic.exact.loops import contacts, simple_loops
+from quasiharmonic.exact.predicates import SegmentRelation
+from quasiharmonic.mesh.topology import boundary_loops, components
+from shared.exact import exact_orientation, exact_relation
+
+lattice = st.integers(-2, 2).map(float)
+# Near a line through the origin, one unit in the last place to its sides.
+near = st.builds(lambda k, ulps: float(k / 8 * (1 + ulps * 2.0**-52)), st.integers(-8, 8), st.integers(-1, 1))
+tiny = st.builds(lambda k, exponent: float(np.ldexp(k, exponent)), st.integers(-3, 3), st.sampled_from([-1074, 0, 900]))
+coordinates = pytest.mark.parametrize("number", [lattice, near, tiny], ids=["lattice", "near", "tiny"])
+
+
+def simple(places):
+    """Whether a closed polygon meets itself nowhere but where an edge ends and the next begins, all in rationals."""
+    k = len(places)
+    ends = [(places[i], places[(i + 1) % k]) for i in range(k)]
+    for i, j in combinations(range(k), 2):
+        relation = exact_relation(*ends[i], *ends[j])
+        joined = j == i + 1 or (i, j) == (0, k - 1)
+        if relation == SegmentRelation.OVERLAPPING or (relation != SegmentRelation.DISJOINT and not joined):
+            return False
+    return all(tuple(p) != tuple(q) for p, q in ends)
+
+
+@coordinates
+def test_simple_loops(number):
+    @given(st.lists(st.lists(st.tuples(number, number), min_size=3, max_size=9), min_size=1, max_size=3))
+    @settings(deadline=None, max_examples=150)
+    def check(polygons):
+        loops = np.split(np.arange(sum(map(len, polygons))), np.cumsum([len(one) for one in polygons])[:-1])
+        found = simple_loops(loops, np.concatenate([np.array(one) for one in polygons]))
+        assert found.tolist() == [simple(one) for one in polygons]
+
+    check()
+
+
+@coordinates
+def test_contacts(number):
+    @given(
+        st.lists(st.tuples(number, number), min_size=4, max_size=7),
+        st.lists(st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=2, max_size=8),
+    )
+    @settings(deadline=None, max_examples=150)
+    def check(places, ends):
+        ends = [(i, j % len(places)) for i, j in ends]
+        expected = {}
+        for a, b in combinations(range(len(ends)), 2):
+            relation = exact_relation(*(places[i] for i in (*ends[a], *ends[b])))
+            joined = bool(set(ends[a]) & set(ends[b]))
+            if relation == SegmentRelation.OVERLAPPING or (relation != SegmentRelation.DISJOINT and not joined):
+                expected[a, b] = relation
+        found = contacts(np.array(places), np.array(ends), 1000)
+        pairs = [tuple(pair) for pair in found.pairs.tolist()]
+        assert dict(zip(pairs, found.relation.tolist(), strict=True)) == expected
+        assert found.complete and len(pairs) == len(expected)
+
+    check()
+
+
+@coordinates
+def test_signs_of_triangles(number):
+    @given(st.lists(st.tuples(number, number), min_size=3, max_size=6), st.data())
+    @settings(deadline=None, max_examples=100)
+    def check(places, data):
+        corner = st.integers(0, len(places) - 1)
+        F = np.array(data.draw(st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=9)))
+        sign, nonfinite = triangle_signs(F, np.array(places))
+        assert sign.tolist() == [exact_orientation(*(places[i] for i in corners)) for corners in F.tolist()]
+        assert not nonfinite.size
+
+    check()
+
+
+def test_a_loop_of_more_doubtful_pairs_than_edges():
+    """All in one place, along one line, and beside a loop that is simple."""
+    around = np.exp(2j * np.pi * np.arange(400) / 400)
+    circle = np.stack([around.real, around.imag], axis=1)
+    line = np.stack([np.arange(400) % 7, np.arange(400) % 7], axis=1) / 7
+    places = np.concatenate([circle, np.ones((400, 2)), line, circle / 3])
+    loops = np.split(np.arange(1600), [400, 800, 1200])
+    assert simple_loops(loops, places).tolist() == [True, False, False, True]
+    ends = np.stack([np.arange(400, 799), np.arange(401, 800)], axis=1)
+    found = contacts(places, ends, 100)
+    assert len(found.pairs) == 100
+    assert not found.complete
+
+
+def test_vertices_that_are_not_there():
+    with pytest.raises(ValueError, match=r"F refers to vertex 7, but there are only vertices 0 … 3"):
+        certify([[0, 1, 2], [0, 2, 7]], np.eye(4, 2))
+    with pytest.raises(ValueError, match=r"F refers to vertex -1"):
+        triangle_signs(np.array([[0, 1, -1]]), np.eye(4, 2))
+    with pytest.raises(ValueError, match=r"F refers to vertices 5, 9, but there are only vertices 0 … 3"):
+        boundary_loops([[0, 1, 2], [0, 5, 9]], 4)
+    with pytest.raises(ValueError, match=r"refers to node 9"):
+        components([[0, 1, 2], [0, 2, 9]], 4)
