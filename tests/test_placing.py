@@ -138,7 +138,7 @@ def test_however_many_are_placed_at_once_and_whatever_is_around_them(rng):
 def test_tries_are_made_when_fewer_are_left_and_ever_more_rarely():
     tries = Tries()
     assert not tries.due(0)
-    counts = [200, 7, 6, 6, 5, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4]
+    counts = [200, 13, 12, 12, 10, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8]
     assert [k for k, flipped in enumerate(counts) if tries.due(flipped)] == [2, 5, 13]
     # The first map is tried with more.
     assert Tries().due(100)
