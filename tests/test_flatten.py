@@ -9,11 +9,11 @@ from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.derivatives import check_energy
 from quasiharmonic.energy.energies import Deformation, Isotropic, SymmetricDirichlet
 from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.layout import laid_along_axis
-from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid

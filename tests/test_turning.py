@@ -5,9 +5,9 @@ import pytest
 
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.energy.turning import Turning
 from quasiharmonic.flattening.descent import FreeDescent, descend
-from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.flattening.start import disk_start
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import grid, random_delaunay

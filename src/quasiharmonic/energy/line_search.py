@@ -80,8 +80,8 @@ def backtrack(
     return None
 
 
-def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf")) -> Taken[S]:
-    """Double a step that went well in full for as long as the function falls.
+def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf"), *, longer: float = 2.0) -> Taken[S]:
+    """Lengthen a step that went well in full for as long as the function falls.
 
     Far from the minimum barriers fall by powers, and Newton's step is several times too short.
 
@@ -91,11 +91,13 @@ def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf")) -> Tak
         As of `backtrack`.
     limit : float
         The longest length.
+    longer : float
+        How many times as long the next length is; above 1.
     """
-    while taken.t >= 1 and 2 * taken.t <= limit:
+    while taken.t >= 1 and longer * taken.t <= limit:
         still_at_it()
-        value, there = trial(2 * taken.t, taken.value)
+        value, there = trial(longer * taken.t, taken.value)
         if there is None:
             break
-        taken = Taken(2 * taken.t, value, there)
+        taken = Taken(longer * taken.t, value, there)
     return taken

@@ -4,7 +4,7 @@
 
     assemble ──▶ factor ──▶ direction ──▶ t = min(1, 0.9 × first collapse) ──▶ less energy? ──▶ injective, exactly?
        ▲                                          │ ▲            no: t/2 ◀──────────┴────────────────┘ yes
-       └──────────────────────────────────────────┼─┴── t = 1 went well: 2t, 4t, … as long as the energy falls
+       └──────────────────────────────────────────┼─┴── t = 1 went well: 1.5t, … as long as the energy falls
                                                   └── next map
 
 The second derivative of the energy is made positive definite triangle by triangle, in closed form
@@ -34,6 +34,8 @@ HALVINGS = 30
 # Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
 # by the first, and where triangles span many orders of magnitude they are as small as that.
 SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
+# Steps shorter than this share count as cut short, and longer ones as in full; these are tried so many times as long.
+_SHORT, _LONGER = 0.25, 1.5
 # A step that lowers the energy by less than this part of the tolerance is idle; after so many in a row the
 # map has come to rest short of convergence.
 _IDLE, _PATIENCE = 1e-2, 3
@@ -175,6 +177,14 @@ class NewtonDescent:
                 return Status.EXHAUSTED if self._idle >= _PATIENCE else None
         return Status.EXHAUSTED
 
+    def lower(self, energy: Lowered) -> None:
+        """Go on with another energy on the same triangles."""
+        self.energy = energy
+        self.system.take_gradients(energy.g)
+        self._deformation = energy.deform(self.w)
+        self.value = energy.value_of(self._deformation)
+        self._cut, self._shift, self._idle = True, 0, 0
+
     def _system(self, n: int, linear_solver: str) -> NewtonSystem:
         """The matrix of Newton's steps for ``n`` vertices."""
         return NewtonSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver)
@@ -238,6 +248,6 @@ class NewtonDescent:
             taken = backtrack(trial, before, promise, longest=2.0, tries=doublings, factor=lambda t, value: 2.0)
         if taken is None:
             return False
-        self._cut = taken.t < 1
-        _, self.value, (self.w, self._deformation) = extend(trial, taken, limit)
+        self._cut = taken.t < _SHORT
+        _, self.value, (self.w, self._deformation) = extend(trial, taken, limit, longer=_LONGER)
         return True

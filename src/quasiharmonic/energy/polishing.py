@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import FloatArray, IntArray, check_callback, map_array, named, not_negative, whole_number
 from quasiharmonic.curves.rails import Rails
+from quasiharmonic.energy.approach import descend
 from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
 from quasiharmonic.energy.energies import (
     ARAP,
@@ -174,10 +175,13 @@ def polish_map(
     # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never accepted.
     with np.errstate(all="ignore"):
         deformation, exponent = at_own_scale(domain, start, chosen, weights, triangles)
+        descent: NewtonDescent
         if track is None:
             descent = NewtonDescent(deformation, start, domain.fixed, exponent, linear_solver)
+            outcomes = descend(descent, max_iterations, tolerance)
         else:
             descent = SlidingDescent(deformation, track, domain.fixed, domain.loops, exponent, linear_solver)
+            outcomes = descent.descend(max_iterations, tolerance)
     history: list[Step] = []
 
     def report() -> None:
@@ -188,7 +192,7 @@ def polish_map(
     status = Status.STILL_FALLING
     try:
         report()
-        for outcome in descent.descend(max_iterations, tolerance):
+        for outcome in outcomes:
             report()
             status = outcome or status
     except KeyboardInterrupt:

@@ -17,9 +17,9 @@ from quasiharmonic.energy.energies import Energy, QuadraticForm
 from quasiharmonic.energy.line_search import backtrack, extend
 from quasiharmonic.energy.newton_descent import Lowered, NewtonDescent
 from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.energy.turning import Turning, rates
 from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
-from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.result import Status
 
 # Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean

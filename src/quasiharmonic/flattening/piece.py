@@ -15,11 +15,11 @@ from quasiharmonic.arrays import FloatArray, check_callback, counted
 from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.exact.certificate import certify, is_injective
 from quasiharmonic.flattening.cascade import coarse_start
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import FreeDescent, GuardedDescent, descend
-from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.flattening.start import disk_start
 from quasiharmonic.problem import Domain
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step

@@ -16,9 +16,9 @@ from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import SymmetricDirichlet
 from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import FreeDescent, descend
-from quasiharmonic.flattening.reweighted import ReweightedDirichlet
 from quasiharmonic.mesh.coarsening import touching
 from quasiharmonic.mesh.prolongation import positive
 from quasiharmonic.mesh.reference import rest_frames
