@@ -119,7 +119,8 @@ static PyObject *collapses(PyObject *module, PyObject *const *given, Py_ssize_t 
         take_edges(a[1].data, F + 3 * start, size, &by);
         for (Py_ssize_t j = 0; j < size; j++) {
             const double c0 = here.x1[j] * here.y2[j] - here.y1[j] * here.x2[j];
-            const double c1 = here.x1[j] * by.y2[j] - here.y1[j] * by.x2[j] + by.x1[j] * here.y2[j] - by.y1[j] * here.x2[j];
+            const double c1 =
+                here.x1[j] * by.y2[j] - here.y1[j] * by.x2[j] + by.x1[j] * here.y2[j] - by.y1[j] * here.x2[j];
             const double c2 = by.x1[j] * by.y2[j] - by.y1[j] * by.x2[j];
             const double square = c1 * c1, limit = 4 * c0 * c2, rest = square - limit;
             const double root = sqrt(rest > 0 ? rest : 0);

@@ -1,4 +1,4 @@
-/* What `energy/mixtures.py` has compiled: sums of the package's own isotropic energies, a = |p|² and b = |q|². */
+/* What `energy/mixtures.py` has compiled: sums of the package's own isotropic energies, a = |p|^2 and b = |q|^2. */
 #include "arguments.h"
 
 #include <math.h>
@@ -23,7 +23,8 @@ typedef struct {
     double aa[CHUNK], ab[CHUNK], bb[CHUNK];
 } Bends;
 
-static void take_squares(const double *p, const double *q, const double *det, Py_ssize_t start, Py_ssize_t f, Squares *d)
+static void take_squares(const double *p, const double *q, const double *det, Py_ssize_t start, Py_ssize_t f,
+                         Squares *d)
 {
     d->size = f - start < CHUNK ? f - start : CHUNK;
     p += 2 * start;
@@ -160,6 +161,7 @@ static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize
     const Py_ssize_t f = arguments[3].size;
     double total = 0, lost = 0, plain = 0;
     Squares d;
+    Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t start = 0; start < f; start += CHUNK) {
         take_squares(arguments[1].data, arguments[2].data, arguments[3].data, start, f, &d);
         double density[CHUNK] = {0}, part[4] = {0};
@@ -175,6 +177,8 @@ static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize
         lost = (next - total) - more;
         total = next;
     }
+    Py_END_ALLOW_THREADS
+    /* Of what is infinite nothing is lost. */
     return done_with_number(arguments, LENGTH(arguments), isfinite(plain) ? total : plain);
 }
 
@@ -190,6 +194,7 @@ static PyObject *mixed_slopes(PyObject *module, PyObject *const *given, Py_ssize
     const Py_ssize_t f = arguments[3].size;
     Squares d;
     Slopes slopes;
+    Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t start = 0; start < f; start += CHUNK) {
         take_squares(p, q, arguments[3].data, start, f, &d);
         take_slopes(arguments[0].data, &d, &slopes);
@@ -202,6 +207,7 @@ static PyObject *mixed_slopes(PyObject *module, PyObject *const *given, Py_ssize
             by_q[y] = to_q * q[y];
         }
     }
+    Py_END_ALLOW_THREADS
     return done(arguments, LENGTH(arguments));
 }
 
@@ -218,8 +224,8 @@ static double inverse(double x)
     return x > 0 ? divided : 0;
 }
 
-/* Of the forms of a chunk: those of |dp|², |dq|², and what dp², dq², dp dq and dp̄ dq are multiplied by besides the
-   phases of p and q. */
+/* Of the forms of a chunk: what |dp|^2 and |dq|^2 are multiplied by, and what dp^2, dq^2 and both products of dp and dq
+   are multiplied by besides p and q. */
 typedef struct {
     double pp[CHUNK], qq[CHUNK], p2[CHUNK], q2[CHUNK], mixed[CHUNK];
 } Filtered;
@@ -231,7 +237,7 @@ static void filter(const Squares *d, const Slopes *slopes, const Bends *bends, c
         const double a = d->a[j], b = d->b[j], ab = 4 * bends->ab[j], c = share[j];
         const double turn_p = 2 * slopes->a[j], turn_q = 2 * slopes->b[j];
         const double xx = turn_p + 4 * a * bends->aa[j], xy = sqrt(a * b) * ab, yy = turn_q + 4 * b * bends->bb[j];
-        /* The eigenvalues of [xx, xy; xy, yy] are mean ± radius. */
+        /* The eigenvalues of [xx, xy; xy, yy] are mean + radius and mean - radius. */
         const double mean = 0.5 * (xx + yy), half = 0.5 * (xx - yy), radius = sqrt(half * half + xy * xy);
         const double upper = damped(mean + radius, negative), lower = damped(mean - radius, negative);
         const double centre = 0.5 * (upper + lower), kept = 0.5 * (upper - lower) * inverse(radius);
@@ -252,7 +258,8 @@ static PyObject *mixed_curvature(PyObject *module, PyObject *const *given, Py_ss
     Argument arguments[12];
     if (!take("mixed_curvature", given, count, "dzzddxDDZZZZ", arguments))
         return NULL;
-    const double *mixture = arguments[0].data, *p = arguments[1].data, *q = arguments[2].data, *share = arguments[4].data;
+    const double *mixture = arguments[0].data, *p = arguments[1].data, *q = arguments[2].data;
+    const double *share = arguments[4].data;
     double *pp = arguments[6].data, *qq = arguments[7].data, *p2 = arguments[8].data, *q2 = arguments[9].data;
     double *pq = arguments[10].data, *pqc = arguments[11].data;
     const Py_ssize_t f = arguments[3].size;

@@ -6,7 +6,7 @@
 /* Triangles at a time: their blocks stay in the core's first cache, and of each array enough is read at once. */
 enum { CHUNK = 256 };
 
-/* What the real and the imaginary part of g₁ conj(g₂) and of g₁ g₂ are multiplied by in the entries of a block. */
+/* What the real and the imaginary part of g1 conj(g2) and of g1 g2 are multiplied by in the entries of a block. */
 typedef struct {
     double xx[3][CHUNK], yy[3][CHUNK], cross[3][CHUNK], turn[CHUNK];
 } Coefficients;

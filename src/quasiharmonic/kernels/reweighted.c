@@ -3,7 +3,7 @@
 
 #include <math.h>
 
-/* (2 sigma - 2 / sigma^3) / (sigma - sigma*). */
+/* As `_factor` there. */
 static double factor(double sigma, double aim)
 {
     const double rigid = 2 * (sigma + 1) * (sigma * sigma + 1) / (sigma * sigma * sigma);
@@ -29,6 +29,7 @@ static PyObject *rigid_proxies(PyObject *module, PyObject *const *given, Py_ssiz
         return NULL;
     const double *p = a[0].data, *q = a[1].data, *det = a[2].data, aim = a[3].number;
     double *both = a[4].data, *mixed = a[5].data;
+    Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < a[2].size; j++) {
         const double px = p[2 * j], py = p[2 * j + 1], qx = q[2 * j], qy = q[2 * j + 1];
         const double size_p = sqrt(px * px + py * py), size_q = sqrt(qx * qx + qy * qy), larger = size_p + size_q;
@@ -38,6 +39,7 @@ static PyObject *rigid_proxies(PyObject *module, PyObject *const *given, Py_ssiz
         mixed[2 * j] = turn * (px * qx - py * qy);
         mixed[2 * j + 1] = -turn * (px * qy + py * qx);
     }
+    Py_END_ALLOW_THREADS
     return done(a, LENGTH(a));
 }
 
