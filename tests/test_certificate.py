@@ -133,7 +133,7 @@ def test_the_three_verdicts_on_a_triangle():
 
 
 def test_predicate_and_locator_agree_with_the_certificate(rng, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.exact.certificate.TRIANGLE_CHUNK", 7)
+    monkeypatch.setattr("quasiharmonic.exact.triangles.TRIANGLE_CHUNK", 7)
     F = strip(6, rows=5)
     flat = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0), indexing="ij"), axis=-1).reshape(-1, 2)
     for noise in (0.0, 0.1, 0.4, 1.0):

@@ -49,9 +49,8 @@ from quasiharmonic.arrays import (
     true_or_false,
 )
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
-from quasiharmonic.exact.predicates import orientation_or_nonfinite, sure_orientation
+from quasiharmonic.exact.triangles import count_turns, triangle_signs
 from quasiharmonic.given.objects import mesh_triangles
-from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.showing import Shown
 
@@ -59,9 +58,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SignArray = NDArray[np.int8]
-
-# Triangles judged at a time: bounds the memory, and is large enough for the overhead not to show.
-TRIANGLE_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -319,49 +315,6 @@ def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     return triangles, places
 
 
-def triangle_signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
-    """Decide the orientations of triangles (f, 3) int64 among places (n, 2) float64, both contiguous, exactly.
-
-    Returns
-    -------
-    sign : (f,) int8
-        1 for counterclockwise, -1 for clockwise, 0 for no area or a coordinate that is NaN or infinite.
-    nonfinite : (m,) int64
-        Ascending indices of the triangles with such a coordinate.
-
-    Raises
-    ------
-    ValueError
-        When ``F`` names vertices that are not there.
-    """
-    sign, nonfinite = np.empty(len(F), dtype=np.int8), np.empty(0, dtype=np.int64)
-    number = sure_signs(F, uv, sign)
-    if number < 0:
-        check_range("F", F, len(uv))
-    if number:
-        open_ = np.flatnonzero(sign == 0)
-        found = [nonfinite]
-        for start in range(0, open_.size, TRIANGLE_CHUNK):
-            chunk = open_[start : start + TRIANGLE_CHUNK]
-            corners = uv.take(F.take(chunk, axis=0), axis=0)
-            sign[chunk], undefined = orientation_or_nonfinite(corners[:, 0], corners[:, 1], corners[:, 2])
-            found.append(chunk[undefined])
-        nonfinite = np.concatenate(found)
-    return sign, nonfinite
-
-
-@compiled
-def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
-    """Fill in orientations (f,), 0 where floating point is not sure; how many of these, -1 for ``F`` out of range."""
-    if F.size and (F.min() < 0 or F.max() >= len(uv)):
-        return -1
-    for start in range(0, len(F), TRIANGLE_CHUNK):
-        chunk = slice(start, start + TRIANGLE_CHUNK)
-        corners = uv.take(F[chunk], axis=0)
-        sign[chunk] = sure_orientation(corners[:, 0], corners[:, 1], corners[:, 2])
-    return sign.size - int(np.count_nonzero(sign))
-
-
 def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
     """Count and name the triangles that are not positive, by what is wrong with them."""
     return ", ".join(
@@ -406,20 +359,3 @@ def _overwound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArra
     turns[F[sign <= 0]] = 0
     turns[np.concatenate(loops)] = 0
     return np.flatnonzero(turns > 1)
-
-
-@compiled
-def count_turns(F: IntArray, uv: FloatArray, turns: IntArray) -> None:
-    """Add to every vertex (n,) how often the triangles around it wind around it, if they are positive.
-
-    Positive triangles turn counterclockwise around their vertex by less than half a turn each, so one
-    of them passes the direction of the x axis exactly if its next corner lies below the vertex and
-    its last does not; as many do as there are turns.
-    """
-    y = uv[:, 1].copy()
-    for start in range(0, len(F), TRIANGLE_CHUNK):
-        chunk = F[start : start + TRIANGLE_CHUNK]
-        level = y.take(chunk)
-        for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            passing = (level[:, following] < level[:, corner]) & (level[:, last] >= level[:, corner])
-            np.add.at(turns, chunk[:, corner].compress(passing), 1)

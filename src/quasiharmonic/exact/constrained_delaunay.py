@@ -21,8 +21,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.exact.certificate import triangle_signs
 from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.exact.triangles import triangle_signs
 from quasiharmonic.mesh.topology import edge_keys, edges
 
 # Rounding of an orientation and of an in-circle determinant relative to the sum of their terms' magnitudes, with room.

@@ -301,7 +301,7 @@ class _Curves:
 
 
 def _in_turn(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
-    """Vertices loop after loop (k,), where each starts and the last ends (l + 1,), and what follows each vertex (k,)."""
+    """Vertices loop after loop (k,), where each starts and the last ends (l + 1,), and the one after each (k,)."""
     starts = np.cumsum([0, *map(len, loops)])
     following = np.arange(1, starts[-1] + 1)
     following[starts[1:] - 1] = starts[:-1]

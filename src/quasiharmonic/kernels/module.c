@@ -2,7 +2,6 @@
 #include "arguments.h"
 
 #define FILES(with) \
-    with(certificate) \
     with(deformation) \
     with(field) \
     with(guard) \
@@ -19,6 +18,7 @@
     with(reweighted) \
     with(removal) \
     with(topology) \
+    with(triangles) \
     with(vector_adam)
 
 #define DECLARED(file) extern PyMethodDef file##_kernels[];

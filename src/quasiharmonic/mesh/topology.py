@@ -268,15 +268,16 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
 @compiled
 def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> int:
     """Fill in the smallest node of every node's component (n,); 0 where a link is out of range, else 1."""
-    if tail.size and (min(tail.min(), head.min()) < 0 or max(tail.max(), head.max()) >= label.size):
-        return 0
     # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
     # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
     # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
     tail, head = tail.ravel(), head.ravel()
-    here = np.arange(label.size)
+    here, low, high = np.arange(label.size), np.minimum(tail, head), np.maximum(tail, head)
+    if low.min(initial=0) < 0 or high.max(initial=-1) >= label.size:
+        return 0
     # Any smaller neighbour will do to begin with, and there is nothing to look up yet.
-    here[np.maximum(tail, head)] = np.minimum(tail, head)
+    here[high] = low
+    del low, high
     while True:
         while not np.array_equal(here, root := here[here]):
             here = root

@@ -17,7 +17,7 @@ from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Combing, Descent, Newton, Patches, Untangling, VectorAdam
 from quasiharmonic.descent.base import FunctionalDescent, Runner, SearchStage, SoFar, Steps
 from quasiharmonic.energy.polishing import polish_map
-from quasiharmonic.exact.certificate import triangle_signs
+from quasiharmonic.exact.triangles import triangle_signs
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.field.tensor import TANH, TensorField, own_tensor
 from quasiharmonic.linsolve import NotPositiveDefinite, available

@@ -1,4 +1,4 @@
-/* What `exact/certificate.py` has compiled. */
+/* What `exact/triangles.py` has compiled. */
 #include "arguments.h"
 #include "predicates.h"
 
@@ -49,4 +49,4 @@ static PyObject *count_turns(PyObject *module, PyObject *const *given, Py_ssize_
     return done(a, LENGTH(a));
 }
 
-PyMethodDef certificate_kernels[] = {KERNEL(sure_signs), KERNEL(count_turns), END_OF_KERNELS};
+PyMethodDef triangles_kernels[] = {KERNEL(sure_signs), KERNEL(count_turns), END_OF_KERNELS};
