@@ -25,8 +25,8 @@ from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.energy.deformation import signed_areas
 from quasiharmonic.kernels import compiled
 
-# Inverted triangles at most for a try: with more it mostly fails, and may take longer than a step of the descent. The
-# first map, from which the way may be far, is tried with more.
+# Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step where it is not
+# compiled. The first map, from which the way may be far, is tried with more.
 _MOST_FLIPS, _MOST_AT_FIRST = 12, 100
 # After a try in vain the next is made when so large a part of the inverted triangles is left, or after as many steps
 # again and two more.
