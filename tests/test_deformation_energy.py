@@ -12,6 +12,7 @@ from quasiharmonic.energy.energies import (
     MIPS,
     AreaPreserving,
     Combination,
+    Energy,
     Isotropic,
     QuadraticForm,
     SymmetricDirichlet,
@@ -120,6 +121,19 @@ def test_an_energy_that_changes_a_part_of_another_is_asked_for_it():
     assert both.value_of(d) == pytest.approx(2 * plain.value_of(d) + DeformationEnergy(V, F, MIPS()).value_of(d))
     np.testing.assert_array_equal(doubled.gradient_of(d, len(V)), plain.gradient_of(d, len(V)))
     assert (bent.curvature_of(d, negative=1.0).pp > 1.1 * plain.curvature_of(d, negative=1.0).pp).mean() > 0.5
+
+
+def test_a_derivative_that_is_one_number():
+    class Stretch(Energy):
+        def density(self, d):
+            return d.a + d.q.real
+
+        def gradient(self, d):
+            return 2 * d.p, 1.0
+
+    V, F, w = bowl()
+    E = DeformationEnergy(V, F, Stretch())
+    assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6
 
 
 def test_scale_of_map_and_surface_do_not_matter_when_normalised():

@@ -110,7 +110,8 @@ class DeformationEnergy:
         """The derivative by ``n`` positions for a deformation at hand."""
         mixture = mixture_of(self.energy, "slopes", "gradient")
         if mixture is None:
-            by_p, by_q = (np.ascontiguousarray(by, dtype=np.complex128) for by in self.energy.gradient(d))
+            slopes = (np.broadcast_to(by, d.p.shape) for by in self.energy.gradient(d))
+            by_p, by_q = (np.ascontiguousarray(by, dtype=np.complex128) for by in slopes)
         else:
             by_p, by_q = np.empty_like(d.p), np.empty_like(d.q)
             mixed_slopes(mixture, d.p, d.q, d.det, by_p, by_q)
