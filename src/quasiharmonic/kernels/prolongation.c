@@ -98,8 +98,8 @@ static Point best_place(const Point *ring, Py_ssize_t d)
     const Point arms[] = {difference(centre, apex), inwards(ring, d)};
     for (int likely = 0; likely < 2 && (!likely || isinf(lowest)); likely++)
         for (int k = 0; k < 5; k++) {
-            const double far = k < 2 ? TOWARDS_MIDDLE[likely][k] : INWARDS[likely][k - 2];
-            const Point *arm = &arms[k >= 2], place = {apex.x + far * arm->x, apex.y + far * arm->y};
+            const double reach = k < 2 ? TOWARDS_MIDDLE[likely][k] : INWARDS[likely][k - 2];
+            const Point *arm = &arms[k >= 2], place = {apex.x + reach * arm->x, apex.y + reach * arm->y};
             const double here = shape(place, ring, d);
             if (here < lowest) {
                 lowest = here;

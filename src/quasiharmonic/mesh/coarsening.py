@@ -34,7 +34,7 @@ from quasiharmonic.mesh.removal import by_degree, fill_rings, remove_vertices, r
 
 # Where so small a share of the vertices is all that a round can take out, it is the last.
 _FEW = 0.04
-# Where so many of the numbers are of vertices that are left, the others are taken out of the arrays.
+# Where a smaller share of the numbers is of vertices that are left, the others are taken out of the arrays.
 _SPARSE = 0.7
 
 
