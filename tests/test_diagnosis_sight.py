@@ -12,7 +12,7 @@ from quasiharmonic.exact.diagnosis import Kind, diagnose, examine, shortcuts
 from quasiharmonic.exact.diagnosis.clearance import clear
 from quasiharmonic.exact.diagnosis.clipping import Lattice
 from quasiharmonic.exact.diagnosis.effort import Effort
-from quasiharmonic.exact.diagnosis.triangulation import triangulate
+from quasiharmonic.exact.triangulation import triangulate
 from quasiharmonic.exact.diagnosis.views import Views
 from quasiharmonic.exact.loops import contacts, winding
 from quasiharmonic.exact.predicates import SegmentRelation, orientation, segment_relation
