@@ -68,6 +68,12 @@ class Settings:
         """Whether problems are plain meshes."""
         return self.flatten or self.to is not None
 
+    @property
+    def together(self) -> bool:
+        """Whether small problems may be solved several at a time, as `quasiharmonic.batch.together` does."""
+        alone = self.flatten or self.cut or self.refine or self.slide or self.polish is not None
+        return not alone and self.reference in (None, "equilateral")
+
     def key(self, files: ProblemFiles) -> str:
         """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.
 
