@@ -13,8 +13,11 @@ from quasiharmonic.io import READERS, problem_files
 
 #: A file that marks a folder as the output of a run; nothing in there is a problem.
 MARKER = "qhm-batch.json"
-#: Bytes of a mesh that may be small, 4,000 triangles or so, and of those that are solved together, some 28,000.
-SMALL_FILE, GROUP_OF_FILES = 300_000, 1_500_000
+#: Bytes of a mesh that is small, some 1,500 triangles, beyond which most searches begin in another way, and of those
+#: that are solved together, some 28,000.
+SMALL_FILE, GROUP_OF_FILES = 100_000, 1_500_000
+# Problems that are solved together, at most: what happens to one of them has all solved by themselves.
+_MOST = 64
 
 # In a list; a name may have the sign inside.
 _COMMENT = re.compile(r"(?:^|\s)#")
@@ -89,7 +92,7 @@ def small_together(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFil
             bytes_ = os.stat(problem.mesh).st_size
         except OSError:
             bytes_ = SMALL_FILE + 1
-        if group and size + bytes_ > GROUP_OF_FILES:
+        if group and (size + bytes_ > GROUP_OF_FILES or len(group) == _MOST):
             yield group
             group, size = [], 0
         if bytes_ > SMALL_FILE:

@@ -1,9 +1,9 @@
 """The outline of one glyph of a TrueType font, straight from its tables.
 
-What matplotlib loads before it can be asked takes a tenth of a second, a third of what mapping a small mesh takes in all,
-and the fonts that letters are made of by default are of this kind. What is handed back is what FreeType makes of such a
-glyph at 100 pixels, unhinted, to the last bit: points rounded to 1/64 of a pixel, ties away from zero [1]_. Whatever is
-not as plain as that is None: matplotlib can be asked.
+What matplotlib loads before it can be asked takes a tenth of a second, a third of what mapping a small mesh takes in
+all, and the font that letters are made of by default is of this kind. What is handed back is what FreeType makes of
+such a glyph at 100 pixels, unhinted, to the last bit: points rounded to 1/64 of a pixel, ties away from zero [1]_. What
+is not as plain as that is None: matplotlib can be asked.
 
 References
 ----------
@@ -32,13 +32,13 @@ _ON, _X_BYTE, _Y_BYTE, _REPEAT, _X_SAME, _Y_SAME = 1, 2, 4, 8, 16, 32
 _WORDS, _OFFSETS, _SCALED, _MORE, _METRICS = 0x1, 0x2, 0x8 | 0x40 | 0x80, 0x20, 0x200
 # The tables that are read.
 _TABLES = {b"head", b"maxp", b"hhea", b"hmtx", b"cmap", b"loca", b"glyf"}
-# Components within components, at most.
-_DEEPEST = 4
+# Components of a glyph, those of components included, at most.
+_COMPONENTS = 64
 
 Contours = list[tuple[IntArray, IntArray]]
 
 
-class _Other(Exception):
+class _OtherError(Exception):
     """Something that is not plain TrueType."""
 
 
@@ -62,7 +62,7 @@ def glyph(file: Path, character: str) -> list[Pieces] | None:
         return None
     try:
         contours = _Font(file.read_bytes()).contours(code)
-    except (OSError, struct.error, IndexError, ValueError, _Other):
+    except (OSError, struct.error, ArithmeticError, IndexError, ValueError, _OtherError):
         return None
     return [_pieces(points, on.tolist()) for points, on in contours if len(points)]
 
@@ -73,11 +73,11 @@ class _Font:
     def __init__(self, data: bytes) -> None:
         kind, count = struct.unpack_from(">4sH", data)
         if kind not in (b"\0\1\0\0", b"true"):
-            raise _Other
+            raise _OtherError
         entries = struct.iter_unpack(">4s4xII", data[12 : 12 + 16 * count])
         self._tables = {name: data[start : start + length] for name, start, length in entries}
         if b"fvar" in self._tables or not set(self._tables) >= _TABLES:
-            raise _Other
+            raise _OtherError
         head = self._tables[b"head"]
         (self._units,), (long,) = struct.unpack_from(">H", head, 18), struct.unpack_from(">h", head, 50)
         (glyphs,) = struct.unpack_from(">H", self._tables[b"maxp"], 4)
@@ -89,8 +89,9 @@ class _Font:
         """Points of a character's contours in 1/64 of a pixel, and which of them are on the curve."""
         number = self._number(code)
         if number == 0:
-            raise _Other
-        contours, left = self._glyph(number, 0)
+            raise _OtherError
+        self._components = 0
+        contours, left = self._glyph(number)
         return [(points - (left, 0), on) for points, on in contours]
 
     def _number(self, code: int) -> int:
@@ -101,7 +102,7 @@ class _Font:
             if (platform, encoding) == (3, 1) and struct.unpack_from(">H", table, start) == (4,):
                 break
         else:
-            raise _Other
+            raise _OtherError
         (twice,) = struct.unpack_from(">H", table, start + 6)
         # The last codes of the segments, two bytes of nothing, the first codes, shifts, and where there are lists.
         words = np.frombuffer(table, ">u2", offset=start + 14, count=(len(table) - start - 14) // 2).astype(np.int64)
@@ -115,7 +116,7 @@ class _Font:
         found = int(words[3 * n + 1 + k + listed // 2 + code - first])
         return (found + int(shift)) % 0x10000 if found else 0
 
-    def _glyph(self, number: int, depth: int) -> tuple[Contours, int]:
+    def _glyph(self, number: int) -> tuple[Contours, int]:
         """Contours of a glyph, and where the pen stands before it is drawn."""
         start, end = self._starts[number : number + 2].tolist()
         data = self._tables[b"glyf"][start:end]
@@ -126,7 +127,7 @@ class _Font:
         at = 4 * number + 2 if number < self._advances else 2 * (number + self._advances)
         (bearing,) = struct.unpack_from(">h", self._tables[b"hmtx"], at)
         left = int(self._scaled(np.array(lowest - bearing)))
-        return (self._simple(data, count), left) if count >= 0 else self._composite(data, left, depth)
+        return (self._simple(data, count), left) if count >= 0 else self._composite(data, left)
 
     def _simple(self, data: bytes, count: int) -> Contours:
         """A glyph with contours of its own."""
@@ -153,17 +154,18 @@ class _Font:
         points = self._scaled(points)
         return [(points[a:b], on[a:b]) for a, b in pairwise([0, *ends.tolist()])]
 
-    def _composite(self, data: bytes, left: int, depth: int) -> tuple[Contours, int]:
+    def _composite(self, data: bytes, left: int) -> tuple[Contours, int]:
         """A glyph made of others, each moved, one of which may say where the pen stands."""
         found: Contours = []
         at, flags = 10, _MORE
         while flags & _MORE:
             flags, number = struct.unpack_from(">HH", data, at)
-            if flags & _SCALED or not flags & _OFFSETS or depth == _DEEPEST:
-                raise _Other
+            self._components += 1
+            if flags & _SCALED or not flags & _OFFSETS or self._components > _COMPONENTS:
+                raise _OtherError
             offset = self._scaled(np.array(struct.unpack_from(">hh" if flags & _WORDS else ">bb", data, at + 4)))
             at += 8 if flags & _WORDS else 6
-            contours, own = self._glyph(number, depth + 1)
+            contours, own = self._glyph(number)
             found += [(points + offset, on) for points, on in contours]
             left = own if flags & _METRICS else left
         return found, left
