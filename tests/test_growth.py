@@ -13,6 +13,8 @@ import pytest
 from quasiharmonic import Problem, certify, io, solve
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.field.objective import Objective
+from quasiharmonic.kernels import extension
+from quasiharmonic.linsolve import available
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.mesh.coarsening import coarsen
 from quasiharmonic.mesh.prolongation import prolong
@@ -209,6 +211,9 @@ class TestImports:
         found = self.modules(f"from quasiharmonic.cli import main; assert main({words!r}) == 0")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
         assert not found & {"scipy.sparse.linalg", "quasiharmonic.cli.flatten", "quasiharmonic.plot"}
+        if available()[0] == "pardiso" and extension is not None:
+            # The other solvers take SciPy's matrices.
+            assert "scipy" not in found
         if letter == "R":
             # What a map onto it takes, or else it would say nothing that Qhull was not loaded.
             assert "composite" in (tmp_path / "j").read_text()
