@@ -123,7 +123,7 @@ def sources_digest() -> str:
     """Digest of the package's sources, as they were when first asked, but for those that only show what came out."""
     package = Path(__file__).parent.parent
     digest = blake2b(digest_size=16)
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted([*package.rglob("*.py"), *package.rglob("*.[ch]")]):
         place = path.relative_to(package).as_posix()
         if not place.startswith(("cli/", "plot/", "report/")):
             contents = path.read_bytes()
