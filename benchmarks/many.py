@@ -187,7 +187,7 @@ def measure(name: str, options: argparse.Namespace, jobs: list[int]) -> list[str
         ratio = (clock.done / clock.processor) / (against.done / against.processor)
         rows.append(
             f"| {name} | {label} | {clock.done:,} | {clock.solved:,} | {clock.done / clock.wall:.0f} | "
-            f"{1000 * clock.processor / clock.done:.3g} | {ratio:.1f} |"
+            f"{1000 * clock.processor / clock.done:.3g} | {ratio:.2g} |"
         )
         print(rows[-1], flush=True)
     print(f"{name}: {np.mean(sizes):.0f} triangles on average", flush=True)
