@@ -17,3 +17,5 @@ def troubled(monkeypatch):
     from shared.commands import TROUBLED
 
     monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
+    # Several that get nowhere are soon solved one by one.
+    monkeypatch.setattr(supervisor, "TOGETHER", 1.0)

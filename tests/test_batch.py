@@ -500,17 +500,19 @@ class TestRun:
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
         """Thousands of folders with a file each that nobody looks into."""
 
-        def attend(supervisor, files):
-            records.clear(supervisor.orders.folder(files.name))
-            records.write_record(supervisor.orders.folder(files.name), {"problem": files.name, "outcome": "injective"})
-            return Finished(files.name, "injective", 0.0)
+        def attend_all(supervisor, some):
+            for files in some:
+                folder = supervisor.orders.folder(files.name)
+                records.clear(folder)
+                records.write_record(folder, {"problem": files.name, "outcome": "injective"})
+                yield Finished(files.name, "injective", 0.0)
 
         def look(progress):
             if progress.done in (100, 1000):
                 held = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/batch/*.py")])
                 sizes[progress.done] = sum(trace.size for trace in held.traces)
 
-        monkeypatch.setattr(supervisor.Supervisor, "attend", attend)
+        monkeypatch.setattr(supervisor.Supervisor, "attend_all", attend_all)
         for k in range(1000):
             folder = tmp_path / "set" / f"{k // 50}" / f"{k}"
             folder.mkdir(parents=True)

@@ -168,7 +168,7 @@ def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
     out, straight = tmp_path / "killed", tmp_path / "straight"
     run = (
         "from quasiharmonic import batch; from quasiharmonic.batch import supervisor; "
-        f"supervisor.COMMAND = {TROUBLED!r}; batch.run({str(source)!r}, {str(out)!r}, jobs=2)"
+        f"supervisor.COMMAND, supervisor.TOGETHER = {TROUBLED!r}, 1.0; batch.run({str(source)!r}, {str(out)!r}, jobs=2)"
     )
     driver = subprocess.Popen([sys.executable, "-c", run])
     while len(list(out.rglob("record.json"))) < 5:

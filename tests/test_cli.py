@@ -9,6 +9,7 @@ import platform
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -471,13 +472,14 @@ def test_help_imports_no_numerics():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
-@pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.__name__.split(".")[-1])
+@pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_subcommand_explains_itself(command):
     """Its page in the documentation is made from this and nothing else."""
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
-    command.add_parser(commands)
+    import_module(f"quasiharmonic.cli.{cli.COMMANDS[command]}").add_parser(commands)
     ((name, subparser),) = commands.choices.items()
+    assert name == command
     assert re.search(rf"^ +{name} +\w+", parser.format_help(), re.MULTILINE)
     # An option without a help text stands alone on its line, and so does nothing else.
     assert not re.findall(r"^  -[^ ]+(?:, --[\w-]+)?(?: [A-Z]+)?$(?!\n {10})", subparser.format_help(), re.MULTILINE)

@@ -9,6 +9,7 @@ from quasiharmonic import Problem, solve
 from quasiharmonic.descent import Composite, VectorAdam
 from quasiharmonic.descent.composite import composite_map, polygon_triangles
 from quasiharmonic.energy.deformation import signed_areas
+from quasiharmonic.exact.constrained_delaunay import delaunay_of_polygon
 from quasiharmonic.field.objective import Objective
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import annulus, disk
@@ -38,6 +39,16 @@ def test_a_polygon_is_covered_once_without_further_corners(rng, corners):
     assert len(F) == corners - 2
     assert area.min() > 0
     assert np.isclose(area.sum(), 0.5 * (outline.conj() * np.roll(outline, -1)).imag.sum())
+
+
+@pytest.mark.parametrize("corners", [101, 200])
+def test_few_corners_are_triangulated_as_many_are(rng, corners):
+    """By a sweep and flips, and by Qhull and flips within a box: the Delaunay triangulation is one."""
+    outline = rng.uniform(0.2, 1, corners) * np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, corners)))
+    swept = delaunay_of_polygon(np.stack([outline.real, outline.imag], axis=1))
+    assert {tuple(np.roll(t, -t.argmin())) for t in swept} == {
+        tuple(np.roll(t, -t.argmin())) for t in polygon_triangles(outline)
+    }
 
 
 def test_what_meets_itself_or_runs_clockwise_has_no_triangles():

@@ -12,10 +12,10 @@ from quasiharmonic.exact.diagnosis import Kind, diagnose, examine, shortcuts
 from quasiharmonic.exact.diagnosis.clearance import clear
 from quasiharmonic.exact.diagnosis.clipping import Lattice
 from quasiharmonic.exact.diagnosis.effort import Effort
-from quasiharmonic.exact.diagnosis.triangulation import triangulate
 from quasiharmonic.exact.diagnosis.views import Views
 from quasiharmonic.exact.loops import contacts, winding
 from quasiharmonic.exact.predicates import SegmentRelation, orientation, segment_relation
+from quasiharmonic.exact.triangulation import triangulate
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
 from shared.meshes import boundary_of

@@ -10,9 +10,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, certify, solve
+from quasiharmonic import Problem, certify, io, solve
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.field.objective import Objective
+from quasiharmonic.kernels import extension
+from quasiharmonic.linsolve import available
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.mesh.coarsening import coarsen
 from quasiharmonic.mesh.prolongation import prolong
@@ -190,10 +192,28 @@ class TestImports:
         assert len(found - self.modules("pass")) < 60
 
     def test_neither_does_the_help(self):
-        found = self.modules("from quasiharmonic.cli import _parser; _parser().format_help()")
+        found = self.modules("from quasiharmonic.cli import COMMANDS, parser_of; parser_of(COMMANDS).format_help()")
         assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.search.solving"}
         assert len(found - self.modules("pass")) < 140
 
     def test_a_solve_imports_what_it_needs_and_no_more(self):
         found = self.modules("from quasiharmonic import injective_map")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
+
+    @pytest.mark.parametrize("letter", [None, "C", "R"])
+    def test_a_small_mesh_is_mapped_by_the_command_without_what_takes_long_to_load(self, letter, tmp_path):
+        """No clock, but what the clock would show: SciPy's parts and matplotlib take longer than the map."""
+        V, F = disk(13)
+        uv = V[:, :2] * (1 + 0.5 * V[:, :1])
+        io.write_obj(tmp_path / "mesh.obj", io.MeshData(V, F).with_map(uv))
+        to = [] if letter is None else ["--to", f"letter:{letter}"]
+        words = ["map", str(tmp_path / "mesh.obj"), *to, "-o", str(tmp_path / "map.obj"), "--json", str(tmp_path / "j")]
+        found = self.modules(f"from quasiharmonic.cli import main; assert main({words!r}) == 0")
+        assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
+        assert not found & {"scipy.sparse.linalg", "quasiharmonic.cli.flatten", "quasiharmonic.plot"}
+        if available()[0] == "pardiso" and extension is not None:
+            # The other solvers take SciPy's matrices.
+            assert "scipy" not in found
+        if letter == "R":
+            # What a map onto it takes, or else it would say nothing that Qhull was not loaded.
+            assert "composite" in (tmp_path / "j").read_text()

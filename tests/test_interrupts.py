@@ -40,7 +40,7 @@ def interrupted(at, *arguments):
     )
 
 
-@pytest.mark.parametrize("at", ["argparse", "quasiharmonic.cli", "quasiharmonic.cli.flatten", "quasiharmonic.cli.view"])
+@pytest.mark.parametrize("at", ["argparse", "quasiharmonic.cli", "quasiharmonic.cli.map", "quasiharmonic.cli.sliding"])
 def test_while_the_command_itself_is_loaded(at):
     done = interrupted(at, "map", "in.obj", "-o", "out.obj")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "qhm: interrupted, nothing was written\n")

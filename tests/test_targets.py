@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from quasiharmonic import surfaces, targets
 from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.targets import truetype
 from quasiharmonic.targets.correspondence import upright
 
 
@@ -383,3 +385,64 @@ def test_input_types_and_inputs_untouched():
 def test_what_is_no_curve_is_refused(loop, outline, options, message):
     with pytest.raises(ValueError, match=message):
         targets.arc_length(loop, outline, **options)
+
+
+FONTS = "DejaVuSans-Bold", "DejaVuSerif-Italic", "DejaVuSansMono", "cmr10", "STIXGeneral"
+
+
+@pytest.mark.parametrize("font", FONTS)
+def test_glyphs_are_those_of_freetype_to_the_last_bit(font):
+    """Letters, ligatures, accents put on letters, Greek, Cyrillic, signs: read here, and by way of matplotlib."""
+    from matplotlib import get_data_path
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.ft2font import FT2Font
+    from matplotlib.path import Path as Outline
+    from matplotlib.textpath import text_to_path
+
+    file = Path(get_data_path(), "fonts", "ttf", f"{font}.ttf")
+    face = FT2Font(str(file))
+    known = face.get_charmap()
+    characters = [chr(code) for code in range(0x21, 0x530, 3) if code in known]
+    read = {character: truetype.glyph(file, character) for character in characters}
+    assert sum(paths is not None for paths in read.values()) > 0.5 * len(characters) > 20
+    for character, paths in read.items():
+        if paths is None:
+            continue
+        points, codes = text_to_path.get_text_path(FontProperties(fname=file), character)
+        curves = Outline(np.asarray(points) / text_to_path.FONT_SCALE, codes).iter_segments(simplify=False)
+        drawn = [(flat, code) for flat, code in curves if code not in (Outline.MOVETO, Outline.CLOSEPOLY)]
+        pieces = [piece for path in paths for piece in path]
+        assert len(pieces) == len(drawn), character
+        for piece, (flat, _) in zip(pieces, drawn, strict=True):
+            assert np.array_equal(piece[1:].ravel(), flat), character
+
+
+def test_no_font_is_asked_for_what_is_laid_out_by_rules_of_its_own(tmp_path):
+    from matplotlib import get_data_path
+
+    file = Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf")
+    assert truetype.glyph(file, "R") is not None
+    for character in "\u0301\u05d0\u0628\ufb01\u00ad":
+        assert truetype.glyph(file, character) is None
+
+
+@pytest.mark.parametrize("cut", [0, 3, 11, 40, 300, 5000, 100_000])
+def test_a_damaged_font_is_left_to_freetype(tmp_path, cut):
+    from matplotlib import get_data_path
+
+    data = Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf").read_bytes()
+    (tmp_path / "cut.ttf").write_bytes(data[:cut])
+    assert truetype.glyph(tmp_path / "cut.ttf", "R") is None
+
+
+def test_a_damaged_font_hangs_nobody(tmp_path, rng):
+    """Bytes changed at random, in the tables and their directory: an outline, or none."""
+    from matplotlib import get_data_path
+
+    data = bytearray(Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf").read_bytes())
+    for _ in range(40):
+        spoilt = data.copy()
+        for at in rng.integers(0, 400, 5).tolist() + rng.integers(0, len(data), 50).tolist():
+            spoilt[at] = int(rng.integers(256))
+        (tmp_path / "spoilt.ttf").write_bytes(spoilt)
+        truetype.glyph(tmp_path / "spoilt.ttf", "Ä")

@@ -14,7 +14,7 @@ from quasiharmonic import cli
 
 def _write(app: Sphinx) -> None:
     os.environ["COLUMNS"] = "100"
-    parser = cli._parser()
+    parser = cli.parser_of(cli.COMMANDS)
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     lines = ["# The command `qhm`", "", str(parser.description), ""]
     lines += ["Exit status: 0 what was asked for holds; 1 a map was written or judged that is not injective;", ""]

@@ -10,10 +10,10 @@ import signal
 import sys
 import time
 
-from quasiharmonic.batch import worker
+from quasiharmonic.batch import account, together, worker
 from quasiharmonic.io import atomic
 
-fill_record = worker.fill_record
+fill_record, ready = worker.fill_record, together.ready
 
 
 def hog():
@@ -48,17 +48,26 @@ TROUBLES = {
     "exit": lambda: sys.exit(3),
     "bug": lambda: {}["lost"],
     "noise": noise,
-    "late": lambda: setattr(worker, "distortion", unmeasurable),
+    "late": lambda: setattr(account, "distortion", unmeasurable),
     "full": lambda: setattr(atomic.os, "replace", full),
 }
 
 
-def troubled(job, folder, record, tell):
+def befall(name):
     for word, trouble in TROUBLES.items():
-        if word in record["problem"]:
+        if word in name:
             trouble()
+
+
+def troubled(job, folder, record, tell):
+    befall(record["problem"])
     fill_record(job, folder, record, tell)
 
 
-worker.fill_record = troubled
+def troubled_with_others(job):
+    befall(job["record"]["problem"])
+    return ready(job)
+
+
+worker.fill_record, together.ready = troubled, troubled_with_others
 worker.serve()

@@ -17,7 +17,7 @@ from quasiharmonic import __version__
 from quasiharmonic.arrays import check_callback
 from quasiharmonic.batch import records
 from quasiharmonic.batch.lock import alone
-from quasiharmonic.batch.problems import MARKER, ProblemFiles, find_problems
+from quasiharmonic.batch.problems import MARKER, ProblemFiles, find_problems, small_together
 from quasiharmonic.batch.settings import Orders, Settings
 from quasiharmonic.batch.supervisor import ClosedError, Finished, Supervisor, resident
 from quasiharmonic.io.atomic import write_whole
@@ -298,16 +298,18 @@ def _cores() -> int:
 def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator[Finished | None]:
     """Solve problems in processes of this machine; yields None now and then while nothing is finished."""
     supervisors = [Supervisor(orders) for _ in range(jobs)]
+    groups = small_together(todo) if orders.settings.together else ([files] for files in todo)
     lock, finished = threading.Lock(), SimpleQueue[Finished | BaseException | None]()
 
     def attend(supervisor: Supervisor) -> None:
         try:
             while True:
                 with lock:
-                    files = next(todo, None)
-                if files is None:
+                    group = next(groups, None)
+                if group is None:
                     break
-                finished.put(supervisor.attend(files))
+                for item in supervisor.attend_all(group):
+                    finished.put(item)
         except ClosedError:
             pass
         except BaseException as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,11 @@ from quasiharmonic.io import READERS, problem_files
 
 #: A file that marks a folder as the output of a run; nothing in there is a problem.
 MARKER = "qhm-batch.json"
+#: Bytes of a mesh that is small, some 1,500 triangles, beyond which most searches begin in another way, and of those
+#: that are solved together, some 28,000.
+SMALL_FILE, GROUP_OF_FILES = 100_000, 1_500_000
+# Problems that are solved together, at most: what happens to one of them has all solved by themselves.
+_MOST = 64
 
 # In a list; a name may have the sign inside.
 _COMMENT = re.compile(r"(?:^|\s)#")
@@ -70,6 +75,33 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
         yield ProblemFiles(path.name, path, None)
     else:
         yield from _listed(path, plain)
+
+
+def small_together(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFiles]]:
+    """Problems in their order, small ones several at a time, by the sizes of their meshes' files.
+
+    Yields
+    ------
+    list of ProblemFiles
+        Those that are not small, or cannot be looked at, by themselves.
+    """
+    group: list[ProblemFiles] = []
+    size = 0
+    for problem in problems:
+        try:
+            bytes_ = os.stat(problem.mesh).st_size
+        except OSError:
+            bytes_ = SMALL_FILE + 1
+        if group and (size + bytes_ > GROUP_OF_FILES or len(group) == _MOST):
+            yield group
+            group, size = [], 0
+        if bytes_ > SMALL_FILE:
+            yield [problem]
+        else:
+            group.append(problem)
+            size += bytes_
+    if group:
+        yield group
 
 
 def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int]]) -> Iterator[ProblemFiles]:

@@ -68,6 +68,12 @@ class Settings:
         """Whether problems are plain meshes."""
         return self.flatten or self.to is not None
 
+    @property
+    def together(self) -> bool:
+        """Whether small problems may be solved several at a time, as `quasiharmonic.batch.together` does."""
+        alone = self.flatten or self.cut or self.refine or self.slide or self.polish is not None
+        return not alone and self.reference in (None, "equilateral")
+
     def key(self, files: ProblemFiles) -> str:
         """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.
 
@@ -117,7 +123,7 @@ def sources_digest() -> str:
     """Digest of the package's sources, as they were when first asked, but for those that only show what came out."""
     package = Path(__file__).parent.parent
     digest = blake2b(digest_size=16)
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted([*package.rglob("*.py"), *package.rglob("*.[ch]")]):
         place = path.relative_to(package).as_posix()
         if not place.startswith(("cli/", "plot/", "report/")):
             contents = path.read_bytes()

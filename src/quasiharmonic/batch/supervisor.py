@@ -10,7 +10,9 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, BinaryIO, NamedTuple
@@ -28,6 +30,8 @@ _THREADS = "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "BLIS_N
 # Seconds between two looks at time and memory, and those that a process may take to import its libraries.
 _LOOK = 0.05
 _START = 120.0
+#: Seconds that several small problems may take together; some hundredths each are usual.
+TOGETHER = 5.0
 
 
 class Finished(NamedTuple):
@@ -85,6 +89,38 @@ class Supervisor:
         ClosedError
             When `close` was called meanwhile.
         """
+        job = self._job(files)
+        return job if isinstance(job, Finished) else self._solved(job)
+
+    def attend_all(self, some: Sequence[ProblemFiles]) -> Iterator[Finished]:
+        """As `attend`, of problems that are small: solved together as far as they can be, and the others one by one.
+
+        Whatever happens to a process that solves several, and however long it takes, is recorded of none of them: those
+        that have no record yet are solved one by one.
+
+        Yields
+        ------
+        Finished
+            In no particular order.
+        """
+        jobs: list[dict[str, Any]] = []
+        for files in some:
+            job = self._job(files)
+            if isinstance(job, Finished):
+                yield job
+            else:
+                jobs.append(job)
+        if len(jobs) > 1:
+            left = dict(enumerate(jobs))
+            for k, finished in self._solved_together(jobs):
+                del left[k]
+                yield finished
+            jobs = list(left.values())
+        for job in jobs:
+            yield self._solved(job)
+
+    def _job(self, files: ProblemFiles) -> dict[str, Any] | Finished:
+        """What the process is told of a problem; or how it ended, if nothing has to be done."""
         folder, orders = self.orders.folder(files.name), self.orders
         known = _known(files, orders)
         try:
@@ -94,7 +130,7 @@ class Supervisor:
         before = records.read_record(folder)
         if before is not None and before.get("key") == known["key"] and _settled(folder, before, orders):
             return Finished(files.name, before["outcome"], before.get("seconds") or 0.0, resumed=True)
-        job = {
+        return {
             "mesh": str(files.mesh),
             "fixed": None if files.fixed is None else str(files.fixed),
             "folder": str(folder),
@@ -102,7 +138,6 @@ class Supervisor:
             "settings": orders.settings.to_dict(),
             "record": known,
         }
-        return self._solved(folder, job)
 
     def close(self) -> None:
         """End the process, whatever it is doing; may be called from another thread."""
@@ -111,7 +146,8 @@ class Supervisor:
             if self._process is not None:
                 self._process.end()
 
-    def _solved(self, folder: Path, job: dict[str, Any]) -> Finished:
+    def _begun(self, job: dict[str, Any]) -> _Process:
+        """Give a job to the process, which is started if need be."""
         with self._lock:
             if self._closed:
                 raise ClosedError
@@ -125,8 +161,31 @@ class Supervisor:
             if self._closed:
                 raise ClosedError from None
             raise
-        began = time.perf_counter()
         process.send(job)
+        return process
+
+    def _solved_together(self, jobs: list[dict[str, Any]]) -> Iterator[tuple[int, Finished]]:
+        """Solve some small problems at once, and tell of those that have been by their number."""
+        limit = min(self.orders.time_limit or TOGETHER, TOGETHER)
+        orders = replace(self.orders, time_limit=limit)
+        process = self._begun({"together": jobs, "time_limit": limit})
+        while True:
+            answer, _ = process.answer(orders)
+            if answer is None:
+                self._replace()
+                if self._closed:
+                    raise ClosedError
+                return
+            if "stop" in answer:
+                raise OutputError(answer["stop"])
+            if "over" in answer:
+                return
+            k = answer["done"]
+            yield k, Finished(jobs[k]["record"]["problem"], answer["outcome"], answer["seconds"])
+
+    def _solved(self, job: dict[str, Any]) -> Finished:
+        process = self._begun(job)
+        began = time.perf_counter()
         record: Record = job["record"]
         while True:
             answer, why = process.answer(self.orders)
@@ -143,7 +202,7 @@ class Supervisor:
         self._replace()
         if self._closed:
             raise ClosedError
-        return _conclude(folder, record | why, time.perf_counter() - began)
+        return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)
 
     def _replace(self) -> None:
         """Make room for another process, which is started when there is something to do."""

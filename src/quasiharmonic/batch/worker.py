@@ -9,16 +9,11 @@ from __future__ import annotations
 import faulthandler
 import json
 import os
-import platform
 import signal
-import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import cache
-from importlib.metadata import version
+from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
 from queue import SimpleQueue
@@ -27,14 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic import __version__, atlas, io
+from quasiharmonic import atlas, io
 from quasiharmonic.apply.fitting import Fitted
 from quasiharmonic.atlas.mapped import MappedAtlas, each_island, faced
 from quasiharmonic.atlas.refined import written_over
-from quasiharmonic.batch import posing, records
+from quasiharmonic.batch import account, posing, records, together
 from quasiharmonic.batch.records import Record
 from quasiharmonic.curves import Rails
-from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.polishing import polished
 from quasiharmonic.flattening.flattened import flattenable
 from quasiharmonic.ladder.climbing import climb, on_refinement
@@ -73,11 +67,15 @@ def serve() -> None:
         job = json.loads(jobs.get())
         _alarm(job["time_limit"])
         try:
-            record = solve_files(job, tell)
+            if "together" in job:
+                together.solve_some(job["together"], tell)
+                answer: dict[str, Any] = {"over": True}
+            else:
+                record = solve_files(job, tell)
+                answer = {"outcome": record["outcome"], "seconds": record["seconds"]}
         except io.OutputError as error:
-            tell({"stop": str(error)})
-        else:
-            tell({"outcome": record["outcome"], "seconds": record["seconds"]})
+            answer = {"stop": str(error)}
+        tell(answer)
         _alarm(None)
 
 
@@ -119,9 +117,9 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     """
     folder = Path(job["folder"])
     records.clear(folder)
-    _forget_peak()
+    account.forget_peak()
     began = time.perf_counter()
-    record: Record = {**job["record"], "versions": _versions()}
+    record: Record = {**job["record"], "versions": account.versions()}
     try:
         fill_record(job, folder, record, tell)
     except io.OutputError:
@@ -132,7 +130,7 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
         # What is wrong with the input shows before its sizes are known.
         wrong_input = isinstance(error, ValueError) and "vertices" not in record
         record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _unexpected(error)
-    record["peak_memory"] = _peak()
+    record["peak_memory"] = account.peak()
     record["seconds"] = time.perf_counter() - began
     records.write_record(folder, record)
     return record
@@ -141,10 +139,10 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
 def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
     """Read, solve, write, judge, measure; what is found goes into the record as soon as it is known."""
     settings = job["settings"]
-    with _timed(record, "read"):
+    with account.timed(record, "read"):
         mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
-    with _timed(record, "setup"):
+    with account.timed(record, "setup"):
         if not settings["flatten"] and settings["to"] is None and mesh.FT is None:
             # It says what is missing.
             io.problem_arrays(mesh, fixed)
@@ -159,10 +157,10 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
         mapped = mesh.with_places(found.mesh)
         if any(refined):
             mapped = written_over(mesh, surface.islands, refined, found.places())
-    with _timed(record, "write"):
+    with account.timed(record, "write"):
         record |= _written(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
-    with _timed(record, "measure"):
-        record |= _measured(mapped)
+    with account.timed(record, "measure"):
+        record |= account.measured(*io.without_idle(*io.cut_at_seams(mapped)))
 
 
 def _mapped(
@@ -173,23 +171,16 @@ def _mapped(
     tell: Callable[[dict[str, Any]], None],
 ) -> tuple[MappedAtlas, list[Refined | None]]:
     """Map a surface onto a given boundary, island by island; and what became of the meshes of these."""
-    with _timed(record, "setup"):
+    with account.timed(record, "setup"):
         posed = posing.posed(surface, fixed, settings)
     problems = [one.fitted.problem for one in posed]
-    record |= {
-        "vertices": sum(problem.n for problem in problems),
-        "triangles": sum(len(problem.F) for problem in problems),
-        "fixed": sum(len(problem.fixed) for problem in problems),
-        "pins": sum(len(problem.domain.pins) for problem in problems),
-        "loops": sum(len(problem.domain.loops) for problem in problems),
-        "islands": len(problems),
-    }
+    record |= account.sizes(problems)
     tell({"facts": record})
     todo = iter(posed)
     # Each is posed as it is to be solved.
     found = each_island(surface, lambda island: _solved(*next(todo), settings, record), reflect=settings["to"] is None)
     results = [island.result for island in found.islands]
-    record |= _told(found)
+    record |= account.told(results, found.status)
     if settings["refine"]:
         record["added_vertices"] = added = sum(result.added for result in results)
         record["vertices"] += added
@@ -206,17 +197,17 @@ def _mapped(
 
 def _solved(fitted: Fitted, slide: bool | Rails, settings: dict[str, Any], record: Record) -> MapResult:
     """Map one island, and lower its distortion if that is asked for."""
-    with _timed(record, "map"):
+    with account.timed(record, "map"):
         way = climb if settings["refine"] else solve
         result = way(
             fitted.problem,
             strategy=settings["strategy"],
             max_iterations=settings["max_iterations"],
-            linear_solver=settings["linear_solver"],
+            linear_solver=together.solver_for(fitted.problem, settings["linear_solver"]),
         )
     if settings["polish"] is None or result.status is not Status.INJECTIVE:
         return result
-    with _timed(record, "polish"):
+    with account.timed(record, "polish"):
         fine = on_refinement(fitted.problem, result.refined)
         return polished(fine, result, energy=settings["polish"], slide=slide)
 
@@ -225,19 +216,19 @@ def _flattened(
     surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
 ) -> MappedAtlas:
     """Lay a surface flat, its boundary free, island by island."""
-    with _timed(record, "setup"):
+    with account.timed(record, "setup"):
         pieces = [piece for island, _ in faced(surface, reflect=False) for piece in flattenable(island.V, island.F)]
     record |= {"vertices": len(surface.V), "triangles": len(surface.F), "fixed": 0, "pins": 0}
     record |= {"loops": sum(len(piece.loops) for piece in pieces), "islands": len(surface.islands)}
     tell({"facts": record})
-    with _timed(record, "map"):
+    with account.timed(record, "map"):
         found = atlas.flatten(
             surface,
             energy=settings["energy"] or "symmetric-dirichlet",
             max_iterations=settings["max_iterations"],
             linear_solver=settings["linear_solver"],
         )
-    record |= _told(found)
+    record |= account.told([island.result for island in found.islands], found.status)
     energy = found.islands[0].result.history[-1].energy
     if len(pieces) == 1 and isfinite(energy):
         record["energy"] = energy
@@ -245,17 +236,6 @@ def _flattened(
     if bad:
         record["error"] = bad[0].summary()
     return found
-
-
-def _told(found: MappedAtlas) -> Record:
-    """What a record says of how a map was found."""
-    stages = [stage for island in found.islands for stage in island.result.stages]
-    return {
-        "status": found.status.name.lower(),
-        "iterations": sum(stage.iterations for stage in stages),
-        "stages": json.dumps([stage.to_dict() for stage in stages]),
-        "linear_solver": found.islands[0].result.linear_solver,
-    }
 
 
 def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
@@ -275,50 +255,8 @@ def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
     }
 
 
-def _measured(mesh: io.MeshData) -> Record:
-    measured = distortion(*io.without_idle(*io.cut_at_seams(mesh)))
-    if len(measured.flat) == len(mesh.F):
-        return {}
-    values = {"mips": measured.summary("mips").mean, "isometric": measured.summary("isometric").maximum}
-    return {name: value if isfinite(value) else None for name, value in values.items()}
-
-
 def _unexpected(error: Exception) -> Record:
     """An exception that no input should raise, with its place."""
     at = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{Path(at.filename).name}, line {at.lineno}, in {at.name}"
     return {"outcome": "error", "certified": False, "error": f"{type(error).__name__}: {error} ({place})"}
-
-
-@contextmanager
-def _timed(record: Record, phase: str) -> Iterator[None]:
-    began = time.perf_counter()
-    try:
-        yield
-    finally:
-        name = f"seconds_{phase}"
-        record[name] = record.get(name, 0.0) + time.perf_counter() - began
-
-
-@cache
-def _versions() -> str:
-    packages = {name: version(name) for name in ("numpy", "scipy")}
-    return json.dumps({"quasiharmonic": __version__, "python": platform.python_version(), **packages})
-
-
-def _forget_peak() -> None:
-    """Let the highest memory use be counted anew, where the system can do that (Linux)."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
-
-
-def _peak() -> int | None:
-    """Highest resident memory, bytes: since `_forget_peak` on Linux, of the process elsewhere; None if nobody knows."""
-    with suppress(OSError, IndexError):
-        return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
-    try:
-        import resource
-    except ImportError:
-        return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else 1024 * most

@@ -10,54 +10,36 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from importlib import import_module
 from io import TextIOWrapper
 
-from quasiharmonic.cli import (
-    animate,
-    batch,
-    batch_report,
-    check,
-    demo,
-    diagnose,
-    field,
-    flatten,
-    harmonise,
-    map,
-    measure,
-    morph,
-    plot,
-    polish,
-    refine,
-    repair,
-    studio,
-    view,
-)
 from quasiharmonic.cli.interrupts import Interrupts
 from quasiharmonic.cli.report import ReportError
 from quasiharmonic.cli.version import Version
 
-COMMANDS = (
-    map,
-    flatten,
-    morph,
-    animate,
-    repair,
-    field,
-    polish,
-    harmonise,
-    check,
-    measure,
-    plot,
-    view,
-    studio,
-    diagnose,
-    refine,
-    batch,
-    batch_report,
-    demo,
-)
+# The modules of the subcommands by their names, in the order of the help.
+COMMANDS = {
+    "map": "map",
+    "flatten": "flatten",
+    "morph": "morph",
+    "animate": "animate",
+    "repair": "repair",
+    "field": "field",
+    "polish": "polish",
+    "harmonise": "harmonise",
+    "check": "check",
+    "measure": "measure",
+    "plot": "plot",
+    "view": "view",
+    "studio": "studio",
+    "diagnose": "diagnose",
+    "refine": "refine",
+    "batch": "batch",
+    "report": "batch_report",
+    "demo": "demo",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,7 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     with Interrupts() as interrupts:
-        options = _parser().parse_args(argv)
+        words = sys.argv[1:] if argv is None else list(argv)
+        # Those of other commands would have to be imported and declared for nothing.
+        options = parser_of([words[0]] if words and words[0] in COMMANDS else COMMANDS).parse_args(words)
         run: Callable[[argparse.Namespace], int] = options.run
         try:
             return run(options)
@@ -104,7 +88,8 @@ def _fail(command: str, message: str, status: int) -> int:
     return status
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
+    """The command's parser, with some of its subcommands."""
     parser = argparse.ArgumentParser(
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
@@ -113,6 +98,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=Version)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in COMMANDS:
-        command.add_parser(commands)
+    for name in names:
+        import_module(f"{__name__}.{COMMANDS[name]}").add_parser(commands)
     return parser

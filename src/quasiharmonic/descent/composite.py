@@ -23,7 +23,7 @@ import numpy as np
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
 from quasiharmonic.descent.base import Iterates
 from quasiharmonic.descent.vector_adam import VectorAdam
-from quasiharmonic.exact.constrained_delaunay import BlockedError, constrained_delaunay
+from quasiharmonic.exact.constrained_delaunay import BlockedError, constrained_delaunay, delaunay_of_polygon
 from quasiharmonic.exact.loops import simple_loops
 from quasiharmonic.exact.point_location import PointLocator
 from quasiharmonic.field.objective import Iterate, Objective
@@ -33,6 +33,9 @@ from quasiharmonic.mesh.topology import edge_keys, linked
 _EVENLY = 0.5
 # Room around the target for the box that it is triangulated in, as a fraction of its extent.
 _MARGIN = 0.1
+# Up to so many corners it is triangulated by itself: that takes no longer, and SciPy's Qhull need not be loaded for it,
+# which takes longer than all else that is done with so small a mesh.
+_FEW = 100
 # From the composite short steps suffice, and long ones would lead away from it.
 NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
 
@@ -139,6 +142,8 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     points = _points(outline)
     if not simple_loops([ring], points).all():
         return None
+    if k <= _FEW:
+        return delaunay_of_polygon(points)
     low, high = points.min(axis=0), points.max(axis=0)
     low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
     box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])

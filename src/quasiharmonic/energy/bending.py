@@ -123,7 +123,7 @@ class PlateSystem(NewtonSystem):
         # Which entries there are is a matter of ones, so that none cancels.
         pattern = csr_array(own + csr_array((np.ones(added.nnz), added.indices, added.indptr), shape=added.shape))
         pattern.sort_indices()
-        self._slots, self._constant = _places(own, pattern), np.zeros(pattern.nnz)
+        self._own_slots, self._constant = _places(own, pattern), np.zeros(pattern.nnz)
         self._constant[_places(csr_array(added), pattern)] = added.data
         self._starts = pattern.indptr[:-1]
         self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver)
@@ -136,7 +136,7 @@ class PlateSystem(NewtonSystem):
     def factor(self, shift: float = 0.0) -> None:
         """Factor the assembled matrix; see `NewtonSystem.factor`."""
         values = self._constant.copy()
-        values[self._slots] += self._values
+        values[self._own_slots] += self._values
         diagonal = self._diagonal * (1 + shift)
         values[self._starts] = np.where(diagonal > 0, diagonal, 1)
         self.solver.factor(values)

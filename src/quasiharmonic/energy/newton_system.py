@@ -8,10 +8,10 @@ values that the factorisation reads.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, triu
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
 from quasiharmonic.energy.energies import QuadraticForm
@@ -19,6 +19,9 @@ from quasiharmonic.hearing import still_at_it
 from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
 from quasiharmonic.linsolve.pattern import stiffness_pattern
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
 _CHUNK = 8192
@@ -124,6 +127,8 @@ class NewtonSystem:
 
     def matrix(self) -> csr_array:
         """The assembled matrix, both of its triangles; for study and tests."""
+        from scipy.sparse import csr_array, triu
+
         size = self._first.size
         upper = csr_array((self._values.copy(), self._indices, self._indptr), shape=(size, size))
         return csr_array(upper + triu(upper, k=1).T)

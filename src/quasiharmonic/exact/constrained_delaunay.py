@@ -3,6 +3,8 @@
     Qhull's Delaunay triangles ──valid, exactly?──▶ yes ──▶ segments that are missing, brought in by flips [1]_
                                       └──▶ no ──▶ one point after the other [2]_ ──▶ the same
 
+    A polygon without further points: any triangles within it, by a sweep ──▶ flips.
+
 Every triangle handed back is strictly positive, decided exactly. Delaunay's criterion is decided in floating point:
 where it is lost in rounding, either diagonal will do.
 
@@ -23,6 +25,7 @@ import numpy as np
 from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.exact.predicates import orientation
 from quasiharmonic.exact.triangles import triangle_signs
+from quasiharmonic.exact.triangulation import triangulate
 from quasiharmonic.mesh.topology import edge_keys, edges
 
 # Rounding of an orientation and of an in-circle determinant relative to the sum of their terms' magnitudes, with room.
@@ -84,6 +87,39 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
     return triangulation.triangles()
 
 
+def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
+    """Triangulate a simple polygon without further points.
+
+    Meant for up to a few hundred corners, all of whose steps are Python's.
+
+    Parameters
+    ----------
+    points : (k, 2) float64
+        Its corners.
+
+    Returns
+    -------
+    (k - 2, 3) int64 or None
+        Counterclockwise. None where the polygon runs clockwise.
+    """
+    corners = _whole(points)
+    if sum(corners[k - 1][0] * y - x * corners[k - 1][1] for k, (x, y) in enumerate(corners)) < 0:
+        return None
+    made = Triangulation(points, np.array(triangulate(corners), dtype=np.int64))
+    sides = np.arange(len(points))
+    made.keep(np.stack([sides, np.roll(sides, -1)], axis=1))
+    made.legalise()
+    return made.triangles()
+
+
+def _whole(points: FloatArray) -> list[tuple[int, int]]:
+    """Points scaled by a power of two such that they are whole numbers, exactly."""
+    ratios = [value.as_integer_ratio() for value in points.ravel().tolist()]
+    finest = max(denominator for _, denominator in ratios)
+    whole = [numerator * (finest // denominator) for numerator, denominator in ratios]
+    return list(zip(whole[::2], whole[1::2], strict=True))
+
+
 def by_qhull(points: FloatArray) -> IntArray:
     """Delaunay triangles as Qhull finds them, counterclockwise as far as they have a sense."""
     from scipy.spatial import Delaunay, QhullError
@@ -136,7 +172,7 @@ class Triangulation:
         """Insert one point after the other into a convex polygon, whose corners are ``hull``."""
         fan = np.stack([np.full(len(hull) - 2, hull[0]), hull[1:-1], hull[2:]], axis=1)
         made = cls(points, fan)
-        made._legalise(list(made._apex))
+        made.legalise()
         inner = np.setdiff1d(np.arange(len(points)), hull)
         at = int(hull[0])
         for point in inner[_along_curve(points[inner])].tolist():
@@ -154,6 +190,10 @@ class Triangulation:
         pairs = [(a, b) for a, b in segments.tolist()]
         self._kept.update(pairs)
         self._kept.update((b, a) for a, b in pairs)
+
+    def legalise(self) -> None:
+        """Flip edges until Delaunay's criterion holds everywhere."""
+        self._legalise(list(self._apex))
 
     def recover(self, tail: int, head: int) -> None:
         """Make a segment an edge, by flipping what crosses it."""

@@ -249,13 +249,16 @@ def polygon_mesh(
         When a face has fewer than three corners, or a vertex twice, or refers to a vertex that there is not.
     """
     check_range("the faces", corners, len(V))
-    T, polygons = triangulated(V, corners, starts)
+    if (np.diff(starts) == 3).all():
+        T, polygons = np.arange(len(corners)).reshape(-1, 3), None
+    else:
+        T, polygons = triangulated(V, corners, starts)
     return MeshData(
         V,
         corners[T],
         FT=None if places is None else places[T],
         FN=None if normal_lines is None else normal_lines[T],
-        polygons=None if (polygons.sizes == 3).all() else polygons,
+        polygons=polygons,
         **rest,
     )
 

@@ -148,7 +148,7 @@ def _classify(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     first, second, third = (text.take(starts + i, mode="clip") for i in range(3))
 
     def blank(letter: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        return np.isin(letter, (ord(" "), ord("\t")))
+        return (letter == ord(" ")) | (letter == ord("\t"))
 
     kinds = np.full(ends.size, _STATEMENT, dtype=np.int8)
     kinds[first == ord("\n")] = _BLANK

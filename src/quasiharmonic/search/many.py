@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import dataclass, replace
-from typing import Any, TypeGuard, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.arrays import check_callback, check_choice, whole_number
-from quasiharmonic.descent import VectorAdam
 from quasiharmonic.energy.energies import Energy
 from quasiharmonic.energy.polishing import energy_named, polished
 from quasiharmonic.mesh.reference import Reference
@@ -25,7 +24,7 @@ from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.solving import solve
 from quasiharmonic.search.stages import Begun, Stages
 from quasiharmonic.search.strategy import STRATEGIES, stages_of
-from quasiharmonic.search.together import Patterns, first_stage
+from quasiharmonic.search.together import SMALL, Patterns, beginning_alike, first_stage
 
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
@@ -33,8 +32,6 @@ Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 # Triangles of a group of problems. Twice as many are no sooner solved, triangle for triangle: their arrays leave the
 # processor's cache. And QDLDL is still the first choice for such a system where MKL is not installed.
 GROUP = 28_000
-# What has more triangles is solved by itself: NumPy has enough to do at each call.
-SMALL = 4_000
 # Seconds between two calls of a callback while nothing is finished, and between two looks for an interrupt.
 _TICK = 0.2
 
@@ -211,15 +208,16 @@ class _Worker:
         ready = self._posed_at_once(group)
         posed = [self._posed(first + k, given, ready.get(k)) for k, given in enumerate(group)]
         begun: dict[int, MapResult | Begun] = {}
-        for descent, some in self._alike(posed).items():
+        problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
+        for descent, some in beginning_alike(problems, self._settings.strategy).items():
             found = first_stage(
-                [problem for _, problem in some],
+                [problems[k] for k in some],
                 descent,
                 self._patterns,
                 self._settings.max_iterations,
                 self._still_wanted,
             )
-            begun |= {k: one for (k, _), one in zip(some, found, strict=True) if one is not None}
+            begun |= {k: one for k, one in zip(some, found, strict=True) if one is not None}
         return [
             problem if isinstance(problem, Exception) else self._finished(first + k, problem, begun.get(k))
             for k, problem in enumerate(posed)
@@ -263,17 +261,6 @@ class _Worker:
             return _numbered(number, error)
         return self._last
 
-    def _alike(self, posed: Sequence[Problem | Exception]) -> dict[VectorAdam, list[tuple[int, Problem]]]:
-        """Those whose searches begin in the same way, and in one in which they can be run together."""
-        alike: dict[VectorAdam, list[tuple[int, Problem]]] = {}
-        for k, problem in enumerate(posed):
-            if isinstance(problem, Exception) or len(problem.F) > SMALL or not problem.encloses_area:
-                continue
-            descent = stages_of(self._settings.strategy, problem)[0]
-            if _plain(descent) and problem.reference in (None, "equilateral"):
-                alike.setdefault(descent, []).append((k, problem))
-        return alike
-
     def _finished(self, number: int, problem: Problem, begun: MapResult | Begun | None) -> MapResult | Exception:
         """The result of one problem, whatever has been done for it so far."""
         settings = self._settings
@@ -309,13 +296,6 @@ class _Worker:
         """Break off where nobody waits any more."""
         if self._stop.is_set():
             raise KeyboardInterrupt
-
-
-def _plain(stage: object) -> TypeGuard[VectorAdam]:
-    """Whether a stage is one that `first_stage` runs."""
-    if not isinstance(stage, VectorAdam) or type(stage) is not VectorAdam:
-        return False
-    return stage.functional == "dirichlet" and stage.reference == "equilateral"
 
 
 def _same(array: np.ndarray[Any, Any], given: Any) -> bool:

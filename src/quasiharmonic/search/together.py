@@ -12,8 +12,8 @@ What is left when the stage has run is handed on as `Begun`, and each is searche
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -29,8 +29,11 @@ from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.reference import ReferenceMesh, blocks
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
-from quasiharmonic.search.stages import Begun
+from quasiharmonic.search.stages import Begun, Stages
+from quasiharmonic.search.strategy import stages_of
 
+# What has more triangles is solved by itself: NumPy has enough to do at each call.
+SMALL = 4_000
 # Patterns kept for meshes that come again, as where one mesh is mapped to many targets.
 _PATTERNS = 8
 
@@ -203,6 +206,37 @@ class _SideBySide:
     def triangles_of(self, k: int) -> slice:
         """The triangles of the k-th mesh."""
         return slice(int(self.triangles[k]), int(self.triangles[k + 1]))
+
+
+def beginning_alike(problems: Mapping[int, Problem], strategy: str | Stages) -> dict[VectorAdam, list[int]]:
+    """Small problems whose searches begin in the same way, and in one in which they can be run together.
+
+    Parameters
+    ----------
+    problems : mapping of int to Problem
+    strategy : str or sequence of stages
+        As `quasiharmonic.solve` takes it.
+
+    Returns
+    -------
+    dict of VectorAdam to list of int
+        For each beginning the keys of those problems. All others are in none.
+    """
+    alike: dict[VectorAdam, list[int]] = {}
+    for k, problem in problems.items():
+        if len(problem.F) > SMALL or not problem.encloses_area:
+            continue
+        descent = stages_of(strategy, problem)[0]
+        if _plain(descent) and problem.reference in (None, "equilateral"):
+            alike.setdefault(descent, []).append(k)
+    return alike
+
+
+def _plain(stage: object) -> TypeGuard[VectorAdam]:
+    """Whether a stage is one that `first_stage` runs."""
+    if not isinstance(stage, VectorAdam) or type(stage) is not VectorAdam:
+        return False
+    return stage.functional == "dirichlet" and stage.reference == "equilateral"
 
 
 def first_stage(

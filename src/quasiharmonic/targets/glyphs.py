@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path as FilePath
 from typing import Any
@@ -9,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.arrays import FloatArray
+from quasiharmonic.targets import truetype
 from quasiharmonic.targets.contours import Pieces, flatten, signed_area
 from quasiharmonic.targets.nesting import nested
 
 Font = str | PathLike[str]
 _FONT_FILES = ".ttf", ".otf", ".ttc"
+# In matplotlib's data.
+_BUNDLED = "fonts", "ttf"
 
 
 def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4) -> list[FloatArray]:
@@ -57,27 +61,32 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
     return contours
 
 
-def _contours(text: str, font: Font | None, tolerance: float) -> list[FloatArray]:
-    """Contours of a line of text as the font winds them, counterclockwise or not."""
-    contours = [flatten(pieces, tolerance) for pieces in glyph_paths(text, font)]
+def _contours(character: str, font: Font | None, tolerance: float) -> list[FloatArray]:
+    """Contours of a character as the font winds them, counterclockwise or not."""
+    contours = [flatten(pieces, tolerance) for pieces in glyph_paths(character, font)]
     return [contour for contour in contours if len(contour) > 2 and signed_area(contour) != 0]
 
 
-def glyph_paths(text: str, font: Font | None = None) -> list[Pieces]:
-    """The closed paths of lines and Bézier curves that a line of text is drawn by; raises as `letter`."""
+def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
+    """The closed paths of lines and Bézier curves that a character is drawn by; raises as `letter`."""
+    file = _font_file(font)
+    plain = truetype.glyph(file, character)
+    return _by_matplotlib(file, character) if plain is None else plain
+
+
+def _by_matplotlib(file: FilePath, character: str) -> list[Pieces]:
+    """The paths of a character in any font, or what is the matter with it."""
     from matplotlib.font_manager import FontProperties, get_font
     from matplotlib.path import Path
     from matplotlib.textpath import text_to_path
 
-    file = _font_file(font)
     try:
         face = get_font(file)
     except RuntimeError as error:
         raise ValueError(f"{file} is not a font that can be read: {error}") from error
-    for character in text:
-        if not face.get_char_index(ord(character)):
-            raise ValueError(f"{file.name} has no glyph for {character!r}")
-    points, codes = text_to_path.get_text_path(FontProperties(fname=file), text)
+    if not face.get_char_index(ord(character)):
+        raise ValueError(f"{file.name} has no glyph for {character!r}")
+    points, codes = text_to_path.get_text_path(FontProperties(fname=file), character)
     if len(codes) == 0:
         return []
     return _pieces(Path(np.asarray(points) / text_to_path.FONT_SCALE, codes))
@@ -101,15 +110,25 @@ def _pieces(path: Any) -> list[Pieces]:
 
 def _font_file(font: Font | None) -> FilePath:
     if font is None:
-        import matplotlib
-
-        return FilePath(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf")
+        return _bundled("DejaVuSans-Bold.ttf")
     file = FilePath(font)
     if file.is_file():
         return file
     if file.suffix.lower() in _FONT_FILES or len(file.parts) > 1:
         raise FileNotFoundError(f"no font file {file}")
     return _installed(str(font))
+
+
+def _bundled(name: str) -> FilePath:
+    """A file of the fonts that come with matplotlib, which is not imported where they lie in its own folder."""
+    found = find_spec("matplotlib")
+    for folder in (found and found.submodule_search_locations) or []:
+        file = FilePath(folder, "mpl-data", *_BUNDLED, name)
+        if file.is_file():
+            return file
+    import matplotlib
+
+    return FilePath(matplotlib.get_data_path(), *_BUNDLED, name)
 
 
 def _installed(name: str) -> FilePath:

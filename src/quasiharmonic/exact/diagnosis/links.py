@@ -25,7 +25,7 @@ import numpy as np
 
 from quasiharmonic.arrays import IntArray
 from quasiharmonic.exact.diagnosis.clipping import MARGIN
-from quasiharmonic.exact.diagnosis.triangulation import triangulate
+from quasiharmonic.exact.triangulation import triangulate
 from quasiharmonic.hearing import still_at_it
 
 Point = tuple[int, int, int]
