@@ -48,7 +48,7 @@ def afar(power=6):
 def test_against_references_singular_values_are_powers():
     energy, w, towards = afar()
     before, after = matrices(energy.deform(w)), matrices(towards.deform(w))
-    u, sigma, vt = np.linalg.svd(before)
+    _, sigma, vt = np.linalg.svd(before)
     # Another way to the same: references made of singular vectors, taken away from the Jacobian.
     farthest = np.abs(np.log(sigma)).max()
     t = np.log(REACH) / farthest
