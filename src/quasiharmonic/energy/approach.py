@@ -3,8 +3,8 @@
 Where a map has shrunk a limb to ``σ = 1e-8`` the energy is ``σ⁻² = 1e16``, and of what other triangles want nothing is
 left in it. Newton's step takes σ to 4/3 σ. So distortion is not measured against rest but against *references* [1]_.
 A triangle whose map is ``U diag(σ₁, σ₂) Vᵀ`` gets the reference ``V diag(σ₁, σ₂)^(1 − t) Vᵀ``, and against that its
-singular values are ``σ₁ᵗ, σ₂ᵗ``. With one t for all triangles none of them is further than `REACH` from its reference, all
-of a limb wants to grow by its part of the way, and a step down the reweighted proxies of this energy
+singular values are ``σ₁ᵗ, σ₂ᵗ``. With one t for all triangles none of them is further than `REACH` from its reference,
+all of a limb wants to grow by its part of the way, and a step down the reweighted proxies of this energy
 (`quasiharmonic.energy.reweighted`) brings it there: t grows from step to step, and with t = 1 the references are at
 rest.
 
