@@ -345,15 +345,20 @@ class TestSearch:
         # Not the middle of the target, but the coarse map carried here.
         assert np.count_nonzero(signed_areas(posed.F, result.uv) > 0) > len(posed.F) // 2
 
-    def test_flat_coarse_triangles_have_shapes(self):
+    @pytest.mark.parametrize("bend", [0.0, 1e-9], ids=["in a plane", "all but in a plane"])
+    def test_flat_coarse_triangles_have_shapes(self, bend, rng):
+        """On a grid there are coarse triangles whose corners lie on a line, or all but."""
         V, F = grid(120, 120)
-        problem = Problem(V, F, boundary_of(F), V[boundary_of(F)] @ [[1, 0.3], [0, 1]])
+        V = np.column_stack([V, bend * rng.standard_normal(len(V))])
+        problem = Problem(V, F, boundary_of(F), V[boundary_of(F), :2] @ [[1, 0.3], [0, 1]])
         result = solve(problem)
         assert result.injective
         coarse = coarse_mesh(problem).domain
         edge = np.linalg.norm(coarse.V[coarse.F] - coarse.V[np.roll(coarse.F, 1, axis=1)], axis=2)
         assert np.isfinite(coarse.V).all()
         assert edge.min() > 0
+        area = np.linalg.norm(np.cross(*(coarse.V[coarse.F[:, i]] - coarse.V[coarse.F[:, 0]] for i in (1, 2))), axis=1)
+        assert (area > 1e-5 * edge.max(axis=1) ** 2).all()
 
 
 def test_degrees_stay_low():

@@ -28,6 +28,9 @@ _PER_FIXED = 3
 _WORTHWHILE = 0.5
 # Nor is one made of a mesh with fewer vertices than these, which is quickly searched itself.
 _LEAST = 1500
+# Coarse triangles that are lower than this share of their longest side are no guide to anything, and their weights in
+# an energy are beyond what doubles tell apart. Their corners are moved by up to this part of the shortest edge there.
+_LOWEST, _STIRRED = 1e-3, 0.2
 
 
 #: Coarse meshes of domains in use, None where there is none to be had.
@@ -95,17 +98,22 @@ def coarse_mesh(problem: Problem) -> CoarseMesh | None:
 
 
 def _not_flat(V: FloatArray, F: IntArray) -> FloatArray:
-    """Positions in space (n, 3), stirred a little if any triangle has no area there, as in the plane many have not.
+    """Positions in space (n, 3), stirred a little at the corners of triangles that have hardly an area there.
 
     A coarse triangle was never there: its shape is a guide to how large the fine ones were, and no more.
     """
-    if not rest_shapes(V, F).flat.size:
+    shapes = rest_shapes(V, F)
+    lengths = np.abs(shapes.sides)
+    low = ~(2 * shapes.m >= _LOWEST * lengths.max(axis=0) ** 2)
+    if not low.any():
         return V
     space = np.zeros((len(V), 3))
     space[:, : V.shape[1]] = V
     shortest = np.full(len(V), np.inf)
-    for tail, head in ((0, 1), (1, 2), (2, 0)):
-        length = np.linalg.norm(space[F[:, tail]] - space[F[:, head]], axis=1)
-        for corner in (tail, head):
+    for length, ends in zip(lengths, ((0, 1), (1, 2), (2, 0)), strict=True):
+        for corner in ends:
             np.minimum.at(shortest, F[:, corner], np.where(length > 0, length, np.inf))
-    return space + 0.2 * shortest[:, None] * np.random.default_rng(0).uniform(-1, 1, space.shape)
+    corners = np.unique(F[low])
+    by = _STIRRED * shapes.unit * shortest[corners, None]
+    space[corners] += by * np.random.default_rng(0).uniform(-1, 1, (corners.size, 3))
+    return space
