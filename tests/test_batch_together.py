@@ -12,9 +12,13 @@ from quasiharmonic import batch, io
 from quasiharmonic.batch import supervisor, together, worker
 from quasiharmonic.batch.problems import GROUP_OF_FILES, SMALL_FILE, ProblemFiles, small_together
 from quasiharmonic.batch.settings import Orders
+from quasiharmonic.linsolve import available
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif("qdldl" not in available(), reason="where there is no QDLDL, each problem is solved by itself"),
+]
 
 
 def jobs_of(source, out, **settings):
@@ -109,6 +113,8 @@ def test_what_cannot_be_solved_there_is_left_as_it_was(tmp_path):
         ({"flatten": True}, False),
         ({"to": "disk", "cut": True}, False),
         ({"reference": "rest"}, False),
+        ({"linear_solver": "qdldl"}, True),
+        ({"linear_solver": "superlu"}, False),
     ],
 )
 def test_settings_that_allow_it(settings, allowed):

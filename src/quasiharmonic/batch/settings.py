@@ -13,6 +13,7 @@ from typing import Any
 
 from quasiharmonic import __version__
 from quasiharmonic.batch.problems import ProblemFiles
+from quasiharmonic.linsolve import available
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,13 @@ class Settings:
 
     @property
     def together(self) -> bool:
-        """Whether small problems may be solved several at a time, as `quasiharmonic.batch.together` does."""
+        """Whether small problems may be solved several at a time, as `quasiharmonic.batch.together` does.
+
+        By QDLDL only: what it computes for a mesh does not depend on what lies beside it.
+        """
         alone = self.flatten or self.cut or self.refine or self.slide or self.polish is not None
-        return not alone and self.reference in (None, "equilateral")
+        by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
+        return by_qdldl and not alone and self.reference in (None, "equilateral")
 
     def key(self, files: ProblemFiles) -> str:
         """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.
