@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from itertools import islice
 from pathlib import Path
 
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 
 import campaign
+import compiled_loops
 import letters_alone
 import many
 import problems
 import speed
-from quasiharmonic import Problem, certify, solve
+from quasiharmonic import Problem, certify, kernels, solve
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.search.strategy import stages_of
 
@@ -255,6 +257,18 @@ def test_wrong_calls_of_the_speed_benchmark_are_refused(arguments, message, tmp_
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
+
+
+def test_compiled_loops_are_compared_with_numpy(tmp_path, monkeypatch):
+    folders = str(Path(compiled_loops.__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", folders, prepend=os.pathsep)
+    if kernels.extension is None:
+        with pytest.raises(SystemExit, match="not built, or switched off"):
+            compiled_loops.main(["--triangles", "100"])
+        return
+    compiled_loops.main(["--triangles", "100", "-r", "1", "-o", str(tmp_path)])
+    lines = (tmp_path / "compiled_loops.md").read_text(encoding="utf-8").splitlines()
+    assert [line.split("|")[1].strip() for line in lines[4:]] == ["cat on C", "cat on R", "cat on S", "geometric mean"]
 
 
 def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
