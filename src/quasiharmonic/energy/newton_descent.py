@@ -39,6 +39,9 @@ _SHORT, _LONGER = 0.25, 1.5
 # A step that lowers the energy by less than this part of the tolerance is idle; after so many in a row the
 # map has come to rest short of convergence.
 _IDLE, _PATIENCE = 1e-2, 3
+# Where a step that promised less than the tolerance brings more than so many times that, the model is pessimistic, and
+# the map not at rest.
+_MORE = 4.0
 # A mean energy this small is rounding: the map is an isometry, or a similarity.
 _NOTHING = 1e-12
 # Where maps stretch as much as this mean energy says, what clamping adds to the second derivatives may be so much that
@@ -170,7 +173,7 @@ class NewtonDescent:
                 direction, promise, small = true, further, 0.5 * further <= tolerance * self.value
             before = self.value
             moved = self._search(direction, promise)
-            if small and negative == 0:
+            if small and negative == 0 and not before - self.value > _MORE * tolerance * before:
                 return Status.POLISHED
             if moved:
                 self._idle = 0 if before - self.value > _IDLE * tolerance * before else self._idle + 1
