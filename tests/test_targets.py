@@ -397,10 +397,12 @@ def test_glyphs_are_those_of_freetype_to_the_last_bit(font):
     """Letters, ligatures, accents put on letters, Greek, Cyrillic, signs: read here, and by way of matplotlib."""
     from matplotlib import get_data_path
     from matplotlib.font_manager import FontProperties
-    from matplotlib.ft2font import FT2Font
+    from matplotlib.ft2font import FT2Font, __freetype_version__
     from matplotlib.path import Path as Outline
     from matplotlib.textpath import text_to_path
 
+    # The one that older matplotlib brings rounds some points to another unit of the font.
+    off = 0.5 / 1000 if __freetype_version__ == "2.6.1" else 0
     file = Path(get_data_path(), "fonts", "ttf", f"{font}.ttf")
     face = FT2Font(str(file))
     known = face.get_charmap()
@@ -416,7 +418,7 @@ def test_glyphs_are_those_of_freetype_to_the_last_bit(font):
         pieces = [piece for path in paths for piece in path]
         assert len(pieces) == len(drawn), character
         for piece, (flat, _) in zip(pieces, drawn, strict=True):
-            assert np.array_equal(piece[1:].ravel(), flat), character
+            assert np.abs(piece[1:].ravel() - flat).max() <= off, character
 
 
 def test_odd_fonts_are_read_without_a_word():

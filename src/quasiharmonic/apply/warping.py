@@ -110,8 +110,8 @@ def warp_by_landmarks(
     >>> image = np.zeros((40, 60), dtype=np.uint8)
     >>> image[20, 30] = 255
     >>> warped = warp_by_landmarks(image, [[30, 20]], [[45, 10]])
-    >>> np.unravel_index(warped.image.argmax(), image.shape)
-    (np.int64(10), np.int64(45))
+    >>> [int(at) for at in np.unravel_index(warped.image.argmax(), image.shape)]
+    [10, 45]
     """
     picture = _picture(image)
     height, width = picture.shape[:2]

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array, kron, triu
+from scipy.sparse import csr_array, dia_array, kron, triu
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.energy.deformation import DeformationEnergy
@@ -90,7 +90,8 @@ class Plate:
 
     def matrix(self) -> csr_array:
         """K (n, n) of the term's ``Re xᴴ K x`` in displacements x."""
-        pulls = eye_array(len(self.weight), format="csr") * self.weight[:, None]
+        n = len(self.weight)
+        pulls = dia_array((self.weight[None], [0]), shape=(n, n))
         return csr_array(self.bent + pulls)
 
     def value(self, w: ComplexArray) -> float:

@@ -156,7 +156,7 @@ class Minimum:
 
     def _by_lu(self) -> None:
         """Factor the second derivatives as they are although they have a negative direction."""
-        from scipy.sparse import diags_array
+        from scipy.sparse import dia_array
         from scipy.sparse.linalg import splu
 
         system = self._freedom.system
@@ -164,7 +164,7 @@ class Minimum:
         matrix = system.matrix()
         # Unknowns that there are none of, across a line, have empty rows.
         empty = (abs(matrix) @ np.ones(matrix.shape[0])) == 0
-        self._lu = splu((matrix + diags_array(empty.astype(np.float64))).tocsc())
+        self._lu = splu((matrix + dia_array((empty[None].astype(np.float64), [0]), shape=matrix.shape)).tocsc())
         self.doubts.append(Doubt.NOT_LEAST)
 
     def _judge(self, left: float) -> None:

@@ -76,8 +76,8 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     >>> field = np.zeros((5, 6, 2))
     >>> field[..., 0] = 1.0
     >>> back = inverse_field(field)
-    >>> back.field[2, 3].tolist(), back.outside[:, 0].all()
-    ([-1.0, 0.0], np.True_)
+    >>> back.field[2, 3].tolist(), bool(back.outside[:, 0].all())
+    ([-1.0, 0.0], True)
     """
     given = checked_field(field)
     grid = checked_grid(given.shape, spacing)

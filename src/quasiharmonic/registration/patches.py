@@ -106,11 +106,12 @@ def filled_in(grid: Grid, given: ComplexArray, held: BoolArray, least: float) ->
 
 def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
     """Make the displacements of free pixels harmonic, those of the others given, the grid's border free."""
-    from scipy.sparse import csr_array, eye_array, kron, triu
+    from scipy.sparse import csr_array, dia_array, kron, triu
 
     inside, moved = np.flatnonzero(free), (given - grid.rest).ravel()
     (rows, columns), aspect = grid.shape, grid.spacing[1] / grid.spacing[0]
-    laplacian = aspect * kron(eye_array(rows), _path(columns)) + kron(_path(rows), eye_array(columns)) / aspect
+    across, along = (dia_array((np.ones((1, count)), [0]), shape=(count, count)) for count in (rows, columns))
+    laplacian = aspect * kron(across, _path(columns)) + kron(_path(rows), along) / aspect
     own_rows = csr_array(laplacian)[inside]
     load = -(own_rows @ np.where(free.ravel(), 0, moved))
     matrix = csr_array(triu(own_rows[:, inside], format="csr"))
@@ -124,12 +125,12 @@ def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> 
 
 def _path(count: int) -> dia_array:
     """The Laplacian of so many points in a row."""
-    from scipy.sparse import diags_array
+    from scipy.sparse import dia_array
 
-    degree = np.full(count, 2.0)
-    degree[[0, -1]] = 1
-    beside = np.full(count - 1, -1.0)
-    return diags_array([beside, degree, beside], offsets=[-1, 0, 1])
+    bands = np.full((3, count), -1.0)
+    bands[1] = 2
+    bands[1, [0, -1]] = 1
+    return dia_array((bands, [-1, 0, 1]), shape=(count, count))
 
 
 def _smoothed(grid: Grid, given: ComplexArray, least: float) -> ComplexArray:

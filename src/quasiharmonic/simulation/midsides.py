@@ -181,7 +181,7 @@ def _step(
     dear: float,
 ) -> FloatArray | None:
     """One step of Levenberg and Marquardt's, (k, 2), or None where none lowers what is to be lowered."""
-    from scipy.sparse import csr_array, eye_array
+    from scipy.sparse import csr_array, dia_array
     from scipy.sparse.linalg import splu
 
     free = np.flatnonzero(number >= 0)
@@ -203,7 +203,8 @@ def _step(
     known = np.broadcast_to(number[nodes][..., None] >= 0, column.shape)
     jacobian = csr_array((slopes[known], (row[known], column[known])), shape=(len(element), 2 * free.size))
     load = jacobian.T @ lacking[element, which] - dear * gone.ravel()
-    matrix = jacobian.T @ jacobian + dear * eye_array(2 * free.size)
+    unknowns = 2 * free.size
+    matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), dear), [0]), shape=(unknowns, unknowns))
     try:
         direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
     except RuntimeError:  # singular: elements so bad that being dear is rounded away
