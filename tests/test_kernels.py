@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 import quasiharmonic
-from quasiharmonic import kernels
+from quasiharmonic import certify, kernels
+from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.energies import ARAP
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.mesh.topology import boundary_loops, components
+from quasiharmonic.surfaces import disk
 from shared.kernels import ARGUMENTS
 
 # Rooms that need what not everybody has installed, and that have no kernels.
@@ -73,6 +79,114 @@ def test_other_arrays_are_refused(name, make):
     for wrong in (arguments[:-1], (*arguments, arguments[-1]), ()):
         with pytest.raises(TypeError, match=f"{name} was given {len(wrong)} arguments"):
             kernel(*wrong)
+
+
+# Arrays by number that may be of many lengths: room for what is found, and what indices in other arrays point into.
+_ANY_LENGTH = {
+    "wirtinger": {0},
+    "lay_flat": {0},
+    "sort_edges": {0},
+    "link_nodes": {2},
+    "jacobians": {0},
+    "pulls": {5},
+    "dirichlet_sweep": {0},
+    "clip_moduli": {0},
+    "assemble": {0},
+    "boundary_load": {0},
+    "put_at": {2},
+    "doubtful_pairs": {0, 3, 4},
+    "find_pattern": {0, 1, 2},
+    "wrong_pattern": {0},
+    "divide_cells": {12},
+    "find_cells": {3},
+    "sure_hits": {3, 4},
+    "find_places": {0},
+    "remove_vertices": {0},
+    "fill_rings": {0, 1, 2},
+    "add_up": {9},
+    "sure_signs": {1},
+}
+
+
+@needs_extension
+@pytest.mark.parametrize(("name", "make"), CASES)
+def test_arrays_that_are_too_short_are_refused(name, make):
+    kernel, arguments = getattr(kernels.extension, name), make(np.random.default_rng(0))
+    for i, each in enumerate(arguments):
+        if isinstance(each, np.ndarray) and each.size and i not in _ANY_LENGTH.get(name, ()):
+            with pytest.raises(ValueError, match=f"kernel {name} do not fit"):
+                kernel(*arguments[:i], np.ascontiguousarray(each[..., :-1]), *arguments[i + 1 :])
+
+
+def off_beat(array, *, strides):
+    """The same numbers where they are not aligned: in a buffer from its second byte on, or in a table of records."""
+    if strides:
+        table = np.zeros(array.shape[:1], dtype=[("numbers", array.dtype, array.shape[1:]), ("rest", np.float64)])
+        table["numbers"] = array
+        return table["numbers"]
+    buffer = bytearray(array.nbytes + 1)
+    given = np.frombuffer(buffer, dtype=array.dtype, offset=1).reshape(array.shape)
+    given[...] = array
+    return given
+
+
+@needs_extension
+def test_what_is_not_aligned_is_refused():
+    F, label = np.array([[0, 1], [1, 2]]), np.empty(3, dtype=np.int64)
+    with pytest.raises(TypeError, match=r"link_nodes.*not aligned"):
+        kernels.extension.link_nodes(off_beat(F, strides=False), F, label)
+    p, q, area = np.empty(2, dtype=complex), np.empty(2, dtype=complex), np.empty(2)
+    gamma = off_beat(np.ones((2, 2), dtype=complex)[:, :1], strides=True).T
+    assert gamma.strides[1] % gamma.itemsize
+    with pytest.raises(TypeError, match=r"wirtinger.*parts of items"):
+        kernels.extension.wirtinger(np.zeros(3, dtype=complex), np.array([[0, 1, 2]] * 2), gamma, p, q, area)
+
+
+@needs_extension
+def test_a_curve_through_a_vertex_that_is_not_there_is_refused():
+    places, starts, pairs = np.zeros((3, 2)), np.array([0, 3]), np.zeros((9, 2), dtype=np.int64)
+    for wrong in (-1, 3):
+        with pytest.raises(ValueError, match="doubtful_pairs do not fit"):
+            kernels.extension.doubtful_pairs(places, np.array([0, 1, wrong]), np.array([1, 2, 0]), starts, pairs)
+
+
+@pytest.mark.parametrize("strides", [False, True])
+def test_triangles_that_are_not_aligned_are_taken(strides):
+    V, F = disk(3)
+    given = off_beat(F, strides=strides)
+    assert not given.flags.c_contiguous if strides else not given.flags.aligned
+    assert np.array_equal(boundary_loops(given, len(V))[0], boundary_loops(F, len(V))[0])
+    assert np.array_equal(components(given, len(V)), components(F, len(V)))
+    assert certify(given, V[:, :2]).bijective
+
+
+V, F = disk(3)
+ENERGY, W = DeformationEnergy(V, F, ARAP()), V[:, 0] + 1j * V[:, 1]
+BEYOND = np.where(F == 0, len(V), F)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: ReferenceMesh(V, BEYOND, "equilateral"),
+        lambda: ReferenceMesh(V, -F, "rest"),
+        lambda: ReferenceMesh(V, F, "equilateral").derivatives(W[1:]),
+        lambda: Laplacian(BEYOND, len(V), np.arange(4)),
+        lambda: Laplacian(F, len(V), np.arange(4)).factor(np.ones((3, len(F) - 1))),
+        lambda: Laplacian(F, len(V), np.arange(4)).factor(np.full((3, len(F)), -1.0)).extend(W[1:]),
+        lambda: DeformationEnergy(V, BEYOND, ARAP()),
+        lambda: DeformationEnergy(V, -F, ARAP(), rest_F=F),
+        lambda: ENERGY.value(W[:-1]),
+        lambda: ENERGY.gradient_of(ENERGY.deform(W), len(V) - 1),
+        lambda: ENERGY.steps_to_collapse(W[:-1], W[:-1]),
+        lambda: ENERGY.steps_to_collapse(W, W[:-1]),
+        lambda: certify(F, V, loops=[[0, 1, len(V)]]),
+    ],
+)
+def test_no_kernel_is_given_vertices_that_are_not_there(call):
+    """By those that users may call themselves."""
+    with pytest.raises(ValueError, match=r"refers? to ver|shape"):
+        call()
 
 
 def test_an_extension_of_before_is_told(monkeypatch):

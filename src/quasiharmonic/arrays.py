@@ -72,8 +72,7 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
         raise ValueError(f"{name} must hold integer indices, not {_held(values, array)}{advice}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
-    made = np.array if copy else np.asarray
-    return made(array, dtype=np.int64, order="C")
+    return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
 
 
 def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:

@@ -55,7 +55,7 @@ class RelativeDirichlet(DeformationEnergy):
     """
 
     def __init__(self, energy: DeformationEnergy, at: Deformation, share: float) -> None:
-        self.energy, self.F = energy.energy, energy.F
+        self.energy, self.F, self._least_places = energy.energy, energy.F, energy._least_places
         a, b = (sigma ** (1 - share) for sigma in _singular_values(at))
         det = a * b
         # The reference is the image of z by s z + c z̄, and stretches where the map does.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, named, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_range, named, real_array
 from quasiharmonic.energy.energies import Deformation, Energy, QuadraticForm
 from quasiharmonic.energy.mixtures import curvature_of_mixture, mixed_energy, mixed_slopes, mixture_of
 from quasiharmonic.kernels import compiled
@@ -64,6 +64,8 @@ class DeformationEnergy:
     ) -> None:
         self.energy = energy
         self.F = np.ascontiguousarray(F, dtype=np.int64)
+        self._least_places = int(self.F.max(initial=-1)) + 1
+        check_range("F", self.F, self._least_places)
         shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))
         if shapes.flat.size:
             raise ValueError(
@@ -86,6 +88,7 @@ class DeformationEnergy:
         Determinants come from the images' areas. An area too small to be told from its own rounding is
         taken to be that rounding: it is positive if the map has been certified, and the energy huge.
         """
+        self._check_places(w.size)
         f = len(self.F)
         p, q, det = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
         jacobians(w, self.F, self.g, self._det_per_area, p, q, det)
@@ -115,6 +118,7 @@ class DeformationEnergy:
         else:
             by_p, by_q = np.empty_like(d.p), np.empty_like(d.q)
             mixed_slopes(mixture, d.p, d.q, d.det, by_p, by_q)
+        self._check_places(n)
         gradient = np.empty(n, dtype=np.complex128)
         pulls(by_p, by_q, self.share, self.F, self.g, gradient)
         return gradient
@@ -145,9 +149,15 @@ class DeformationEnergy:
             Positive; ``inf`` where it never does, and where the area of ``w`` itself is lost in rounding, so
             that only the exact test can say.
         """
+        self._check_places(min(w.size, direction.size))
         first = np.empty(len(self.F))
         collapses(w, direction, self.F, first)
         return first
+
+    def _check_places(self, n: int) -> None:
+        """Raise a ValueError unless there are places for all vertices of the triangles."""
+        if n < self._least_places:
+            raise ValueError(f"the triangles refer to vertex {self._least_places - 1}, but there are only {n} places")
 
 
 @compiled

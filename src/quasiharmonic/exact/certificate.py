@@ -195,7 +195,7 @@ def certify(
     Raises
     ------
     ValueError
-        When ``F`` or ``uv`` has the wrong shape or dtype, or ``F`` names vertices that are not there.
+        When ``F`` or ``uv`` has the wrong shape or dtype, or ``F`` or ``loops`` name vertices that are not there.
 
     See Also
     --------
@@ -226,6 +226,8 @@ def certify(
     if boundary and len(F):
         known, broken = _loops(F, len(uv)) if loops is None else (list(loops), [])
         reasons += broken
+        for loop in loops or ():
+            check_range("loops", np.asarray(loop), len(uv))
         # If all triangles are positive and the only loop is simple, then it encloses the sum of their areas, so it runs
         # counterclockwise and winds once around what it encloses, and nothing is left to ask.
         plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])

@@ -48,6 +48,10 @@ static int take_array(PyObject *given, char letter, int strided, Argument *to)
         PyErr_Format(PyExc_TypeError, "holds items of the format '%s'", view->format ? view->format : "B");
         return 0;
     }
+    if ((uintptr_t)view->buf % (uintptr_t)(view->itemsize > 8 ? 8 : view->itemsize)) {
+        PyErr_SetString(PyExc_TypeError, "is not aligned");
+        return 0;
+    }
     to->data = view->buf;
     to->size = view->itemsize ? view->len / view->itemsize : 0;
     to->rows = to->columns = to->row_stride = to->stride = 1;
@@ -63,6 +67,11 @@ static int take_array(PyObject *given, char letter, int strided, Argument *to)
                 PyErr_SetString(PyExc_TypeError, "has more than two axes");
                 return 0;
             }
+            for (int axis = 0; axis <= last; axis++)
+                if (view->strides[axis] % view->itemsize) {
+                    PyErr_SetString(PyExc_TypeError, "has strides of parts of items");
+                    return 0;
+                }
             to->stride = view->strides[last] / view->itemsize;
             to->row_stride = last ? view->strides[0] / view->itemsize : 0;
         }
@@ -110,6 +119,35 @@ wrong:
     Py_XDECREF(value);
     Py_XDECREF(traceback);
     return 0;
+}
+
+int fit(const char *kernel, Argument *arguments, Py_ssize_t count, int fits)
+{
+    if (fits)
+        return 1;
+    release(arguments, count);
+    PyErr_Format(PyExc_ValueError, "arrays given to the kernel %s do not fit together", kernel);
+    return 0;
+}
+
+int are_parts(const Argument *starts, Py_ssize_t items)
+{
+    const int64_t *at = starts->data;
+    if (!starts->size || at[0] < 0 || at[starts->size - 1] > items)
+        return 0;
+    for (Py_ssize_t i = 1; i < starts->size; i++)
+        if (at[i] < at[i - 1])
+            return 0;
+    return 1;
+}
+
+int are_indices(const Argument *numbers, Py_ssize_t items)
+{
+    const int64_t *at = numbers->data;
+    int inside = 1;
+    for (Py_ssize_t i = 0; i < numbers->size; i++)
+        inside &= 0 <= at[i] && at[i] < items;
+    return inside;
 }
 
 PyObject *done(Argument *arguments, Py_ssize_t count)

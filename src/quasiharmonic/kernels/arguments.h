@@ -29,6 +29,15 @@ typedef struct {
  * 1 when all is well; 0 with a TypeError set, and nothing held. */
 int take(const char *kernel, PyObject *const *given, Py_ssize_t count, const char *kinds, Argument *arguments);
 
+/* 1 where arrays fit together, as a kernel says; else 0 with a ValueError set, and nothing held. */
+int fit(const char *kernel, Argument *arguments, Py_ssize_t count, int fits);
+
+/* Whether these int64 are where parts of so many items begin, one after another, and where the last one ends. */
+int are_parts(const Argument *starts, Py_ssize_t items);
+
+/* Whether each of these int64 is the number of one of so many items. */
+int are_indices(const Argument *numbers, Py_ssize_t items);
+
 /* Let the arrays go. None, for a kernel to return. */
 PyObject *done(Argument *arguments, Py_ssize_t count);
 

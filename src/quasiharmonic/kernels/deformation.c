@@ -39,6 +39,9 @@ static PyObject *jacobians(PyObject *module, PyObject *const *given, Py_ssize_t 
     const int64_t *F = a[1].data;
     double *p = a[4].data, *q = a[5].data, *det = a[6].data;
     const Py_ssize_t f = a[6].size;
+    if (!fit("jacobians", a, LENGTH(a),
+             a[1].size == 3 * f && a[2].size == 3 * f && a[3].size == f && a[4].size == f && a[5].size == f))
+        return NULL;
     const double *gradients = a[2].data;
     Edges edges;
     Py_BEGIN_ALLOW_THREADS
@@ -76,6 +79,9 @@ static PyObject *pulls(PyObject *module, PyObject *const *given, Py_ssize_t coun
     const int64_t *F = a[3].data;
     double *gradient = a[5].data;
     const Py_ssize_t f = a[2].size;
+    if (!fit("pulls", a, LENGTH(a),
+             a[0].size == f && a[1].size == f && a[3].size == 3 * f && a[4].size == 3 * f))
+        return NULL;
     double pull[3][2 * CHUNK];
     Py_BEGIN_ALLOW_THREADS
     memset(gradient, 0, 2 * sizeof(double) * (size_t)a[5].size);
@@ -111,6 +117,9 @@ static PyObject *collapses(PyObject *module, PyObject *const *given, Py_ssize_t 
     const int64_t *F = a[2].data;
     double *first = a[3].data;
     const Py_ssize_t f = a[3].size;
+    if (!fit("collapses", a, LENGTH(a),
+             a[0].size == a[1].size && a[2].size == 3 * f))
+        return NULL;
     Edges here, by;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t start = 0; start < f; start += CHUNK) {

@@ -56,6 +56,9 @@ static PyObject *fill_stiffness(PyObject *module, PyObject *const *given, Py_ssi
     const double *xi = a[0].data, *by_entry = a[2].data;
     const Py_ssize_t number = a[1].integer, f = a[0].size, step = a[2].stride, row = a[2].row_stride;
     double *stiffness = a[3].data;
+    if (!fit("fill_stiffness", a, LENGTH(a),
+             a[2].rows == 9 && a[2].columns == f && a[3].size == 3 * f))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < f; j++) {
         const double x = xi[2 * j], y = xi[2 * j + 1];
@@ -81,8 +84,12 @@ static PyObject *dirichlet_sweep(PyObject *module, PyObject *const *given, Py_ss
     const double *w = a[0].data, *gamma = a[2].data, *m = a[3].data, *xi = a[4].data;
     const int64_t *F = a[1].data, *starts = a[6].data;
     const Py_ssize_t number = a[5].integer, step = 2 * a[2].stride, row = 2 * a[2].row_stride, by = a[3].stride;
-    const Py_ssize_t meshes = a[6].size - 1;
+    const Py_ssize_t f = a[4].size, meshes = a[6].size - 1;
     double *gradient = a[7].data, *sums = a[8].data;
+    if (!fit("dirichlet_sweep", a, LENGTH(a),
+             a[1].size == 3 * f && a[2].rows == 2 && a[2].columns == f && a[3].rows == 1 && a[3].columns == f &&
+             are_parts(a + 6, f) && a[7].size == f && a[8].size == 4 * meshes))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < meshes; i++) {
         double *sum = sums + 4 * i;

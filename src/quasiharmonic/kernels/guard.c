@@ -15,6 +15,10 @@ static PyObject *probe_matrix(PyObject *module, PyObject *const *given, Py_ssize
     const double *values = a[2].data, *signs = a[3].data;
     double *root = a[4].data, *probe = a[5].data, *image = a[6].data;
     const Py_ssize_t n = a[3].size;
+    if (!fit("probe_matrix", a, LENGTH(a),
+             a[0].size == n + 1 && a[1].size == indptr[n] && a[2].size == indptr[n] && a[4].size == n &&
+             a[5].size == n && a[6].size == n))
+        return NULL;
     Py_ssize_t worst = -1;
     for (Py_ssize_t i = 0; i < n && worst < 0; i++)
         if (!(values[indptr[i]] > 0))
@@ -50,6 +54,9 @@ static PyObject *scaled_sizes(PyObject *module, PyObject *const *given, Py_ssize
     const double *root = a[0].data, *probe = a[1].data, *image = a[2].data;
     double *sizes = a[5].data;
     const Py_ssize_t n = a[0].size, rows = a[5].columns;
+    if (!fit("scaled_sizes", a, LENGTH(a),
+             a[1].size == n && a[2].size == n && a[3].size == rows * n && a[4].size == rows * n && a[5].rows == 3))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < rows; j++) {
         const double *b = (const double *)a[3].data + j * n, *x = (const double *)a[4].data + j * n;

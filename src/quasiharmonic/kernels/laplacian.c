@@ -12,6 +12,10 @@ static PyObject *assemble(PyObject *module, PyObject *const *given, Py_ssize_t c
     const int32_t *diagonal = a[1].data, *halves = a[4].data, *offsets = a[5].data;
     const int64_t *row = a[2].data, *column = a[3].data, *border = a[6].data, *border_row = a[7].data;
     double *values = a[8].data;
+    if (!fit("assemble", a, LENGTH(a),
+             a[1].size > 0 && a[3].size == a[2].size && a[5].size == a[2].size + 1 &&
+             a[4].size == offsets[a[2].size] && a[7].size == a[6].size && a[8].size == a[1].size - 1 + a[2].size))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < a[1].size - 1; i++)
         values[diagonal[i]] = 0.0;
@@ -40,6 +44,10 @@ static PyObject *boundary_load(PyObject *module, PyObject *const *given, Py_ssiz
     const double *stiffness = a[0].data, *w = a[4].data;
     const int64_t *border = a[1].data, *border_row = a[2].data, *border_fixed = a[3].data;
     double *u = a[5].data, *v = u + a[5].columns;
+    if (!fit("boundary_load", a, LENGTH(a),
+             a[2].size == a[1].size && a[3].size == a[1].size && a[5].rows == 2 && are_indices(a + 1, a[0].size) &&
+             are_indices(a + 2, a[5].columns) && are_indices(a + 3, a[4].size)))
+        return NULL;
     for (Py_ssize_t i = 0; i < a[5].size; i++)
         u[i] = 0.0;
     for (Py_ssize_t k = 0; k < a[1].size; k++) {
@@ -60,6 +68,9 @@ static PyObject *put_at(PyObject *module, PyObject *const *given, Py_ssize_t cou
     const double *u = a[0].data, *v = u + a[0].columns;
     const int64_t *free = a[1].data;
     double *out = a[2].data;
+    if (!fit("put_at", a, LENGTH(a),
+             a[0].rows == 2 && a[0].columns == a[1].size))
+        return NULL;
     for (Py_ssize_t i = 0; i < a[1].size; i++) {
         out[2 * free[i]] = u[i];
         out[2 * free[i] + 1] = v[i];

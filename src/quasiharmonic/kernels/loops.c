@@ -167,6 +167,10 @@ static PyObject *doubtful_pairs(PyObject *module, PyObject *const *given, Py_ssi
         return NULL;
     const int64_t *tails = a[1].data, *heads = a[2].data, *starts = a[3].data;
     List list = {a[4].data, 0, a[4].size / 2};
+    if (!fit("doubtful_pairs", a, LENGTH(a),
+             a[2].size == a[1].size && are_indices(a + 1, a[0].size / 2) && are_indices(a + 2, a[0].size / 2) &&
+             are_parts(a + 3, a[1].size)))
+        return NULL;
     Py_ssize_t largest = 0;
     for (Py_ssize_t g = 0; g + 1 < a[3].size; g++)
         if (starts[g + 1] - starts[g] > largest)

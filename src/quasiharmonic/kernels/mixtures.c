@@ -159,6 +159,10 @@ static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize
         return NULL;
     const double *mixture = arguments[0].data, *share = arguments[4].data;
     const Py_ssize_t f = arguments[3].size;
+    if (!fit("mixed_energy", arguments, LENGTH(arguments),
+             arguments[0].size == KINDS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[4].size == f))
+        return NULL;
     double total = 0, lost = 0, plain = 0;
     Squares d;
     Py_BEGIN_ALLOW_THREADS
@@ -192,6 +196,10 @@ static PyObject *mixed_slopes(PyObject *module, PyObject *const *given, Py_ssize
     const double *p = arguments[1].data, *q = arguments[2].data;
     double *by_p = arguments[4].data, *by_q = arguments[5].data;
     const Py_ssize_t f = arguments[3].size;
+    if (!fit("mixed_slopes", arguments, LENGTH(arguments),
+             arguments[0].size == KINDS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[4].size == f && arguments[5].size == f))
+        return NULL;
     Squares d;
     Slopes slopes;
     Py_BEGIN_ALLOW_THREADS
@@ -263,6 +271,12 @@ static PyObject *mixed_curvature(PyObject *module, PyObject *const *given, Py_ss
     double *pp = arguments[6].data, *qq = arguments[7].data, *p2 = arguments[8].data, *q2 = arguments[9].data;
     double *pq = arguments[10].data, *pqc = arguments[11].data;
     const Py_ssize_t f = arguments[3].size;
+    if (!fit("mixed_curvature", arguments, LENGTH(arguments),
+             arguments[0].size == KINDS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[4].size == f && arguments[6].size == f && arguments[7].size == f &&
+             arguments[8].size == f && arguments[9].size == f && arguments[10].size == f &&
+             arguments[11].size == f))
+        return NULL;
     Squares d;
     Slopes slopes;
     Bends bends;

@@ -45,6 +45,11 @@ static PyObject *divide_cells(PyObject *module, PyObject *const *given, Py_ssize
     const double *nx = a[2].data, *ny = a[3].data, *offset = a[4].data;
     const int64_t columns = a[8].integer, lines = a[9].integer;
     const int shift = (int)a[10].integer;
+    if (!fit("divide_cells", a, LENGTH(a),
+             a[1].size == a[0].size && 2 * a[2].size == 3 * a[0].size && a[3].size == a[2].size &&
+             a[4].size == a[2].size && a[6].size == a[5].size && 0 <= shift && shift <= BITS &&
+             2 * a[11].size == a[7].size * columns * lines))
+        return NULL;
     int64_t *length = a[11].data, *listed = a[12].data;
     const double size = ldexp(1.0, shift - BITS);
     Pairs pairs = {NULL, NULL, 0, 4 * a[5].size + 16};
@@ -119,6 +124,9 @@ static PyObject *find_cells(PyObject *module, PyObject *const *given, Py_ssize_t
     const double *points = a[0].data;
     const int64_t columns = a[1].integer, *parts = a[3].data;
     int64_t *cell = a[4].data;
+    if (!fit("find_cells", a, LENGTH(a),
+             a[0].size == 2 * a[4].size && 0 <= a[2].integer && a[2].integer <= BITS))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < a[4].size; i++) {
         const int64_t x = finest(points[2 * i]), y = finest(points[2 * i + 1]);

@@ -82,6 +82,10 @@ static PyObject *add_up(PyObject *module, PyObject *const *given, Py_ssize_t cou
     const int32_t *slots = a[7].data;
     double *values = a[9].data;
     const Py_ssize_t f = a[0].size;
+    if (!fit("add_up", a, LENGTH(a),
+             a[1].size == f && a[2].size == f && a[3].size == f && a[4].size == f && a[5].size == f &&
+             a[6].size == 3 * f && a[7].size == 12 * f && a[8].size == 3 * f))
+        return NULL;
     Coefficients by;
     Blocks blocks;
     Py_BEGIN_ALLOW_THREADS

@@ -111,6 +111,12 @@ static PyObject *find_pattern(PyObject *module, PyObject *const *given, Py_ssize
     if (!take("find_pattern", given, count, "qiIIQQIIQQQQ", a))
         return NULL;
     const Mesh mesh = {a[0].data, a[1].data, a[0].size / 3, a[2].size - 1};
+    if (!fit("find_pattern", a, LENGTH(a),
+             a[0].size % 3 == 0 && mesh.size >= 0 && mesh.size + a[0].size <= INT32_MAX &&
+             a[3].size >= mesh.size + a[0].size && a[4].size >= a[0].size && a[5].size >= a[0].size &&
+             a[6].size >= a[0].size && a[7].size > a[0].size && a[8].size >= a[0].size &&
+             a[9].size >= a[0].size && a[10].size >= a[0].size && a[11].size == 3))
+        return NULL;
     int64_t *starts = malloc((size_t)(mesh.size + 1) * sizeof(*starts));
     uint64_t *inner = malloc((size_t)(3 * mesh.triangles + 1) * sizeof(*inner));
     if (!starts || !inner) {
@@ -158,6 +164,10 @@ static PyObject *wrong_pattern(PyObject *module, PyObject *const *given, Py_ssiz
     (void)module;
     Argument a[2];
     if (!take("wrong_pattern", given, count, "ii", a))
+        return NULL;
+    if (!fit("wrong_pattern", a, LENGTH(a),
+             a[0].size > 0 && ((const int32_t *)a[0].data)[0] == 0 &&
+             ((const int32_t *)a[0].data)[a[0].size - 1] == a[1].size))
         return NULL;
     int found;
     Py_BEGIN_ALLOW_THREADS

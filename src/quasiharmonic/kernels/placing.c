@@ -237,6 +237,10 @@ static PyObject *place_inverted(PyObject *module, PyObject *const *given, Py_ssi
     const double *from = a[3].data;
     double *w = a[4].data;
     unsigned char *righted = a[5].data;
+    if (!fit("place_inverted", a, LENGTH(a),
+             a[0].size == 3 * f && a[1].size == n && a[4].size == n &&
+             (!f || (of[0] >= 0 && of[f - 1] < a[5].size))))
+        return NULL;
     int64_t *number = malloc((size_t)(n + 1) * sizeof(int64_t));
     int64_t *corners = malloc((size_t)(3 * f + 1) * sizeof(int64_t));
     double *before = malloc((size_t)(n + 1) * 2 * sizeof(double));

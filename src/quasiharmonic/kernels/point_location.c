@@ -27,6 +27,9 @@ static PyObject *sure_hits(PyObject *module, PyObject *const *given, Py_ssize_t 
     const int64_t *begin = a[1].data, *end = a[2].data;
     const int32_t *listed = a[3].data;
     int64_t *hits = a[5].data;
+    if (!fit("sure_hits", a, LENGTH(a),
+             a[0].size == 2 * a[5].size && a[1].size == a[5].size && a[2].size == a[5].size && a[4].size % 6 == 0))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < a[5].size; i++) {
         hits[i] = NOWHERE;

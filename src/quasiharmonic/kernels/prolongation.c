@@ -119,6 +119,9 @@ static PyObject *find_places(PyObject *module, PyObject *const *given, Py_ssize_
     const Point *ring = a[0].data;
     Point *place = a[1].data;
     const Py_ssize_t d = a[0].columns;
+    if (!fit("find_places", a, LENGTH(a),
+             d >= 3 && a[0].size == d * a[1].size))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < a[1].size; i++)
         place[i] = best_place(ring + i * d, d);
@@ -213,6 +216,9 @@ static PyObject *smooth(PyObject *module, PyObject *const *given, Py_ssize_t cou
     (void)module;
     Argument a[3];
     if (!take("smooth", given, count, "Z~qb", a))
+        return NULL;
+    if (!fit("smooth", a, LENGTH(a),
+             a[1].columns == 3 && a[1].rows <= INT32_MAX / 3 && a[2].size == a[0].size))
         return NULL;
     const size_t n = (size_t)a[0].size + 1, f = (size_t)a[1].rows + 1;
     Smoothing map = {

@@ -14,6 +14,9 @@ static PyObject *wirtinger(PyObject *module, PyObject *const *given, Py_ssize_t 
     const int64_t *F = a[1].data;
     double *p = a[3].data, *q = a[4].data, *area = a[5].data;
     const Py_ssize_t f = a[5].size, step = 2 * a[2].stride, row = 2 * a[2].row_stride;
+    if (!fit("wirtinger", a, LENGTH(a),
+             a[1].size == 3 * f && a[2].rows == 2 && a[2].columns == f && a[3].size == f && a[4].size == f))
+        return NULL;
     for (Py_ssize_t j = 0; j < f; j++) {
         const double *w0 = w + 2 * F[3 * j], *w1 = w + 2 * F[3 * j + 1], *w2 = w + 2 * F[3 * j + 2];
         const double x1 = w1[0] - w0[0], y1 = w1[1] - w0[1], x2 = w2[0] - w0[0], y2 = w2[1] - w0[1];
@@ -57,6 +60,9 @@ static PyObject *lay_flat(PyObject *module, PyObject *const *given, Py_ssize_t c
     const int64_t *F = a[1].data;
     double *z1 = a[3].data, *z2 = a[4].data;
     const Py_ssize_t f = a[3].size, dimension = a[0].columns, row = a[0].row_stride, step = a[0].stride;
+    if (!fit("lay_flat", a, LENGTH(a),
+             (dimension == 2 || dimension == 3) && a[1].size == 3 * f && a[4].size == f))
+        return NULL;
     const Power into = power_of_two(-a[2].integer), back = power_of_two(a[2].integer);
     Py_ssize_t flat = 0;
     Py_BEGIN_ALLOW_THREADS

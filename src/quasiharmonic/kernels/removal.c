@@ -184,10 +184,14 @@ static void take_out(Round *round, int64_t *vertices, int64_t *rings, int64_t *o
     memset(of_degree, 0, (MOST_NEIGHBOURS + 1) * sizeof(*of_degree));
     for (Py_ssize_t v = 0; v < round->n; v++)
         round->last[v] = -1;
+    Py_ssize_t room = round->f;
     for (Py_ssize_t i = 0; i < round->number; i++) {
         const int32_t v = round->chosen[i];
         const Py_ssize_t d = degree(round, v);
         int64_t ring[MOST_NEIGHBOURS];
+        /* Of what is no surface two may have a triangle in common. */
+        if ((room -= d) < 0)
+            break;
         if (d < 3 || !turn_around(round, v, ring) || !fits(round, ring, d))
             continue;
         *vertices++ = v;
@@ -232,6 +236,10 @@ static PyObject *remove_vertices(PyObject *module, PyObject *const *given, Py_ss
     Argument a[6];
     if (!take("remove_vertices", given, count, "qbdQQQ", a))
         return NULL;
+    if (!fit("remove_vertices", a, LENGTH(a),
+             a[0].rows == 3 && a[0].size <= INT32_MAX && a[2].size == a[1].size &&
+             a[3].size >= a[0].columns / 3 && a[4].size >= a[0].columns && a[5].size == MOST_NEIGHBOURS + 1))
+        return NULL;
     Round round = {.n = a[1].size, .f = a[0].columns, .T = a[0].data, .free = a[1].data, .dice = a[2].data};
     if (!reserve(&round)) {
         release(&round);
@@ -271,19 +279,30 @@ static PyObject *fill_rings(PyObject *module, PyObject *const *given, Py_ssize_t
     const uint8_t *there = a[1].data;
     int64_t *filled = a[4].data;
     const Py_ssize_t before = a[0].columns, after = a[4].columns;
-    Py_BEGIN_ALLOW_THREADS
-    Py_ssize_t k = 0, stay = after;
-    for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++)
+    Py_ssize_t k = 0, stay = after, corners = 0;
+    if (!fit("fill_rings", a, LENGTH(a), a[0].rows == 3 && a[4].rows == 3 && a[3].size == MOST_NEIGHBOURS + 1))
+        return NULL;
+    for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++) {
         stay -= of_degree[d] * (d - 2);
-    for (Py_ssize_t j = 0; j < before && k < stay; j++) {
+        corners += of_degree[d] * d;
+    }
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t j = 0; j < before && k <= stay; j++) {
         const int64_t one = T[j], two = T[before + j], three = T[2 * before + j];
-        if (there[one] & there[two] & there[three]) {
+        if (!(there[one] & there[two] & there[three]))
+            continue;
+        if (k < stay) {
             filled[k] = one;
             filled[after + k] = two;
             filled[2 * after + k] = three;
-            k++;
         }
+        k++;
     }
+    Py_END_ALLOW_THREADS
+    /* As many must stay as leave room for the fans. */
+    if (!fit("fill_rings", a, LENGTH(a), k == stay && corners <= a[2].size))
+        return NULL;
+    Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t d = 3; d <= MOST_NEIGHBOURS; d++) {
         k = fill_with_fans(rings, of_degree[d], d, filled, after, k);
         rings += of_degree[d] * d;

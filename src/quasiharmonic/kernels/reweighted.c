@@ -29,6 +29,9 @@ static PyObject *rigid_proxies(PyObject *module, PyObject *const *given, Py_ssiz
         return NULL;
     const double *p = a[0].data, *q = a[1].data, *det = a[2].data, aim = a[3].number;
     double *both = a[4].data, *mixed = a[5].data;
+    if (!fit("rigid_proxies", a, LENGTH(a),
+             a[0].size == a[2].size && a[1].size == a[2].size && a[4].size == a[2].size && a[5].size == a[2].size))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < a[2].size; j++) {
         const double px = p[2 * j], py = p[2 * j + 1], qx = q[2 * j], qy = q[2 * j + 1];

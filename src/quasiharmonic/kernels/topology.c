@@ -103,10 +103,10 @@ static PyObject *sort_edges(PyObject *module, PyObject *const *given, Py_ssize_t
         return NULL;
     const int64_t *F = a[0].data;
     const Py_ssize_t halves = a[0].size, n = a[1].integer;
-    int known = 1;
-    for (Py_ssize_t i = 0; i < halves; i++)
-        known &= F[i] >= 0 && F[i] < n;
-    if (!known)
+    if (!fit("sort_edges", a, LENGTH(a),
+             halves % 3 == 0 && n >= 0 && a[2].size >= 2 * halves && a[3].size == KINDS))
+        return NULL;
+    if (!are_indices(a, n))
         return done_with_integer(a, LENGTH(a), 0);
     int64_t *starts = malloc((size_t)(n + 1) * sizeof(*starts));
     uint32_t *others = malloc((size_t)(halves + 1) * sizeof(*others));
@@ -144,6 +144,9 @@ static PyObject *link_nodes(PyObject *module, PyObject *const *given, Py_ssize_t
     const int64_t *tails = a[0].data, *heads = a[1].data;
     int64_t *label = a[2].data;
     const Py_ssize_t n = a[2].size, rows = a[0].rows, columns = a[0].columns;
+    if (!fit("link_nodes", a, LENGTH(a),
+             a[1].rows == rows && a[1].columns == columns))
+        return NULL;
     int known = 1;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < n; i++)
@@ -227,6 +230,9 @@ static PyObject *follow_loops(PyObject *module, PyObject *const *given, Py_ssize
     if (!take("follow_loops", given, count, "qQQ", a))
         return NULL;
     const Py_ssize_t size = a[1].size;
+    if (!fit("follow_loops", a, LENGTH(a),
+             a[0].size == 2 * size && a[2].size == size))
+        return NULL;
     HalfEdge *sorted = malloc((size_t)(size ? size : 1) * sizeof(*sorted));
     if (!sorted) {
         Py_DECREF(done(a, LENGTH(a)));

@@ -14,6 +14,9 @@ static PyObject *sure_signs(PyObject *module, PyObject *const *given, Py_ssize_t
     const double *uv = a[1].data;
     const Py_ssize_t f = a[2].size, n = a[1].size / 2;
     int8_t *sign = a[2].data;
+    if (!fit("sure_signs", a, LENGTH(a),
+             a[0].size == 3 * f))
+        return NULL;
     Py_ssize_t open = 0;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < f; j++) {
@@ -39,6 +42,9 @@ static PyObject *count_turns(PyObject *module, PyObject *const *given, Py_ssize_
     const int64_t *F = a[0].data;
     const double *uv = a[1].data;
     int64_t *turns = a[2].data;
+    if (!fit("count_turns", a, LENGTH(a),
+             a[0].size % 3 == 0 && a[1].size == 2 * a[2].size))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t j = 0; j < a[0].size; j += 3) {
         const double level[] = {uv[2 * F[j] + 1], uv[2 * F[j + 1] + 1], uv[2 * F[j + 2] + 1]};

@@ -12,6 +12,9 @@ static PyObject *adam_step(PyObject *module, PyObject *const *given, Py_ssize_t 
         return NULL;
     const double *gradient = a[0].data, first = a[1].number, second = a[2].number, length = a[3].number;
     double *mean = a[4].data, *square = a[5].data, *step = a[6].data;
+    if (!fit("adam_step", a, LENGTH(a),
+             a[4].size == a[0].size && a[5].size == a[0].size && a[6].size == a[0].size))
+        return NULL;
     for (Py_ssize_t j = 0; j < a[0].size; j++) {
         const double x = gradient[2 * j], y = gradient[2 * j + 1];
         mean[2 * j] = first * mean[2 * j] + (1 - first) * x;

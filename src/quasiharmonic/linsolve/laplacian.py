@@ -111,6 +111,8 @@ class Laplacian:
         quasiharmonic.linsolve.NotPositiveDefinite
             When rounding leaves no positive definite matrix.
         """
+        if stiffness.size != self._F.size:
+            raise ValueError(f"stiffness must have shape (3, {len(self._F)}), not {stiffness.shape}")
         made = FactoredLaplacian(self, stiffness.ravel())
         with self._lock:
             self._refactor(made)
@@ -174,6 +176,8 @@ class FactoredLaplacian:
             Equal to ``w`` at the fixed vertices, to the last bit.
         """
         of, pattern, out = self.pattern, self.pattern._pattern, w.copy()
+        if w.shape != (of.n,):
+            raise ValueError(f"w must have shape ({of.n},), a place for every vertex, not {w.shape}")
         load = np.empty((2, of.free.size))
         boundary_load(self.stiffness, pattern.border, pattern.border_row, pattern.border_fixed, w, load)
         of._solve(self, load, out)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import IntArray
+from quasiharmonic.arrays import IntArray, check_range
 from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.topology import edge_keys
 
@@ -52,6 +52,7 @@ def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> Stiff
     size : int
         How many are free.
     """
+    check_range("F", F, place.size)
     most = F.size
     made = StiffnessPattern(
         indptr=np.empty(size + 1, dtype=np.int32),

@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_range
 from quasiharmonic.kernels import compiled
 
 Reference = Literal["equilateral", "rest", "corrected"]
@@ -59,10 +59,12 @@ def flat_triangles(V: FloatArray, F: NDArray[np.integer]) -> IntArray:
 
 def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray, int]:
     """As `rest_frames`, and how many triangles have no area."""
+    T: IntArray = np.ascontiguousarray(F, dtype=np.int64)
+    check_range("F", T, len(V))
     # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
     exponent = math.frexp(max(V.max(initial=0), -V.min(initial=0)))[1]
     z1, z2 = np.empty(len(F)), np.empty(len(F), dtype=np.complex128)
-    return z1, z2, lay_flat(V, np.ascontiguousarray(F, dtype=np.int64), exponent, z1, z2)
+    return z1, z2, lay_flat(V, T, exponent, z1, z2)
 
 
 @compiled
@@ -139,6 +141,7 @@ class ReferenceMesh:
         self.F = F
         self.n = len(V)
         if kind == "equilateral":
+            check_range("F", F, self.n)
             m, gamma, per_entry = _equilateral()
         else:
             z1, z2 = rest_frames(V, F)
@@ -184,7 +187,14 @@ class ReferenceMesh:
         Returns
         -------
         Derivatives
+
+        Raises
+        ------
+        ValueError
+            When there is not a place for every vertex.
         """
+        if w.shape != (self.n,):
+            raise ValueError(f"w must have shape ({self.n},), a place for every vertex, not {w.shape}")
         f = len(self.F)
         p, q, area = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
         wirtinger(w, self.F, self.half_gamma, p, q, area)

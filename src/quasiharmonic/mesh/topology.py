@@ -57,7 +57,8 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     Edges
         Each kind in ascending order of its undirected edge.
     """
-    T: IntArray = np.ascontiguousarray(F, dtype=np.int64)
+    # Aligned too, which columns of a table of records need not be.
+    T: IntArray = np.require(F, np.int64, ["C", "A"])
     pairs, sizes = np.empty((T.size, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
     if not sort_edges(T, n, pairs, sizes):
         check_range("F", T, n)
@@ -238,7 +239,7 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     (n,) int64
         The smallest vertex of the component. A vertex without triangle is a component of its own.
     """
-    T: IntArray = np.asarray(F, dtype=np.int64)
+    T: IntArray = np.require(F, np.int64, ["A"])
     # Two edges of a triangle connect its three vertices.
     return linked(T[:, :2], T[:, 1:], n)
 
