@@ -2,8 +2,9 @@
 
 A kernel is a function that fills arrays handed to it. Its NumPy text stands where it is used, defines what it does, and
 is decorated by `compiled`; the function of that name in the extension, made of the C files of this folder, takes its
-place where there is one. It takes its arguments by position, wants arrays of the very types and contiguous unless its C
-text says otherwise, and asks no more of them: indices in arrays are in range because whoever calls has seen to it.
+place where there is one. It takes its arguments by position, wants arrays of the very types, aligned, and contiguous
+unless its C text says otherwise, and refuses such as do not fit together (`fit` in `arguments.h`). It asks no more of
+them: indices in arrays are in range because whoever calls has seen to it.
 
 ``QUASIHARMONIC_PURE=1`` in the environment has the NumPy texts run. Both give the same results but for rounding, and in
 the room `exact` the same in every bit.

@@ -107,11 +107,13 @@ static PyObject *divide_cells(PyObject *module, PyObject *const *given, Py_ssize
     return done_with_integer(a, LENGTH(a), together);
 }
 
-/* Coordinate of the finest cell. */
+/* Coordinate of the finest cell; -1 for what is below the unit box, or no number. */
 static int64_t finest(double along)
 {
-    const int64_t last = ((int64_t)1 << BITS) - 1, at = (int64_t)(along * 0x1p40);
-    return at < last ? at : last;
+    const int64_t last = ((int64_t)1 << BITS) - 1;
+    if (!(along >= 0))
+        return -1;
+    return along < 1 ? (int64_t)(along * 0x1p40) : last;
 }
 
 /* (points, columns, shift, parts, cell): the cells that points of the unit box lie in. */
@@ -124,21 +126,25 @@ static PyObject *find_cells(PyObject *module, PyObject *const *given, Py_ssize_t
     const double *points = a[0].data;
     const int64_t columns = a[1].integer, *parts = a[3].data;
     int64_t *cell = a[4].data;
+    int inside = 1;
     if (!fit("find_cells", a, LENGTH(a),
              a[0].size == 2 * a[4].size && 0 <= a[2].integer && a[2].integer <= BITS))
         return NULL;
     Py_BEGIN_ALLOW_THREADS
-    for (Py_ssize_t i = 0; i < a[4].size; i++) {
+    for (Py_ssize_t i = 0; i < a[4].size && inside; i++) {
         const int64_t x = finest(points[2 * i]), y = finest(points[2 * i + 1]);
         int shift = (int)a[2].integer;
         int64_t at = (y >> shift) * columns + (x >> shift);
-        while (parts[at] >= 0) {
+        inside = x >= 0 && y >= 0 && at < a[3].size;
+        while (inside && parts[at] >= 0) {
             shift -= 2;
             at = parts[at] + ((y >> shift & 3) << 2 | (x >> shift & 3));
         }
         cell[i] = at;
     }
     Py_END_ALLOW_THREADS
+    if (!fit("find_cells", a, LENGTH(a), inside))
+        return NULL;
     return done(a, LENGTH(a));
 }
 

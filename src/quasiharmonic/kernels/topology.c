@@ -104,7 +104,7 @@ static PyObject *sort_edges(PyObject *module, PyObject *const *given, Py_ssize_t
     const int64_t *F = a[0].data;
     const Py_ssize_t halves = a[0].size, n = a[1].integer;
     if (!fit("sort_edges", a, LENGTH(a),
-             halves % 3 == 0 && n >= 0 && a[2].size >= 2 * halves && a[3].size == KINDS))
+             halves % 3 == 0 && 0 <= n && n <= INT32_MAX && a[2].size >= 2 * halves && a[3].size == KINDS))
         return NULL;
     if (!are_indices(a, n))
         return done_with_integer(a, LENGTH(a), 0);
