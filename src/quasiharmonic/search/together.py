@@ -4,7 +4,8 @@ A call of NumPy or of a sparse solver takes some microseconds however little the
 hundred triangles is a hundred such calls. So small meshes are laid side by side, none joined to another: their
 Laplacian has one block for each, one analysis, one factorisation and one solve serve all, and VectorAdam does not mind,
 as it looks at each triangle by itself. Every problem walks the way that it would walk alone, to rounding. Whichever is
-solved falls out, and when half have, the others move up.
+solved falls out; what is left of several groups after the first iterations is joined, and whenever half have fallen
+out, the others move up.
 
 What is left when the stage has run is handed on as `Begun`, and each is searched on by itself.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
@@ -20,6 +22,7 @@ import numpy as np
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.descent.placing import Tries, placed_each
+from quasiharmonic.descent.vector_adam import Pace
 from quasiharmonic.exact.side_by_side import certify_each
 from quasiharmonic.field.functionals import beltrami_terms
 from quasiharmonic.field.passes import clip_moduli, stiffness_of, sweep
@@ -34,6 +37,12 @@ from quasiharmonic.search.strategy import stages_of
 
 # What has more triangles is solved by itself: NumPy has enough to do at each call.
 SMALL = 4_000
+# Triangles of what is laid side by side. Twice as many are no sooner solved, triangle for triangle: their arrays leave
+# the processor's cache. And QDLDL is still the first choice for such a system where MKL is not installed.
+GROUP = 28_000
+# Iterations before groups are joined. After two, nine in ten of what is not hard is solved, and the rest of one group
+# would be too little to be worth a call.
+_APART = 2
 # Patterns kept for meshes that come again, as where one mesh is mapped to many targets.
 _PATTERNS = 8
 
@@ -68,6 +77,8 @@ class _Member:
     problem : Problem
     live : bool
         Whether the stage has anything left to do for it.
+    seconds : float
+        Its share of what has been spent.
     tries : Tries
         When the vertices of its last inverted triangles are placed.
     found : MapResult, Begun or None
@@ -79,6 +90,7 @@ class _Member:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.live = True
+        self.seconds = 0.0
         self.tries = Tries()
         self.found: MapResult | Begun | None = None
         self.placed_mu: ComplexArray | None = None
@@ -100,18 +112,18 @@ class _Member:
         self.history.append(Step(len(self.history), 0, energy))
         self.best, self.best_map, self.placed_mu = (0, energy), w, mu
 
-    def stage(self, descent: VectorAdam, seconds: float) -> Stage:
+    def stage(self, descent: VectorAdam) -> Stage:
         """What reports say of what was done."""
         first, last = self.history[0], self.best
         return Stage(
             name=descent.name,
             iterations=len(self.history) - 1,
-            seconds=seconds,
+            seconds=self.seconds,
             flipped=(first.flipped, last[0]),
             energy=(first.energy, last[1]),
         )
 
-    def hand_on(self, descent: VectorAdam, seconds: float) -> None:
+    def hand_on(self, descent: VectorAdam) -> None:
         """The stage is over, and a search by itself begins."""
         self.live = False
         self.found = Begun(
@@ -122,7 +134,7 @@ class _Member:
             best_xi=self.best_xi,
             deepest_map=self._deepest_map,
             deepest_xi=self._deepest_xi,
-            stage=self.stage(descent, seconds),
+            stage=self.stage(descent),
         )
 
 
@@ -261,63 +273,125 @@ def first_stage(
     -------
     list
         For each problem its result, or how far the stage has come with it; None where rounding has spoilt something
-        for all: then it is as if nothing had been done.
+        for all of its group: then it is as if nothing had been done.
     """
     members = [_Member(problem) for problem in problems]
-    try:
-        _descend(members, descent, patterns, budget, still_wanted)
-    except NotPositiveDefinite:
-        return [member.found if isinstance(member.found, MapResult) else None for member in members]
+    last = min(descent.iterations, budget)
+    walks = []
+    for first, end in _runs([len(problem.F) for problem in problems]):
+        xi = np.zeros(sum(len(problem.F) for problem in problems[first:end]), dtype=np.complex128)
+        walk = _Walk(members[first:end], xi, descent.pace(xi.size), descent, patterns)
+        if walk.go(range(min(_APART, last + 1)), last, still_wanted):
+            walks.append(walk)
+    for walk in _joined(walks):
+        walk.go(range(_APART, last + 1), last, still_wanted)
+    for member in members:
+        if member.live:
+            member.hand_on(descent)
     return [member.found for member in members]
 
 
-def _descend(
-    members: list[_Member],
-    descent: VectorAdam,
-    patterns: Patterns,
-    budget: int,
-    still_wanted: Callable[[], None],
-) -> None:
-    """Descend until all are solved or the stage is over."""
-    side = _SideBySide(members, descent, patterns)
-    xi = np.zeros(int(side.triangles[-1]), dtype=np.complex128)
-    pace, spent, since = descent.pace(xi.size), 0.0, time.perf_counter()
-    last = min(descent.iterations, budget)
-    for iteration in range(last + 1):
-        still_wanted()
-        if iteration:
-            side.bounded(xi)
-        maps = side.evaluate(xi)
-        live = [k for k, member in enumerate(side.members) if member.live]
-        flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
-        for k in live:
-            side.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], xi[side.triangles_of(k)])
-        ready = [side.members[k] for k in live if flipped[k] == 0]
-        due = [k for k in live if flipped[k] and iteration < last and side.members[k].tries.due(flipped[k])]
-        if descent.placing and due:
-            ready += side.place(due, maps.w)
-        # Nobody knows what an iteration takes for one of them alone: all are charged alike.
-        now = time.perf_counter()
-        spent, since = spent + (now - since) / len(live), now
-        _judge(ready, descent, side.laplacian.solver.name, spent)
-        live = [k for k in live if side.members[k].live]
-        if not live:
-            return
-        xi += pace.step(maps.gradient)
-        size = 1 << (len(live) - 1).bit_length()
-        if 2 * size <= len(side.members):
-            # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
-            done = [k for k, member in enumerate(side.members) if not member.live]
-            kept = sorted(live + done[: size - len(live)])
-            triangles = np.concatenate([np.r_[side.triangles_of(k)] for k in kept])
-            pace.keep(triangles)
-            xi = xi[triangles]
-            side = _SideBySide([side.members[k] for k in kept], descent, patterns)
-    for k in live:
-        side.members[k].hand_on(descent, spent)
+class _Walk:
+    """Some of the problems on their way, side by side.
+
+    Parameters
+    ----------
+    members : sequence of _Member
+    xi : (f,) complex128
+        Of the triangles of all of them, one mesh after another.
+    pace : Pace
+        Of the same triangles.
+    descent : VectorAdam
+    patterns : Patterns
+    """
+
+    def __init__(
+        self, members: Sequence[_Member], xi: ComplexArray, pace: Pace, descent: VectorAdam, patterns: Patterns
+    ) -> None:
+        self.members, self.xi, self.pace, self.descent, self.patterns = members, xi, pace, descent, patterns
+
+    def go(self, iterations: range, last: int, still_wanted: Callable[[], None]) -> bool:
+        """Descend until all are solved or these iterations are over; ``last`` is the last of the stage.
+
+        Where rounding spoils something, False is returned, and nothing comes of what is not solved yet.
+        """
+        try:
+            self._go(iterations, last, still_wanted)
+        except NotPositiveDefinite:
+            for member in self.members:
+                member.live = False
+            return False
+        return True
+
+    def _go(self, iterations: range, last: int, still_wanted: Callable[[], None]) -> None:
+        side, since = _SideBySide(self.members, self.descent, self.patterns), time.perf_counter()
+        for iteration in iterations:
+            still_wanted()
+            if iteration:
+                side.bounded(self.xi)
+            maps = side.evaluate(self.xi)
+            live = [k for k, member in enumerate(self.members) if member.live]
+            flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
+            for k in live:
+                self.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], self.xi[side.triangles_of(k)])
+            ready = [self.members[k] for k in live if flipped[k] == 0]
+            due = [k for k in live if flipped[k] and iteration < last and self.members[k].tries.due(flipped[k])]
+            if self.descent.placing and due:
+                ready += side.place(due, maps.w)
+            # Nobody knows what an iteration takes for one of them alone: all are charged alike.
+            now = time.perf_counter()
+            for k in live:
+                self.members[k].seconds += (now - since) / len(live)
+            since = now
+            _judge(ready, self.descent, side.laplacian.solver.name)
+            left = sum(self.members[k].live for k in live)
+            if not left:
+                return
+            self.xi += self.pace.step(maps.gradient)
+            if 2 * _filled_up(left) <= len(self.members) and iteration + 1 in iterations:
+                (fewer,) = _joined([self])
+                self.members, self.xi, self.pace = fewer.members, fewer.xi, fewer.pace
+                side = _SideBySide(self.members, self.descent, self.patterns)
 
 
-def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: float) -> None:
+def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
+    """What is live of these walks, after as many iterations each, in as few as there may be."""
+    members = [member for walk in walks for member in walk.members]
+    chosen = [k for k, member in enumerate(members) if member.live]
+    if not chosen:
+        return []
+    if len({member.problem.domain for member in members}) == 1:
+        # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
+        done = (k for k, member in enumerate(members) if not member.live)
+        chosen = sorted([*chosen, *islice(done, _filled_up(len(chosen)) - len(chosen))])
+    ends = np.cumsum([len(member.problem.F) for member in members])
+    xi, pace = np.concatenate([walk.xi for walk in walks]), Pace.joined([walk.pace for walk in walks])
+    joined = []
+    for first, end in _runs([len(members[k].problem.F) for k in chosen]):
+        some = chosen[first:end]
+        triangles = np.concatenate([np.arange(ends[k] - len(members[k].problem.F), ends[k]) for k in some])
+        walk = _Walk([members[k] for k in some], xi[triangles], pace.part(triangles), walks[0].descent, walks[0].patterns)
+        joined.append(walk)
+    return joined
+
+
+def _filled_up(count: int) -> int:
+    """The least power of two that is no less."""
+    return 1 << (count - 1).bit_length()
+
+
+def _runs(sizes: Sequence[int]) -> list[tuple[int, int]]:
+    """From where to where things of these sizes, in their order, make up a group each."""
+    runs, first, total = list[tuple[int, int]](), 0, 0
+    for k, size in enumerate(sizes):
+        if k > first and total + size > GROUP:
+            runs.append((first, k))
+            first, total = k, 0
+        total += size
+    return [*runs, (first, len(sizes))] if sizes else []
+
+
+def _judge(members: list[_Member], descent: VectorAdam, solver: str) -> None:
     """Decide exactly on maps without inverted triangles, as far as floating point can tell."""
     problems = [member.problem for member in members]
     uv = [member.problem.positions(member.best_map) for member in members]
@@ -330,10 +404,10 @@ def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: fl
                 uv=places,
                 status=Status.INJECTIVE,
                 certificate=certificate,
-                stages=[member.stage(descent, seconds)],
+                stages=[member.stage(descent)],
                 history=member.history,
                 linear_solver=solver,
-                seconds=seconds,
+                seconds=member.seconds,
                 mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu if mu is None else mu,
                 V=member.problem.V,
             )
