@@ -24,12 +24,11 @@ from quasiharmonic.descent import VectorAdam
 from quasiharmonic.descent.placing import Tries, placed_each
 from quasiharmonic.descent.vector_adam import Pace
 from quasiharmonic.exact.side_by_side import certify_each
-from quasiharmonic.field.functionals import beltrami_terms
-from quasiharmonic.field.passes import clip_moduli, stiffness_of, sweep
-from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, own_tensor
+from quasiharmonic.field.passes import clip_moduli, own_sweep, stiffness_of, sweep
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.reference import ReferenceMesh, blocks
+from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
 from quasiharmonic.search.stages import Begun, Stages
@@ -102,10 +101,13 @@ class _Member:
     def note(self, flipped: int, energy: float, w: ComplexArray, xi: ComplexArray) -> None:
         """Take note of a map and its tensors."""
         self.history.append(Step(len(self.history), flipped, energy))
-        if (flipped, energy) < self.best:
-            self.best, self.best_map, self.best_xi = (flipped, energy), w.copy(), xi.copy()
-        if energy < self._deepest or not self._deepest_map.size:
-            self._deepest, self._deepest_map, self._deepest_xi = energy, w.copy(), xi.copy()
+        better, deeper = (flipped, energy) < self.best, energy < self._deepest or not self._deepest_map.size
+        if better or deeper:
+            w, xi = w.copy(), xi.copy()
+        if better:
+            self.best, self.best_map, self.best_xi = (flipped, energy), w, xi
+        if deeper:
+            self._deepest, self._deepest_map, self._deepest_xi = energy, w, xi
 
     def note_placed(self, w: ComplexArray, mu: ComplexArray, energy: float) -> None:
         """Take note of a map with vertices placed, none of whose triangles is inverted, at its own tensors."""
@@ -158,11 +160,10 @@ class _SideBySide:
         self.triangles = np.cumsum([0, *(len(problem.F) for problem in problems)])
         starts, n = self.vertices[:-1].tolist(), int(self.vertices[-1])
         F = np.concatenate([problem.F + start for problem, start in zip(problems, starts, strict=True)])
-        fixed = np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)])
+        self._fixed = np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)])
         self._mesh = ReferenceMesh(np.empty((n, 2)), F, "equilateral")
-        self.laplacian = patterns.of(tuple(problem.domain for problem in problems), F, n, fixed)
-        self._boundary = np.zeros(n, dtype=np.complex128)
-        self._boundary[fixed] = np.concatenate([problem.frame.inward(problem.target) for problem in problems])
+        self.laplacian = patterns.of(tuple(problem.domain for problem in problems), F, n, self._fixed)
+        self._boundary = np.concatenate([problem.held for problem in problems])
 
     def evaluate(self, xi: ComplexArray) -> _Maps:
         """As `Objective.evaluate` and what an `Iterate` computes."""
@@ -179,31 +180,21 @@ class _SideBySide:
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
         """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
-        problems = [self.members[k].problem for k in some]
-        vertices = np.cumsum([0, *(problem.n for problem in problems)])
-        count, starts = np.array([len(problem.F) for problem in problems]), vertices[:-1].tolist()
-        F = np.concatenate([problem.F + start for problem, start in zip(problems, starts, strict=True)])
-        moved, righted = placed_each(
-            F,
-            np.concatenate([w[self.vertices_of(k)] for k in some]),
-            np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)]),
-            np.repeat(np.arange(len(some)), count),
-        )
-        good = np.flatnonzero(righted)
+        chosen = np.zeros(len(self.members), dtype=bool)
+        chosen[some] = True
+        count = np.diff(self.triangles)
+        mesh = np.repeat(np.arange(len(some)), count[chosen])
+        F = self._mesh.F[np.repeat(chosen, count)]
+        moved, righted = placed_each(F, w, self._fixed, mesh)
+        good = np.asarray(some)[righted]
         if not good.size:
             return []
-        F, starts = F[np.repeat(righted, count)], np.cumsum(count[good]) - count[good]
-        mesh = ReferenceMesh(np.empty((moved.size, 2)), F, "equilateral")
-        mu, density, area = np.empty(len(F), dtype=np.complex128), np.empty(len(F)), np.empty(len(F))
-        for part in blocks(len(F)):
-            dw = mesh[part].derivatives(moved)
-            field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
-            mu[part], area[part] = field.mu, dw.area
-            density[part] = beltrami_terms(mesh.m[part], field, dw.p, dw.q)[0]
-        energy = 2 * np.add.reduceat(density, starts) / np.add.reduceat(area, starts)
-        noting = [self.members[some[k]] for k in good.tolist()]
-        for member, k, tensors, value in zip(noting, good, np.split(mu, starts[1:]), energy.tolist(), strict=True):
-            member.note_placed(moved[vertices[k] : vertices[k + 1]].copy(), tensors.copy(), value)
+        F, starts = F[righted[mesh]], np.concatenate([[0], np.cumsum(count[good])])
+        sums, mu = own_sweep(ReferenceMesh(np.empty((w.size, 2)), F, "equilateral"), moved, starts)
+        noting = [self.members[k] for k in good.tolist()]
+        energy = (sums[:, 0] / sums[:, 1]).tolist()
+        for member, k, first, end, value in zip(noting, good, starts[:-1], starts[1:], energy, strict=True):
+            member.note_placed(moved[self.vertices_of(k)].copy(), mu[first:end].copy(), value)
         return noting
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
@@ -396,10 +387,17 @@ def _judge(members: list[_Member], descent: VectorAdam, solver: str) -> None:
     problems = [member.problem for member in members]
     uv = [member.problem.positions(member.best_map) for member in members]
     verdicts = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])
+    mapped = [member for member, verdict in zip(members, verdicts, strict=True) if verdict.injective]
+    descended = [member for member in mapped if member.placed_mu is None]
+    tensors = list[ComplexArray]()
+    if descended:
+        xi = np.concatenate([member.best_xi for member in descended])
+        ends = np.cumsum([member.best_xi.size for member in descended])
+        tensors = np.split(PARAMETERISATIONS[descent.parameterisation].field(xi).mu, ends[:-1])
+    own = iter(tensors)
     for member, places, certificate in zip(members, uv, verdicts, strict=True):
         member.live = False
         if certificate.injective:
-            mu = member.placed_mu
             member.found = MapResult(
                 uv=places,
                 status=Status.INJECTIVE,
@@ -408,6 +406,6 @@ def _judge(members: list[_Member], descent: VectorAdam, solver: str) -> None:
                 history=member.history,
                 linear_solver=solver,
                 seconds=member.seconds,
-                mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu if mu is None else mu,
+                mu=next(own).copy() if member.placed_mu is None else member.placed_mu,
                 V=member.problem.V,
             )
