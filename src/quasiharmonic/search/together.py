@@ -339,10 +339,17 @@ class _Walk:
             if not left:
                 return
             self.xi += self.pace.step(maps.gradient)
-            if 2 * _filled_up(left) <= len(self.members) and iteration + 1 in iterations:
+            if self._too_many(left, iterations.stop - iteration - 1):
                 (fewer,) = _joined([self])
                 self.members, self.xi, self.pace = fewer.members, fewer.xi, fewer.pace
                 side = _SideBySide(self.members, self.descent, self.patterns)
+
+    def _too_many(self, left: int, iterations: int) -> bool:
+        """Whether those that are left had better move up, for so many iterations that are still to come."""
+        if _of_one_mesh(self.members):
+            return iterations > 0 and 5 * _filled_up(left) <= 3 * len(self.members)
+        # To analyse a pattern takes as long as two iterations.
+        return iterations > 1 and 2 * left <= len(self.members)
 
 
 def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
@@ -351,7 +358,7 @@ def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
     chosen = [k for k, member in enumerate(members) if member.live]
     if not chosen:
         return []
-    if len({member.problem.domain for member in members}) == 1:
+    if _of_one_mesh(members):
         # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
         done = (k for k, member in enumerate(members) if not member.live)
         chosen = sorted([*chosen, *islice(done, _filled_up(len(chosen)) - len(chosen))])
@@ -364,6 +371,11 @@ def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
         walk = _Walk([members[k] for k in some], xi[triangles], pace.part(triangles), walks[0].descent, walks[0].patterns)
         joined.append(walk)
     return joined
+
+
+def _of_one_mesh(members: Sequence[_Member]) -> bool:
+    """Whether all have one domain."""
+    return len({member.problem.domain for member in members}) == 1
 
 
 def _filled_up(count: int) -> int:
