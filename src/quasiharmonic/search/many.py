@@ -304,6 +304,8 @@ class _Worker:
 
 def _same(array: np.ndarray[Any, Any], given: Any) -> bool:
     """Whether what is given is an array of the same shape and numbers."""
+    if given is array:
+        return True
     return isinstance(given, np.ndarray) and given.shape == array.shape and np.array_equal(array, given)
 
 

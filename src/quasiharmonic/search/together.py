@@ -180,16 +180,14 @@ class _SideBySide:
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
         """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
-        chosen = np.zeros(len(self.members), dtype=bool)
-        chosen[some] = True
         count = np.diff(self.triangles)
-        mesh = np.repeat(np.arange(len(some)), count[chosen])
-        F = self._mesh.F[np.repeat(chosen, count)]
-        moved, righted = placed_each(F, w, self._fixed, mesh)
+        F = np.concatenate([self._mesh.F[self.triangles_of(k)] for k in some])
+        moved, righted = placed_each(F, w, self._fixed, np.repeat(np.arange(len(some)), count[some]))
         good = np.asarray(some)[righted]
         if not good.size:
             return []
-        F, starts = F[righted[mesh]], np.concatenate([[0], np.cumsum(count[good])])
+        F = np.concatenate([self._mesh.F[self.triangles_of(k)] for k in good])
+        starts = np.concatenate([[0], np.cumsum(count[good])])
         sums, mu = own_sweep(ReferenceMesh(np.empty((w.size, 2)), F, "equilateral"), moved, starts)
         noting = [self.members[k] for k in good.tolist()]
         energy = (sums[:, 0] / sums[:, 1]).tolist()
