@@ -4,10 +4,10 @@
 
 Three sets: one mesh onto many outlines, a mesh of its own for each outline, and generated problems that are hard for
 their size (`problems.py`). Ways to solve arrays take turns, portion by portion. A call for each is made for ``--each``
-problems only, some of every portion, files are written for the first ``--files``; rates are problems a second, of wall time and of
-processor time, and the ratio is that of the latter to a call for each, so that a busy machine is no matter. A call for
-each leaves a second core idle, so what two threads gain in wall time comes on top. Of files, a call for each is a loop
-that reads, maps, writes, reads back and certifies; `qhm batch` besides measures distortion and keeps records.
+problems only, some of every portion, files are written for the first ``--files``; rates are problems a second, of wall
+time and of processor time, and the ratio is that of the latter to a call for each, so that a busy machine is no matter.
+A call for each leaves a second core idle, so what two threads gain in wall time comes on top. Of files, a call for each
+is a loop that reads, maps, writes, reads back and certifies; `qhm batch` besides measures distortion and keeps records.
 """
 
 from __future__ import annotations

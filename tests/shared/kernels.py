@@ -353,9 +353,9 @@ def _(rng):
 def _(rng):
     """A map without inverted triangles, weights and gradients of each triangle's own."""
     V, F = disk(4)
-    f, gamma = len(F), numbers(rng, 2, 1)
+    f, gamma = len(F), np.broadcast_to(numbers(rng, 2, 1), (2, len(F))).copy()
     w = V[:, 0] + 1j * V[:, 1] + rng.normal(size=len(V)) / 30
-    return w, F, np.broadcast_to(gamma, (2, f)).copy(), rng.uniform(1, 2, f), np.array([0, f]), numbers(rng, f), np.empty((1, 2))
+    return w, F, gamma, rng.uniform(1, 2, f), np.array([0, f]), numbers(rng, f), np.empty((1, 2))
 
 
 @arguments_of("clip_moduli")

@@ -362,12 +362,11 @@ def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
         chosen = sorted([*chosen, *islice(done, _filled_up(len(chosen)) - len(chosen))])
     ends = np.cumsum([len(member.problem.F) for member in members])
     xi, pace = np.concatenate([walk.xi for walk in walks]), Pace.joined([walk.pace for walk in walks])
-    joined = []
+    descent, patterns, joined = walks[0].descent, walks[0].patterns, []
     for first, end in _runs([len(members[k].problem.F) for k in chosen]):
         some = chosen[first:end]
         triangles = np.concatenate([np.arange(ends[k] - len(members[k].problem.F), ends[k]) for k in some])
-        walk = _Walk([members[k] for k in some], xi[triangles], pace.part(triangles), walks[0].descent, walks[0].patterns)
-        joined.append(walk)
+        joined.append(_Walk([members[k] for k in some], xi[triangles], pace.part(triangles), descent, patterns))
     return joined
 
 
