@@ -3,11 +3,11 @@
     python benchmarks/many.py [-n 10000] [--triangles 500] [-j 1,2] [--each 1000] [--files 200] [-o docs/speed/many.md]
 
 Three sets: one mesh onto many outlines, a mesh of its own for each outline, and generated problems that are hard for
-their size (`problems.py`). Ways to solve arrays take turns, portion by portion. A call for each is made for the first
-``--each`` problems only, files are written for the first ``--files``; rates are problems a second, of wall time and of
-processor time, and the ratio is that of the latter to a call for each, so that a busy machine is no matter. A call for
-each leaves a second core idle, so what two threads gain in wall time comes on top. Of files, a call for each is a loop
-that reads, maps, writes, reads back and certifies; `qhm batch` besides measures distortion and keeps records.
+their size (`problems.py`). Ways to solve arrays take turns, portion by portion. A call for each is made for ``--each``
+problems only, some of every portion, files are written for the first ``--files``; rates are problems a second, of wall
+time and of processor time, and the ratio is that of the latter to a call for each, so that a busy machine is no matter.
+A call for each leaves a second core idle, so what two threads gain in wall time comes on top. Of files, a call for each
+is a loop that reads, maps, writes, reads back and certifies; `qhm batch` besides measures distortion and keeps records.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from speed import machine
 Arrays = tuple[FloatArray, IntArray, IntArray, FloatArray]
 
 # Problems between two turns.
-_PORTION = 250
+_PORTION = 1000
 _CALLS, _FILES = "`injective_map` for each", "files: `injective_map` for each"
 _HARD = "noise", "flow", "swirl", "polygon", "star", "glyph"
 
@@ -155,7 +155,7 @@ def measure(name: str, options: argparse.Namespace, jobs: list[int]) -> list[str
     endless = SETS[name](options.triangles)
     clocks: dict[str, Clock] = {_CALLS: Clock()}
     clocks |= {f"`injective_maps`, {n} {'thread' if n == 1 else 'threads'}": Clock() for n in jobs}
-    each, left, sizes = options.each, options.count, []
+    left, sizes = options.count, []
     first = list(islice(endless, _PORTION))
     one_by_one(first[:5])  # loads what is loaded once and for all
     while left > 0:
@@ -167,9 +167,9 @@ def measure(name: str, options: argparse.Namespace, jobs: list[int]) -> list[str
             if "maps" in label:
                 number = int(label.split(", ")[1].split()[0])
                 clock.time(lambda some=some, number=number: together(some, number))
-            elif each > 0:
+            else:
+                each = min(round(len(some) * options.each / options.count), len(some))
                 clock.time(lambda some=some[:each]: one_by_one(some))
-                each -= len(some)
     if options.files:
         with tempfile.TemporaryDirectory() as folder:
             root = Path(folder)

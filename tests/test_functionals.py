@@ -10,8 +10,10 @@ from quasiharmonic import certify, solve
 from quasiharmonic.descent import LBFGS, Newton, VectorAdam
 from quasiharmonic.field.functionals import FUNCTIONALS, neumann_target
 from quasiharmonic.field.objective import Objective
+from quasiharmonic.field.passes import own_sweep
 from quasiharmonic.field.tensor import TANH
 from quasiharmonic.mesh.operators import operators
+from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
@@ -438,3 +440,23 @@ class TestSettings:
     def test_others_are_refused(self, setting, word):
         with pytest.raises(ValueError, match=f"{setting} must be one of "):
             LBFGS(**{setting: word})
+
+
+def test_maps_at_their_own_tensors():
+    """Each triangle's V₃ there is twice its area where it is inverted and nothing where it is not."""
+    V, F = random_delaunay(80, seed=2)
+    mesh = ReferenceMesh(V, F, "equilateral")
+    w = V[:, 0] + 1j * V[:, 1]
+    folded = w + 0.08 * np.random.default_rng(1).standard_normal(len(V))
+    starts = np.array([0, 30, len(F)])
+    for places in (w, folded):
+        sums, mu = own_sweep(mesh, places, starts)
+        area = 0.5 * signed_areas(F, np.stack([places.real, places.imag], axis=1))
+        expected = [np.where(part < 0, -2 * part, 0).sum() for part in np.split(area, starts[1:-1])]
+        np.testing.assert_allclose(sums[:, 0], expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(sums[:, 1], [part.sum() for part in np.split(area, starts[1:-1])], rtol=1e-12)
+        dw = mesh.derivatives(places)
+        upright = area > 0
+        np.testing.assert_allclose(mu[upright], (dw.q / dw.p)[upright], rtol=1e-9)
+        np.testing.assert_allclose(mu[~upright], (dw.p / dw.q)[~upright].conj(), rtol=1e-9)
+    assert (~upright).sum() > 3

@@ -14,7 +14,7 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem.side_by_side import posed_each
-from quasiharmonic.search import many
+from quasiharmonic.search import many, together
 from quasiharmonic.search.together import Patterns, first_stage
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.exact import inverted
@@ -104,6 +104,39 @@ class TestAgreement:
             assert outline(a) == outline(b)
             np.testing.assert_array_equal(a.uv, b.uv)
 
+    def test_groups_that_are_joined_go_on_as_they_would_alone(self, monkeypatch):
+        """Whatever is left of several groups after the first iterations, of one mesh or of many."""
+        monkeypatch.setattr(together, "GROUP", 900)
+        stars = [star_problem(depth=0.15, points=6, n=150, seed=seed) for seed in range(5)]
+        V, F, fixed, target = stars[0]
+        turned = [(V, F, fixed, target * [1, 0.5 + k / 10]) for k in range(5)]
+        for problems in (ellipses(2) + stars, [Problem(V, F, fixed, target).moved(one[3]) for one in turned]):
+            posed = [given if isinstance(given, Problem) else Problem(*given) for given in problems]
+            descent = VectorAdam(iterations=30, placing=True)
+            found = first_stage(posed, descent, Patterns("auto"), 1000, lambda: None)
+            assert max(len(one.history) for one in found) > 4
+            for problem, one in zip(posed, found, strict=True):
+                alone = solve(problem, strategy=[descent])
+                assert [step.flipped for step in one.history] == [step.flipped for step in alone.history]
+                np.testing.assert_allclose(
+                    [step.energy for step in one.history],
+                    [step.energy for step in alone.history],
+                    rtol=1e-6,
+                    atol=1e-25,
+                )
+                if alone.injective:
+                    np.testing.assert_allclose(one.uv, alone.uv, atol=1e-9)
+
+    def test_larger_portions_keep_their_order(self, monkeypatch):
+        """A call takes ever more at a time; 60 groups are more than the first that are taken one by one."""
+        for module in (many, together):
+            monkeypatch.setattr(module, "GROUP", 60)
+        V, F, fixed, target = ellipses(1, 2)[0]
+        problems = [(V, F, fixed, target * [1, 0.3 + k / 100]) for k in range(60)]
+        for (*_, held), result in zip(problems, injective_maps(problems, jobs=2), strict=True):
+            assert result.injective
+            np.testing.assert_array_equal(result.uv[fixed], held)
+
     def test_a_stage_in_vain_is_gone_on_from(self):
         """The history goes on where that of the common stage ends, and the stages after it are run."""
         problems = [star_problem(depth=0.15, points=6, n=150, seed=seed) for seed in range(3)]
@@ -146,6 +179,19 @@ class TestAgreement:
             patch.setattr(Laplacian, "factor", defeated)
             found = first_stage(problems, VectorAdam(iterations=5), Patterns("auto"), 100, lambda: None)
         assert found == [None] * 5
+        factor, calls = Laplacian.factor, count()
+
+        def defeated_once(pattern, stiffness):
+            if next(calls) == 0:
+                raise NotPositiveDefinite("for once")
+            return factor(pattern, stiffness)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Laplacian, "factor", defeated_once)
+            patch.setattr(together, "GROUP", 2 * len(problems[0].F))
+            found = first_stage(problems, VectorAdam(iterations=50), Patterns("auto"), 100, lambda: None)
+        assert found[:2] == [None] * 2
+        assert all(one.injective for one in found[2:])
         monkeypatch.setattr(many, "first_stage", lambda problems, *_: [None] * len(problems))
         assert all(result.injective for result in injective_maps(problems))
 

@@ -339,6 +339,25 @@ def _(rng):
     return w, F, rng.normal() * gamma.copy(), rng.uniform(1, 2, 60), xi, *rest
 
 
+@arguments_of("at_own_tensors")
+def _(rng):
+    """Triangles of all shapes, one without area, one without sides, one vertex that lies nowhere."""
+    w, F, gamma, m, _, _, starts, gradient, _ = swept(rng, 0, 1.0, [0, 1, 40, 60])
+    w[F[50, 1]] = np.nan
+    w[F[3]] = 0.5
+    w[F[5]] = 0.1, 0.2, 0.6
+    return w, F, gamma, m, starts, gradient, np.empty((3, 2))
+
+
+@arguments_of("at_own_tensors")
+def _(rng):
+    """A map without inverted triangles, weights and gradients of each triangle's own."""
+    V, F = disk(4)
+    f, gamma = len(F), np.broadcast_to(numbers(rng, 2, 1), (2, len(F))).copy()
+    w = V[:, 0] + 1j * V[:, 1] + rng.normal(size=len(V)) / 30
+    return w, F, gamma, rng.uniform(1, 2, f), np.array([0, f]), numbers(rng, f), np.empty((1, 2))
+
+
 @arguments_of("clip_moduli")
 def _(rng):
     xi = field_on(rng, 30, 8.0)

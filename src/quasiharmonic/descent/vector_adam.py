@@ -114,9 +114,23 @@ class Pace:
         self._square = np.zeros(triangles)
         self._steps = 0
 
-    def keep(self, triangles: IntArray) -> None:
-        """Forget all but these triangles."""
-        self._mean, self._square = self._mean[triangles], self._square[triangles]
+    def part(self, triangles: IntArray | slice) -> Pace:
+        """What is remembered of some of the triangles, for these to go on by themselves."""
+        return self._with(self._mean[triangles], self._square[triangles])
+
+    @staticmethod
+    def joined(paces: Sequence[Pace]) -> Pace:
+        """One for the triangles of several, one after another, which have made as many steps each."""
+        return paces[0]._with(
+            np.concatenate([pace._mean for pace in paces]), np.concatenate([pace._square for pace in paces])
+        )
+
+    def _with(self, mean: ComplexArray, square: FloatArray) -> Pace:
+        """Of the same method after as many steps."""
+        other = Pace(0, self._momenta, self._times, self._lengths)
+        # What is taken from another one's is changed at every step.
+        other._mean, other._square, other._steps = np.array(mean), np.array(square), self._steps
+        return other
 
     def step(self, gradient: ComplexArray) -> ComplexArray:
         """The step in ξ that a gradient calls for, after those before it; (f,) complex128."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.field.functionals import beltrami_terms
-from quasiharmonic.field.tensor import Parameterisation, parameterisation_of
+from quasiharmonic.field.tensor import TANH, Parameterisation, own_tensor, parameterisation_of
 from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.reference import ReferenceMesh, blocks, wirtinger
 
@@ -66,6 +66,28 @@ def sweep(
     return sums, gradient
 
 
+def own_sweep(mesh: ReferenceMesh, w: ComplexArray, starts: IntArray) -> tuple[FloatArray, ComplexArray]:
+    """V₃ of a map, or of several side by side, at its own tensors as far as tanh reaches them.
+
+    Parameters
+    ----------
+    mesh : ReferenceMesh
+    w : (n,) complex128
+    starts : (k + 1,) int64
+        As of `sweep`.
+
+    Returns
+    -------
+    sums : (k, 2) float64
+        Of each mesh V₃ and the map's signed area.
+    mu : (f,) complex128
+        The Beltrami coefficients of these tensors.
+    """
+    sums, mu = np.empty((len(starts) - 1, 2)), np.empty(len(mesh.F), dtype=np.complex128)
+    at_own_tensors(w, np.ascontiguousarray(mesh.F), mesh.half_gamma, mesh.m, starts, mu, sums)
+    return sums, mu
+
+
 @compiled
 def fill_stiffness(xi: ComplexArray, number: int, by_entry: FloatArray, stiffness: FloatArray) -> None:
     """Fill in edge stiffness (3, f); by_entry: how each edge's depends on each entry of the tensor (9, f)."""
@@ -98,6 +120,28 @@ def dirichlet_sweep(
     # Areas that are not numbers are not positive either.
     for column, values in enumerate((~(area > 0), 2.0 * density, area, np.abs(area))):
         sums[:, column] = np.add.reduceat(values, starts[:-1], dtype=np.float64)
+
+
+@compiled
+def at_own_tensors(
+    w: ComplexArray,
+    F: IntArray,
+    half_gamma: ComplexArray,
+    m: FloatArray,
+    starts: IntArray,
+    mu: ComplexArray,
+    sums: FloatArray,
+) -> None:
+    """Fill in what `own_sweep` returns; half_gamma: of the last two corners (2, f)."""
+    f = mu.size
+    density, area = np.empty(f), np.empty(f)
+    for part in blocks(f):
+        p, q = np.empty_like(mu[part]), np.empty_like(mu[part])
+        wirtinger(w, F[part], half_gamma[:, part], p, q, area[part])
+        field = TANH.field(TANH.invert(own_tensor(p, q)))
+        density[part], mu[part] = beltrami_terms(m[part], field, p, q)[0], field.mu
+    for column, values in enumerate((2.0 * density, area)):
+        sums[:, column] = np.add.reduceat(values, starts[:-1])
 
 
 @compiled

@@ -1,12 +1,15 @@
 /* What `field/passes.py` has compiled: a field's tensors to stiffness, and V3 with its gradient in xi. */
 #include "arguments.h"
 
+#include <float.h>
 #include <math.h>
 
 /* Stands in for a divisor of zero, where the dividend vanishes too. */
 #define TINY 1e-300
 /* Sums are taken over so many triangles at a time before they are added up, which keeps rounding small. */
 #define TOGETHER 1024
+/* Of `TANH` in `field/tensor.py`. */
+#define TANH_BOUND 8.8
 
 /* r/rho, 1/(1 - r^2) and r' of the sigmoid of this number in `field/tensor.py`. */
 typedef struct {
@@ -133,6 +136,64 @@ static PyObject *dirichlet_sweep(PyObject *module, PyObject *const *given, Py_ss
     return done(a, LENGTH(a));
 }
 
+/* (w, F, half_gamma, m, starts, mu, sums): each triangle's own mu, as far as the bound of tanh's xi allows, and of each
+   mesh V3 at these, and the signed area. */
+static PyObject *at_own_tensors(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[7];
+    if (!take("at_own_tensors", given, count, "zq~z~dqZD", a))
+        return NULL;
+    const double *w = a[0].data, *gamma = a[2].data, *m = a[3].data;
+    const int64_t *F = a[1].data, *starts = a[4].data;
+    const Py_ssize_t step = 2 * a[2].stride, row = 2 * a[2].row_stride, by = a[3].stride;
+    const Py_ssize_t meshes = a[4].size - 1;
+    const double most = tanh(TANH_BOUND);
+    double *mu = a[5].data, *sums = a[6].data;
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < meshes; i++) {
+        double energy = 0.0, area = 0.0;
+        for (Py_ssize_t j = (Py_ssize_t)starts[i]; j < starts[i + 1]; j++) {
+            const double *w0 = w + 2 * F[3 * j], *w1 = w + 2 * F[3 * j + 1], *w2 = w + 2 * F[3 * j + 2];
+            const double x1 = w1[0] - w0[0], y1 = w1[1] - w0[1], x2 = w2[0] - w0[0], y2 = w2[1] - w0[1];
+            area += 0.5 * (x1 * y2 - y1 * x2);
+            /* As of `wirtinger`. */
+            const double *g1 = gamma + j * step, *g2 = g1 + row;
+            const double pr = (x1 * g1[0] + y1 * g1[1]) + (x2 * g2[0] + y2 * g2[1]);
+            const double pi = (y1 * g1[0] - x1 * g1[1]) + (y2 * g2[0] - x2 * g2[1]);
+            const double qr = (x1 * g1[0] - y1 * g1[1]) + (x2 * g2[0] - y2 * g2[1]);
+            const double qi = (x1 * g1[1] + y1 * g1[0]) + (x2 * g2[1] + y2 * g2[0]);
+            /* As of `own_tensor`: q / p, or conj(p / q) where that is less. Sizes by `hypot`, as in NumPy. */
+            const double size_p = hypot(pr, pi), size_q = hypot(qr, qi);
+            const int inverted = size_q > size_p;
+            const double large = inverted ? size_q : size_p;
+            const double nr = inverted ? pr : qr, ni = inverted ? -pi : qi;
+            /* Of modulus one, so that no square leaves the range. */
+            const double dr = (inverted ? qr : pr) / large, di = (inverted ? -qi : pi) / large;
+            double u = 0.0, v = 0.0;
+            if (large >= DBL_MIN) {
+                u = (nr / large) * dr + (ni / large) * di;
+                v = (ni / large) * dr - (nr / large) * di;
+            }
+            const double modulus = sqrt(u * u + v * v);
+            double by_defect = 1.0 / ((1.0 - modulus) * (1.0 + modulus));
+            if (!(modulus <= most)) {
+                u *= most / modulus;
+                v *= most / modulus;
+                by_defect = tanh_at(TANH_BOUND).by_defect;
+            }
+            mu[2 * j] = u;
+            mu[2 * j + 1] = v;
+            const double rr = qr - (u * pr - v * pi), ri = qi - (u * pi + v * pr);
+            energy += (rr * rr + ri * ri) * m[j * by] * by_defect;
+        }
+        sums[2 * i] = 2.0 * energy;
+        sums[2 * i + 1] = area;
+    }
+    Py_END_ALLOW_THREADS
+    return done(a, LENGTH(a));
+}
+
 /* (xi, bound): clip moduli in place. */
 static PyObject *clip_moduli(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
@@ -156,6 +217,7 @@ static PyObject *clip_moduli(PyObject *module, PyObject *const *given, Py_ssize_
 PyMethodDef field_kernels[] = {
     KERNEL(fill_stiffness),
     KERNEL(dirichlet_sweep),
+    KERNEL(at_own_tensors),
     KERNEL(clip_moduli),
     END_OF_KERNELS,
 };

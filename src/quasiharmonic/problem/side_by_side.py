@@ -122,5 +122,5 @@ def _areas(V: NDArray[np.float64], F: IntArray, starts: IntArray) -> bool:
 
 def _parted(pairs: IntArray, starts: IntArray) -> list[IntArray]:
     """Edges in the order of their smaller ends, (e, 2), mesh by mesh in its own numbers."""
-    ends = np.searchsorted(pairs.min(axis=1), starts[1:-1])
+    ends = np.searchsorted(np.minimum(pairs[:, 0], pairs[:, 1]), starts[1:-1])
     return [part - start for part, start in zip(np.split(pairs, ends), starts[:-1].tolist(), strict=True)]

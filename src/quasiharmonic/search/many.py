@@ -24,14 +24,16 @@ from quasiharmonic.result import MapResult, Status, Step
 from quasiharmonic.search.solving import solve
 from quasiharmonic.search.stages import Begun, Stages
 from quasiharmonic.search.strategy import STRATEGIES, stages_of
-from quasiharmonic.search.together import SMALL, Patterns, beginning_alike, first_stage
+from quasiharmonic.search.together import GROUP, SMALL, Patterns, beginning_alike, first_stage
 
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 
-# Triangles of a group of problems. Twice as many are no sooner solved, triangle for triangle: their arrays leave the
-# processor's cache. And QDLDL is still the first choice for such a system where MKL is not installed.
-GROUP = 28_000
+# Groups that are solved together, at most: what is left of them after the first iterations is joined.
+_GROUPS = 4
+# What is solved together is no more than such a part of all that was before, so that no thread is left with much while
+# the others have nothing to do any more.
+_PART = 8
 # Seconds between two calls of a callback while nothing is finished, and between two looks for an interrupt.
 _TICK = 0.2
 
@@ -174,11 +176,13 @@ def _awaited(
 
 def _groups(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
     """Problems in their order, as many together as are to be solved together; and the number of the first."""
-    first, group, size = 0, list[Any](), 0
+    first, group, size, before = 0, list[Any](), 0, 0
     for given in problems:
         triangles = _triangles(given)
-        if group and (size + triangles > GROUP or triangles > SMALL):
+        most = GROUP * min(max(before // (_PART * GROUP), 1), _GROUPS)
+        if group and (size + triangles > most or triangles > SMALL):
             yield first, group
+            before += size
             first, group, size = first + len(group), [], 0
         group.append(given)
         size += triangles
@@ -300,6 +304,8 @@ class _Worker:
 
 def _same(array: np.ndarray[Any, Any], given: Any) -> bool:
     """Whether what is given is an array of the same shape and numbers."""
+    if given is array:
+        return True
     return isinstance(given, np.ndarray) and given.shape == array.shape and np.array_equal(array, given)
 
 

@@ -4,7 +4,8 @@ A call of NumPy or of a sparse solver takes some microseconds however little the
 hundred triangles is a hundred such calls. So small meshes are laid side by side, none joined to another: their
 Laplacian has one block for each, one analysis, one factorisation and one solve serve all, and VectorAdam does not mind,
 as it looks at each triangle by itself. Every problem walks the way that it would walk alone, to rounding. Whichever is
-solved falls out, and when half have, the others move up.
+solved falls out; what is left of several groups after the first iterations is joined, and whenever half have fallen
+out, the others move up.
 
 What is left when the stage has run is handed on as `Begun`, and each is searched on by itself.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
@@ -20,13 +22,13 @@ import numpy as np
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.descent import VectorAdam
 from quasiharmonic.descent.placing import Tries, placed_each
+from quasiharmonic.descent.vector_adam import Pace
 from quasiharmonic.exact.side_by_side import certify_each
-from quasiharmonic.field.functionals import beltrami_terms
-from quasiharmonic.field.passes import clip_moduli, stiffness_of, sweep
-from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, own_tensor
+from quasiharmonic.field.passes import clip_moduli, own_sweep, stiffness_of, sweep
+from quasiharmonic.field.tensor import PARAMETERISATIONS
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.reference import ReferenceMesh, blocks
+from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.result import MapResult, Stage, Status, Step
 from quasiharmonic.search.stages import Begun, Stages
@@ -34,6 +36,12 @@ from quasiharmonic.search.strategy import stages_of
 
 # What has more triangles is solved by itself: NumPy has enough to do at each call.
 SMALL = 4_000
+# Triangles of what is laid side by side. Twice as many are no sooner solved, triangle for triangle: their arrays leave
+# the processor's cache. And QDLDL is still the first choice for such a system where MKL is not installed.
+GROUP = 28_000
+# Iterations before groups are joined. After two, nine in ten of what is not hard is solved, and the rest of one group
+# would be too little to be worth a call.
+_APART = 2
 # Patterns kept for meshes that come again, as where one mesh is mapped to many targets.
 _PATTERNS = 8
 
@@ -68,6 +76,8 @@ class _Member:
     problem : Problem
     live : bool
         Whether the stage has anything left to do for it.
+    seconds : float
+        Its share of what has been spent.
     tries : Tries
         When the vertices of its last inverted triangles are placed.
     found : MapResult, Begun or None
@@ -79,6 +89,7 @@ class _Member:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.live = True
+        self.seconds = 0.0
         self.tries = Tries()
         self.found: MapResult | Begun | None = None
         self.placed_mu: ComplexArray | None = None
@@ -90,28 +101,31 @@ class _Member:
     def note(self, flipped: int, energy: float, w: ComplexArray, xi: ComplexArray) -> None:
         """Take note of a map and its tensors."""
         self.history.append(Step(len(self.history), flipped, energy))
-        if (flipped, energy) < self.best:
-            self.best, self.best_map, self.best_xi = (flipped, energy), w.copy(), xi.copy()
-        if energy < self._deepest or not self._deepest_map.size:
-            self._deepest, self._deepest_map, self._deepest_xi = energy, w.copy(), xi.copy()
+        better, deeper = (flipped, energy) < self.best, energy < self._deepest or not self._deepest_map.size
+        if better or deeper:
+            w, xi = w.copy(), xi.copy()
+        if better:
+            self.best, self.best_map, self.best_xi = (flipped, energy), w, xi
+        if deeper:
+            self._deepest, self._deepest_map, self._deepest_xi = energy, w, xi
 
     def note_placed(self, w: ComplexArray, mu: ComplexArray, energy: float) -> None:
         """Take note of a map with vertices placed, none of whose triangles is inverted, at its own tensors."""
         self.history.append(Step(len(self.history), 0, energy))
         self.best, self.best_map, self.placed_mu = (0, energy), w, mu
 
-    def stage(self, descent: VectorAdam, seconds: float) -> Stage:
+    def stage(self, descent: VectorAdam) -> Stage:
         """What reports say of what was done."""
         first, last = self.history[0], self.best
         return Stage(
             name=descent.name,
             iterations=len(self.history) - 1,
-            seconds=seconds,
+            seconds=self.seconds,
             flipped=(first.flipped, last[0]),
             energy=(first.energy, last[1]),
         )
 
-    def hand_on(self, descent: VectorAdam, seconds: float) -> None:
+    def hand_on(self, descent: VectorAdam) -> None:
         """The stage is over, and a search by itself begins."""
         self.live = False
         self.found = Begun(
@@ -122,7 +136,7 @@ class _Member:
             best_xi=self.best_xi,
             deepest_map=self._deepest_map,
             deepest_xi=self._deepest_xi,
-            stage=self.stage(descent, seconds),
+            stage=self.stage(descent),
         )
 
 
@@ -146,11 +160,10 @@ class _SideBySide:
         self.triangles = np.cumsum([0, *(len(problem.F) for problem in problems)])
         starts, n = self.vertices[:-1].tolist(), int(self.vertices[-1])
         F = np.concatenate([problem.F + start for problem, start in zip(problems, starts, strict=True)])
-        fixed = np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)])
+        self._fixed = np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)])
         self._mesh = ReferenceMesh(np.empty((n, 2)), F, "equilateral")
-        self.laplacian = patterns.of(tuple(problem.domain for problem in problems), F, n, fixed)
-        self._boundary = np.zeros(n, dtype=np.complex128)
-        self._boundary[fixed] = np.concatenate([problem.frame.inward(problem.target) for problem in problems])
+        self.laplacian = patterns.of(tuple(problem.domain for problem in problems), F, n, self._fixed)
+        self._boundary = np.concatenate([problem.held for problem in problems])
 
     def evaluate(self, xi: ComplexArray) -> _Maps:
         """As `Objective.evaluate` and what an `Iterate` computes."""
@@ -167,31 +180,19 @@ class _SideBySide:
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
         """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
-        problems = [self.members[k].problem for k in some]
-        vertices = np.cumsum([0, *(problem.n for problem in problems)])
-        count, starts = np.array([len(problem.F) for problem in problems]), vertices[:-1].tolist()
-        F = np.concatenate([problem.F + start for problem, start in zip(problems, starts, strict=True)])
-        moved, righted = placed_each(
-            F,
-            np.concatenate([w[self.vertices_of(k)] for k in some]),
-            np.concatenate([problem.fixed + start for problem, start in zip(problems, starts, strict=True)]),
-            np.repeat(np.arange(len(some)), count),
-        )
-        good = np.flatnonzero(righted)
+        count = np.diff(self.triangles)
+        F = np.concatenate([self._mesh.F[self.triangles_of(k)] for k in some])
+        moved, righted = placed_each(F, w, self._fixed, np.repeat(np.arange(len(some)), count[some]))
+        good = np.asarray(some)[righted]
         if not good.size:
             return []
-        F, starts = F[np.repeat(righted, count)], np.cumsum(count[good]) - count[good]
-        mesh = ReferenceMesh(np.empty((moved.size, 2)), F, "equilateral")
-        mu, density, area = np.empty(len(F), dtype=np.complex128), np.empty(len(F)), np.empty(len(F))
-        for part in blocks(len(F)):
-            dw = mesh[part].derivatives(moved)
-            field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
-            mu[part], area[part] = field.mu, dw.area
-            density[part] = beltrami_terms(mesh.m[part], field, dw.p, dw.q)[0]
-        energy = 2 * np.add.reduceat(density, starts) / np.add.reduceat(area, starts)
-        noting = [self.members[some[k]] for k in good.tolist()]
-        for member, k, tensors, value in zip(noting, good, np.split(mu, starts[1:]), energy.tolist(), strict=True):
-            member.note_placed(moved[vertices[k] : vertices[k + 1]].copy(), tensors.copy(), value)
+        F = np.concatenate([self._mesh.F[self.triangles_of(k)] for k in good])
+        starts = np.concatenate([[0], np.cumsum(count[good])])
+        sums, mu = own_sweep(ReferenceMesh(np.empty((w.size, 2)), F, "equilateral"), moved, starts)
+        noting = [self.members[k] for k in good.tolist()]
+        energy = (sums[:, 0] / sums[:, 1]).tolist()
+        for member, k, first, end, value in zip(noting, good, starts[:-1], starts[1:], energy, strict=True):
+            member.note_placed(moved[self.vertices_of(k)].copy(), mu[first:end].copy(), value)
         return noting
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
@@ -261,79 +262,159 @@ def first_stage(
     -------
     list
         For each problem its result, or how far the stage has come with it; None where rounding has spoilt something
-        for all: then it is as if nothing had been done.
+        for all of its group: then it is as if nothing had been done.
     """
     members = [_Member(problem) for problem in problems]
-    try:
-        _descend(members, descent, patterns, budget, still_wanted)
-    except NotPositiveDefinite:
-        return [member.found if isinstance(member.found, MapResult) else None for member in members]
+    last = min(descent.iterations, budget)
+    walks = []
+    for first, end in _runs([len(problem.F) for problem in problems]):
+        xi = np.zeros(sum(len(problem.F) for problem in problems[first:end]), dtype=np.complex128)
+        walk = _Walk(members[first:end], xi, descent.pace(xi.size), descent, patterns)
+        if walk.go(range(min(_APART, last + 1)), last, still_wanted):
+            walks.append(walk)
+    for walk in _joined(walks):
+        walk.go(range(_APART, last + 1), last, still_wanted)
+    for member in members:
+        if member.live:
+            member.hand_on(descent)
     return [member.found for member in members]
 
 
-def _descend(
-    members: list[_Member],
-    descent: VectorAdam,
-    patterns: Patterns,
-    budget: int,
-    still_wanted: Callable[[], None],
-) -> None:
-    """Descend until all are solved or the stage is over."""
-    side = _SideBySide(members, descent, patterns)
-    xi = np.zeros(int(side.triangles[-1]), dtype=np.complex128)
-    pace, spent, since = descent.pace(xi.size), 0.0, time.perf_counter()
-    last = min(descent.iterations, budget)
-    for iteration in range(last + 1):
-        still_wanted()
-        if iteration:
-            side.bounded(xi)
-        maps = side.evaluate(xi)
-        live = [k for k, member in enumerate(side.members) if member.live]
-        flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
-        for k in live:
-            side.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], xi[side.triangles_of(k)])
-        ready = [side.members[k] for k in live if flipped[k] == 0]
-        due = [k for k in live if flipped[k] and iteration < last and side.members[k].tries.due(flipped[k])]
-        if descent.placing and due:
-            ready += side.place(due, maps.w)
-        # Nobody knows what an iteration takes for one of them alone: all are charged alike.
-        now = time.perf_counter()
-        spent, since = spent + (now - since) / len(live), now
-        _judge(ready, descent, side.laplacian.solver.name, spent)
-        live = [k for k in live if side.members[k].live]
-        if not live:
-            return
-        xi += pace.step(maps.gradient)
-        size = 1 << (len(live) - 1).bit_length()
-        if 2 * size <= len(side.members):
-            # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
-            done = [k for k, member in enumerate(side.members) if not member.live]
-            kept = sorted(live + done[: size - len(live)])
-            triangles = np.concatenate([np.r_[side.triangles_of(k)] for k in kept])
-            pace.keep(triangles)
-            xi = xi[triangles]
-            side = _SideBySide([side.members[k] for k in kept], descent, patterns)
-    for k in live:
-        side.members[k].hand_on(descent, spent)
+class _Walk:
+    """Some of the problems on their way, side by side.
+
+    Parameters
+    ----------
+    members : sequence of _Member
+    xi : (f,) complex128
+        Of the triangles of all of them, one mesh after another.
+    pace : Pace
+        Of the same triangles.
+    descent : VectorAdam
+    patterns : Patterns
+    """
+
+    def __init__(
+        self, members: Sequence[_Member], xi: ComplexArray, pace: Pace, descent: VectorAdam, patterns: Patterns
+    ) -> None:
+        self.members, self.xi, self.pace, self.descent, self.patterns = members, xi, pace, descent, patterns
+
+    def go(self, iterations: range, last: int, still_wanted: Callable[[], None]) -> bool:
+        """Descend until all are solved or these iterations are over; ``last`` is the last of the stage.
+
+        Where rounding spoils something, False is returned, and nothing comes of what is not solved yet.
+        """
+        try:
+            self._go(iterations, last, still_wanted)
+        except NotPositiveDefinite:
+            for member in self.members:
+                member.live = False
+            return False
+        return True
+
+    def _go(self, iterations: range, last: int, still_wanted: Callable[[], None]) -> None:
+        side, since = _SideBySide(self.members, self.descent, self.patterns), time.perf_counter()
+        for iteration in iterations:
+            still_wanted()
+            if iteration:
+                side.bounded(self.xi)
+            maps = side.evaluate(self.xi)
+            live = [k for k, member in enumerate(self.members) if member.live]
+            flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
+            for k in live:
+                self.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], self.xi[side.triangles_of(k)])
+            ready = [self.members[k] for k in live if flipped[k] == 0]
+            due = [k for k in live if flipped[k] and iteration < last and self.members[k].tries.due(flipped[k])]
+            if self.descent.placing and due:
+                ready += side.place(due, maps.w)
+            # Nobody knows what an iteration takes for one of them alone: all are charged alike.
+            now = time.perf_counter()
+            for k in live:
+                self.members[k].seconds += (now - since) / len(live)
+            since = now
+            _judge(ready, self.descent, side.laplacian.solver.name)
+            left = sum(self.members[k].live for k in live)
+            if not left:
+                return
+            self.xi += self.pace.step(maps.gradient)
+            if self._too_many(left, iterations.stop - iteration - 1):
+                (fewer,) = _joined([self])
+                self.members, self.xi, self.pace = fewer.members, fewer.xi, fewer.pace
+                side = _SideBySide(self.members, self.descent, self.patterns)
+
+    def _too_many(self, left: int, iterations: int) -> bool:
+        """Whether those that are left had better move up, for so many iterations that are still to come."""
+        if _of_one_mesh(self.members):
+            return iterations > 0 and 5 * _filled_up(left) <= 3 * len(self.members)
+        # To analyse a pattern takes as long as two iterations.
+        return iterations > 1 and 2 * left <= len(self.members)
 
 
-def _judge(members: list[_Member], descent: VectorAdam, solver: str, seconds: float) -> None:
+def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
+    """What is live of these walks, after as many iterations each, in as few as there may be."""
+    members = [member for walk in walks for member in walk.members]
+    chosen = [k for k, member in enumerate(members) if member.live]
+    if not chosen:
+        return []
+    if _of_one_mesh(members):
+        # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
+        done = (k for k, member in enumerate(members) if not member.live)
+        chosen = sorted([*chosen, *islice(done, _filled_up(len(chosen)) - len(chosen))])
+    ends = np.cumsum([len(member.problem.F) for member in members])
+    xi, pace = np.concatenate([walk.xi for walk in walks]), Pace.joined([walk.pace for walk in walks])
+    descent, patterns, joined = walks[0].descent, walks[0].patterns, []
+    for first, end in _runs([len(members[k].problem.F) for k in chosen]):
+        some = chosen[first:end]
+        triangles = np.concatenate([np.arange(ends[k] - len(members[k].problem.F), ends[k]) for k in some])
+        joined.append(_Walk([members[k] for k in some], xi[triangles], pace.part(triangles), descent, patterns))
+    return joined
+
+
+def _of_one_mesh(members: Sequence[_Member]) -> bool:
+    """Whether all have one domain."""
+    return len({member.problem.domain for member in members}) == 1
+
+
+def _filled_up(count: int) -> int:
+    """The least power of two that is no less."""
+    return 1 << (count - 1).bit_length()
+
+
+def _runs(sizes: Sequence[int]) -> list[tuple[int, int]]:
+    """From where to where things of these sizes, in their order, make up a group each."""
+    runs, first, total = list[tuple[int, int]](), 0, 0
+    for k, size in enumerate(sizes):
+        if k > first and total + size > GROUP:
+            runs.append((first, k))
+            first, total = k, 0
+        total += size
+    return [*runs, (first, len(sizes))] if sizes else []
+
+
+def _judge(members: list[_Member], descent: VectorAdam, solver: str) -> None:
     """Decide exactly on maps without inverted triangles, as far as floating point can tell."""
     problems = [member.problem for member in members]
     uv = [member.problem.positions(member.best_map) for member in members]
     verdicts = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])
+    mapped = [member for member, verdict in zip(members, verdicts, strict=True) if verdict.injective]
+    descended = [member for member in mapped if member.placed_mu is None]
+    tensors = list[ComplexArray]()
+    if descended:
+        xi = np.concatenate([member.best_xi for member in descended])
+        ends = np.cumsum([member.best_xi.size for member in descended])
+        tensors = np.split(PARAMETERISATIONS[descent.parameterisation].field(xi).mu, ends[:-1])
+    own = iter(tensors)
     for member, places, certificate in zip(members, uv, verdicts, strict=True):
         member.live = False
         if certificate.injective:
-            mu = member.placed_mu
             member.found = MapResult(
                 uv=places,
                 status=Status.INJECTIVE,
                 certificate=certificate,
-                stages=[member.stage(descent, seconds)],
+                stages=[member.stage(descent)],
                 history=member.history,
                 linear_solver=solver,
-                seconds=seconds,
-                mu=PARAMETERISATIONS[descent.parameterisation].field(member.best_xi).mu if mu is None else mu,
+                seconds=member.seconds,
+                mu=next(own).copy() if member.placed_mu is None else member.placed_mu,
                 V=member.problem.V,
             )
