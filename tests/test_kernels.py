@@ -90,6 +90,7 @@ _ANY_LENGTH = {
     "jacobians": {0},
     "pulls": {5},
     "dirichlet_sweep": {0},
+    "at_own_tensors": {0},
     "clip_moduli": {0},
     "assemble": {0},
     "boundary_load": {0},

@@ -147,9 +147,13 @@ static PyObject *at_own_tensors(PyObject *module, PyObject *const *given, Py_ssi
     const double *w = a[0].data, *gamma = a[2].data, *m = a[3].data;
     const int64_t *F = a[1].data, *starts = a[4].data;
     const Py_ssize_t step = 2 * a[2].stride, row = 2 * a[2].row_stride, by = a[3].stride;
-    const Py_ssize_t meshes = a[4].size - 1;
+    const Py_ssize_t f = a[5].size, meshes = a[4].size - 1;
     const double most = tanh(TANH_BOUND);
     double *mu = a[5].data, *sums = a[6].data;
+    if (!fit("at_own_tensors", a, LENGTH(a),
+             a[1].size == 3 * f && a[2].rows == 2 && a[2].columns == f && a[3].rows == 1 && a[3].columns == f &&
+             are_parts(a + 4, f) && a[6].size == 2 * meshes))
+        return NULL;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t i = 0; i < meshes; i++) {
         double energy = 0.0, area = 0.0;
