@@ -87,9 +87,10 @@ def injective_maps(
     Notes
     -----
     Meshes of up to 4,000 triangles are laid side by side, and the first stage of the search is run on some 28,000
-    triangles at a time. Each walks the way that it would walk alone: the same call gives the same
-    maps, whatever ``jobs``, and they are those of `injective_map` but for rounding, which may lead a long search
-    elsewhere. Ctrl-C ends all within a fraction of a second, as does closing the iterator.
+    triangles at a time; what is left of up to four such groups after two iterations goes on together. Each walks
+    the way that it would walk alone: the same call gives the same maps, whatever ``jobs``, and they are those of
+    `injective_map` but for rounding, which may lead a long search elsewhere. Ctrl-C ends all within a fraction of a
+    second, as does closing the iterator.
 
     Examples
     --------
