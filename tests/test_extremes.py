@@ -21,7 +21,8 @@ from quasiharmonic import (
 )
 from quasiharmonic.cli import main
 from quasiharmonic.exact.diagnosis import Kind
-from quasiharmonic.surfaces import disk, grid, random_delaunay
+from quasiharmonic.surfaces import cat, disk, grid, random_delaunay
+from quasiharmonic.targets import boundary_to
 from shared.meshes import boundary_of, signed_areas
 from shared.obstructed import OBSTRUCTED, moved, onto
 from shared.polygons import circle
@@ -94,6 +95,14 @@ class TestScales:
         io.write_obj(tmp_path / "in.obj", io.MeshData(V / scale, F).with_map(uv))
         assert main(["map", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]) == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], target * scale)
+
+    def test_targets_of_a_few_of_the_least_numbers_are_mapped_without_a_warning(self):
+        """Their curvatures underflow to nothing, by which a step of Newton's would divide."""
+        V, F = cat(4)
+        fixed, target = boundary_to(V, F, "letter:R")
+        result = injective_map(V, F, fixed, target * 5e-324)
+        assert not result.injective
+        assert np.isfinite(result.uv).all()
 
 
 class TestOffsets:

@@ -67,8 +67,8 @@ class _Read(NamedTuple):
 def solver_for(problem: Problem, asked: str) -> str:
     """The linear solver for a problem: QDLDL for a small one, where the choice is free.
 
-    What it computes for a mesh does not depend on what lies beside it, so that alone and with others a problem has the
-    same map; and no other is quicker there.
+    Alone and with others a problem has the same map by it, but for rounding where its order of elimination depends on
+    what lies beside; and no other is quicker there.
     """
     return "qdldl" if asked == "auto" and len(problem.F) <= SMALL and "qdldl" in available() else asked
 

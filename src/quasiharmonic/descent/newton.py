@@ -60,7 +60,9 @@ class Newton(TensorDescent):
         model = SecondOrderModel(here)
         for _ in range(self.iterations):
             try:
-                step, predicted = model.step(system, damping)
+                # Where all curvatures underflow there is none to divide by, and what is no number is not factored.
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    step, predicted = model.step(system, damping)
                 there = objective.evaluate(objective.bounded(here.xi + step))
             except NotPositiveDefinite:
                 predicted, there = 0.0, None
