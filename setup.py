@@ -18,7 +18,7 @@ FLAGS = ["/std:c11"] if sys.platform == "win32" else ["-std=c11", "-O3", *PRECIS
 # One wheel serves this Python and all later ones, but for those without the global lock.
 STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
 
-if os.environ.get("QUASIHARMONIC_PURE"):
+if os.environ.get("QUASIHARMONIC_PURE", "0") not in ("", "0"):
     setup()
 else:
     setup(

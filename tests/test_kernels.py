@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import pkgutil
 import subprocess
@@ -17,7 +18,8 @@ from quasiharmonic import certify, kernels
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import ARAP
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.mesh.reference import ReferenceMesh, rest_frames
+from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import boundary_loops, components
 from quasiharmonic.surfaces import disk
 from shared.kernels import ARGUMENTS
@@ -79,6 +81,18 @@ def test_other_arrays_are_refused(name, make):
     for wrong in (arguments[:-1], (*arguments, arguments[-1]), ()):
         with pytest.raises(TypeError, match=f"{name} was given {len(wrong)} arguments"):
             kernel(*wrong)
+
+
+@needs_extension
+def test_the_order_of_bytes_may_be_named():
+    """As it is in arrays that come from `ctypes`, copies of them included."""
+    V, F = disk(3)
+    named = np.ctypeslib.as_array((ctypes.c_double * V.size)(*V.ravel().tolist())).reshape(V.shape)
+    assert memoryview(named.copy()).format in ("<d", ">d")
+    alike, other = rest_shapes(V, F), rest_shapes(named, F)
+    assert np.array_equal(alike.m, other.m)
+    with pytest.raises(TypeError, match="lay_flat"):
+        rest_frames(V.astype(V.dtype.newbyteorder()), F)
 
 
 # Arrays by number that may be of many lengths: room for what is found, and what indices in other arrays point into.
@@ -200,7 +214,7 @@ def test_an_extension_of_before_is_told(monkeypatch):
         kernels.compiled(newer)
 
 
-@pytest.mark.parametrize(("value", "switched"), [("1", True), ("", False)])
+@pytest.mark.parametrize(("value", "switched"), [("1", True), ("", False), ("0", False)])
 def test_the_environment_switches_them_off(value, switched):
     code = "from quasiharmonic import kernels; print(kernels.extension is None)"
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"QUASIHARMONIC_PURE": value},

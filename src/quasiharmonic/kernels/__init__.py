@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 try:
-    if os.environ.get("QUASIHARMONIC_PURE"):
+    if os.environ.get("QUASIHARMONIC_PURE", "0") not in ("", "0"):
         raise ImportError("switched off")
     from quasiharmonic.kernels import _compiled as extension
 except ImportError:

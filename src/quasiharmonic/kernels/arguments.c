@@ -6,7 +6,10 @@
 /* Formats of buffers, as NumPy and `struct` write them, and the size of an item, by the letter of a kind. */
 static int fits(char kind, const char *format, Py_ssize_t itemsize)
 {
-    if (*format == '@' || *format == '=')
+    /* Arrays that came from `ctypes` name the order of their bytes, which may be this machine's. */
+    const uint16_t one = 1;
+    const char own_order = *(const unsigned char *)&one ? '<' : '>';
+    if (*format == '@' || *format == '=' || *format == own_order)
         format++;
     switch (kind) {
     case 'd':
