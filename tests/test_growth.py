@@ -203,6 +203,8 @@ class TestImports:
     @pytest.mark.parametrize("letter", [None, "C", "R"])
     def test_a_small_mesh_is_mapped_by_the_command_without_what_takes_long_to_load(self, letter, tmp_path):
         """No clock, but what the clock would show: SciPy's parts and matplotlib take longer than the map."""
+        if available()[0] == "superlu":
+            pytest.skip("the one solver here is a part of scipy.sparse.linalg, which loads them")
         V, F = disk(13)
         uv = V[:, :2] * (1 + 0.5 * V[:, :1])
         io.write_obj(tmp_path / "mesh.obj", io.MeshData(V, F).with_map(uv))
