@@ -171,3 +171,9 @@ PyObject *done_with_number(Argument *arguments, Py_ssize_t count, double answer)
     release(arguments, count);
     return PyFloat_FromDouble(answer);
 }
+
+PyObject *out_of_memory(Argument *arguments, Py_ssize_t count)
+{
+    release(arguments, count);
+    return PyErr_NoMemory();
+}

@@ -45,6 +45,9 @@ PyObject *done(Argument *arguments, Py_ssize_t count);
 PyObject *done_with_integer(Argument *arguments, Py_ssize_t count, Py_ssize_t answer);
 PyObject *done_with_number(Argument *arguments, Py_ssize_t count, double answer);
 
+/* The same where there was no memory: NULL, with a MemoryError set. */
+PyObject *out_of_memory(Argument *arguments, Py_ssize_t count);
+
 #define KERNEL(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, "As its twin in NumPy."}
 #define END_OF_KERNELS {NULL, NULL, 0, NULL}
 #define LENGTH(array) ((Py_ssize_t)(sizeof(array) / sizeof((array)[0])))

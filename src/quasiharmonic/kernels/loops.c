@@ -176,10 +176,8 @@ static PyObject *doubtful_pairs(PyObject *module, PyObject *const *given, Py_ssi
         if (starts[g + 1] - starts[g] > largest)
             largest = starts[g + 1] - starts[g];
     Box *tree = malloc(2 * (size_t)leaves(largest) * sizeof(*tree));
-    if (!tree) {
-        Py_DECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
-    }
+    if (!tree)
+        return out_of_memory(a, LENGTH(a));
     int room = 1;
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t g = 0; g + 1 < a[3].size && room; g++) {

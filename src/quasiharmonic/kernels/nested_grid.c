@@ -100,10 +100,8 @@ static PyObject *divide_cells(PyObject *module, PyObject *const *given, Py_ssize
     free(pairs.cells);
     free(pairs.entries);
     free(next);
-    if (!enough) {
-        Py_XDECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
-    }
+    if (!enough)
+        return out_of_memory(a, LENGTH(a));
     return done_with_integer(a, LENGTH(a), together);
 }
 

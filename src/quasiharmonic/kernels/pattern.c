@@ -1,32 +1,11 @@
 /* What `linsolve/pattern.py` has compiled, and the check of patterns in `linsolve/base.py`. */
 #include "arguments.h"
+#include "sorting.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-/* Numbers from which on a row is sorted by the library. */
-#define MANY 24
-
-static int ascending(const void *one, const void *other)
-{
-    const uint64_t a = *(const uint64_t *)one, b = *(const uint64_t *)other;
-    return (a > b) - (a < b);
-}
-
-static void sort(uint64_t *numbers, int64_t size)
-{
-    if (size >= MANY) {
-        qsort(numbers, (size_t)size, sizeof(*numbers), ascending);
-        return;
-    }
-    for (int64_t k = 1; k < size; k++) {
-        const uint64_t here = numbers[k];
-        int64_t at = k;
-        for (; at > 0 && numbers[at - 1] > here; at--)
-            numbers[at] = numbers[at - 1];
-        numbers[at] = here;
-    }
-}
+DEFINE_SORT(uint64_t)
 
 /* Triangles, the rows of their corners or -1, and how many rows there are. */
 typedef struct {
@@ -122,8 +101,7 @@ static PyObject *find_pattern(PyObject *module, PyObject *const *given, Py_ssize
     if (!starts || !inner) {
         free(starts);
         free(inner);
-        Py_DECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
+        return out_of_memory(a, LENGTH(a));
     }
     int64_t *sizes = a[11].data;
     Py_BEGIN_ALLOW_THREADS

@@ -267,10 +267,8 @@ static PyObject *place_inverted(PyObject *module, PyObject *const *given, Py_ssi
     free(number);
     free(corners);
     free(before);
-    if (!enough) {
-        Py_XDECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
-    }
+    if (!enough)
+        return out_of_memory(a, LENGTH(a));
     return done(a, LENGTH(a));
 }
 

@@ -240,11 +240,7 @@ static PyObject *smooth(PyObject *module, PyObject *const *given, Py_ssize_t cou
     free(map.before);
     free(map.back);
     free(map.is_back);
-    PyObject *answer = done(a, LENGTH(a));
-    if (enough)
-        return answer;
-    Py_DECREF(answer);
-    return PyErr_NoMemory();
+    return enough ? done(a, LENGTH(a)) : out_of_memory(a, LENGTH(a));
 }
 
 PyMethodDef prolongation_kernels[] = {KERNEL(find_places), KERNEL(smooth), END_OF_KERNELS};

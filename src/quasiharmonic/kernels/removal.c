@@ -243,8 +243,7 @@ static PyObject *remove_vertices(PyObject *module, PyObject *const *given, Py_ss
     Round round = {.n = a[1].size, .f = a[0].columns, .T = a[0].data, .free = a[1].data, .dice = a[2].data};
     if (!reserve(&round)) {
         release(&round);
-        Py_DECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
+        return out_of_memory(a, LENGTH(a));
     }
     Py_BEGIN_ALLOW_THREADS
     gather_stars(&round);

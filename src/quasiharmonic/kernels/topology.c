@@ -1,32 +1,11 @@
 /* What `mesh/topology.py` has compiled. */
 #include "arguments.h"
+#include "sorting.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-/* Numbers from which on a bucket is sorted by the library. */
-#define MANY 24
-
-static int ascending(const void *one, const void *other)
-{
-    const uint32_t a = *(const uint32_t *)one, b = *(const uint32_t *)other;
-    return (a > b) - (a < b);
-}
-
-static void sort(uint32_t *numbers, int64_t size)
-{
-    if (size >= MANY) {
-        qsort(numbers, (size_t)size, sizeof(*numbers), ascending);
-        return;
-    }
-    for (int64_t k = 1; k < size; k++) {
-        const uint32_t here = numbers[k];
-        int64_t place = k;
-        for (; place > 0 && numbers[place - 1] > here; place--)
-            numbers[place] = numbers[place - 1];
-        numbers[place] = here;
-    }
-}
+DEFINE_SORT(uint32_t)
 
 /* Where the half-edges end that are of the same edge as others[from], all of them before `until`. */
 static int64_t end_of_edge(const uint32_t *others, int64_t from, int64_t until)
@@ -113,8 +92,7 @@ static PyObject *sort_edges(PyObject *module, PyObject *const *given, Py_ssize_t
     if (!starts || !others) {
         free(starts);
         free(others);
-        Py_DECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
+        return out_of_memory(a, LENGTH(a));
     }
     Py_BEGIN_ALLOW_THREADS
     bucket(F, halves, n, starts, others);
@@ -234,10 +212,8 @@ static PyObject *follow_loops(PyObject *module, PyObject *const *given, Py_ssize
              a[0].size == 2 * size && a[2].size == size))
         return NULL;
     HalfEdge *sorted = malloc((size_t)(size ? size : 1) * sizeof(*sorted));
-    if (!sorted) {
-        Py_DECREF(done(a, LENGTH(a)));
-        return PyErr_NoMemory();
-    }
+    if (!sorted)
+        return out_of_memory(a, LENGTH(a));
     Py_ssize_t loops;
     Py_BEGIN_ALLOW_THREADS
     memcpy(sorted, a[0].data, (size_t)size * sizeof(*sorted));
