@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from numbers import Integral, Number, Real
 from os import PathLike
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,9 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class ReadOnly:
@@ -73,6 +76,33 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
     return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
+
+
+class _Unchangeable(np.ndarray):
+    """Owns the memory of what `unchangeable` returns: nobody else has it but as the base of that."""
+
+
+def unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """The numbers of an array in memory that nobody can write to.
+
+    The array itself where `unchangeable` made it, or it is a view of such a one; else a contiguous copy. That an array
+    is not writeable does not prove it: whoever has the base of a view may write, and whoever has the array itself may
+    set its flag again.
+    """
+    owner = array
+    while isinstance(owner, np.ndarray) and not owner.flags.writeable:
+        if isinstance(owner, _Unchangeable):
+            return array
+        owner = cast(Any, owner.base)
+    own = _Unchangeable(array.shape, array.dtype)
+    own[...] = array
+    own.flags.writeable = False
+    return own.view(np.ndarray)
+
+
+def own_triangles(F: NDArray[np.integer]) -> IntArray:
+    """Triangles as contiguous int64 that nobody can change, as kernels want them; any numbers."""
+    return unchangeable(np.require(F, np.int64, ["C", "A"]))
 
 
 def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:

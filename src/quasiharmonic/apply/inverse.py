@@ -132,8 +132,7 @@ class InverseMap(ReadOnly):
         _check(certificate, overlapping)
         self.certificate: Certificate = certificate
         self.V = vertex_array(V, finite=False)
-        self.F = np.array(F, dtype=np.int64)
-        self.uv = map_array("uv", uv, finite=False)
+        self.F, self.uv = certificate.F, certificate.uv
         if len(self.V) != len(self.uv):
             raise ValueError(f"V must have as many rows as uv, {len(self.uv)}, not {len(self.V)}")
         self._seal()
@@ -160,7 +159,7 @@ class InverseMap(ReadOnly):
         ValueError
             When the last axis is not of length 2.
         """
-        places = np.asarray(points, dtype=np.float64)
+        places = np.array(points, dtype=np.float64)
         if places.ndim < 1 or places.shape[-1] != 2:
             raise ValueError(f"points must have shape (..., 2), not {places.shape}")
         rows = places.reshape(-1, 2)

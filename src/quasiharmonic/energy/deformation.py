@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_range, named, real_array
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_range, named, own_triangles, real_array
 from quasiharmonic.energy.energies import Deformation, Energy, QuadraticForm
 from quasiharmonic.energy.mixtures import curvature_of_mixture, mixed_energy, mixed_slopes, mixture_of
 from quasiharmonic.kernels import compiled
@@ -63,7 +63,7 @@ class DeformationEnergy:
         rest_F: ArrayLike | None = None,
     ) -> None:
         self.energy = energy
-        self.F = np.ascontiguousarray(F, dtype=np.int64)
+        self.F = own_triangles(np.asarray(F))
         self._least_places = int(self.F.max(initial=-1)) + 1
         check_range("F", self.F, self._least_places)
         shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, named
+from quasiharmonic.arrays import ComplexArray, FloatArray, named, own_triangles
 from quasiharmonic.energy.energies import Deformation, Energy, QuadraticForm, damped, inverse
 from quasiharmonic.mesh.shapes import rest_shapes
 from quasiharmonic.mesh.topology import boundary_edges
@@ -31,7 +31,7 @@ class MassSpring(Energy):
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
-        F = np.asarray(F, dtype=np.int64)
+        F = own_triangles(np.asarray(F))
         shapes = rest_shapes(V, F)
         if shapes.flat.size:
             raise ValueError(

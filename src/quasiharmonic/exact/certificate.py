@@ -30,7 +30,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -43,22 +43,22 @@ from quasiharmonic.arrays import (
     ReadOnly,
     check_range,
     counted,
+    index_array,
+    kind_of,
     map_array,
     named,
     triangle_rows,
     true_or_false,
+    unchangeable,
 )
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
-from quasiharmonic.exact.triangles import count_turns, triangle_signs
+from quasiharmonic.exact.triangles import overwound_vertices, triangle_signs
 from quasiharmonic.given.objects import mesh_triangles
 from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.showing import Shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-SignArray = NDArray[np.int8]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(ReadOnly, Shown):
@@ -81,10 +81,19 @@ class Certificate(ReadOnly, Shown):
         Rows ``i, j, k, l``: the boundary edges ``i → j`` and ``k → l`` share a point that they should
         not share. At most 1000 are listed.
     overwound : (k,) int64
-        Interior vertices around which positive triangles wind more than once.
+        Vertices, all triangles around them positive, whose angles add up to more than 2π. Around an interior vertex
+        they then wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
     F : (f, 3) int64
     uv : (n, 2) float64
-        What was judged.
+        What was judged: the certificate's own copies. No array here is writeable.
+
+    Notes
+    -----
+    Where all triangles around a vertex are positive, the map is locally injective at it if and only if their angles add
+    up to 2π, around an interior vertex, or to less than 2π, at a boundary vertex. Around an interior vertex the sum is
+    a multiple of 2π. At a boundary vertex it may be 2π exactly: then the two boundary edges there lie on each other,
+    which `crossings` has, and the vertex is not overwound. This is decided exactly; where the boundary was not judged
+    (`bijective` is None), or the mesh is not a surface, `overwound` is empty.
     """
 
     triangles: int
@@ -183,9 +192,10 @@ def certify(
     boundary : bool
         Judge the boundary too, so that `Certificate.bijective` is known. All components count
         together: islands that overlap are not bijective.
-    loops : sequence of (l,) int64, optional
-        The boundary loops of a mesh that is known to be a surface, as `boundary_loops` gives them. They are taken
-        on trust, and to find them is half of the work.
+    loops : sequence of (l,) int, optional
+        The boundary loops of a mesh that is known to be a surface, as `boundary_loops` gives them, at least one and of
+        three vertices or more. That they are the loops of ``F`` is taken on trust, and to find them is half of the
+        work.
 
     Returns
     -------
@@ -195,7 +205,8 @@ def certify(
     Raises
     ------
     ValueError
-        When ``F`` or ``uv`` has the wrong shape or dtype, or ``F`` or ``loops`` name vertices that are not there.
+        When ``F``, ``uv`` or a loop has the wrong shape or dtype, there are no loops in ``loops``, or ``F`` or
+        ``loops`` name vertices that are not there.
 
     See Also
     --------
@@ -211,6 +222,7 @@ def certify(
     """
     true_or_false("boundary", boundary)
     F, uv = _taken(F, uv)
+    given = None if loops is None else _given_loops(loops, F, len(uv))
     sign, nonfinite = triangle_signs(F, uv)
     flipped = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []
@@ -224,15 +236,13 @@ def certify(
     known: list[IntArray] = []
     crossings, overwound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
     if boundary and len(F):
-        known, broken = _loops(F, len(uv)) if loops is None else (list(loops), [])
+        known, broken = _loops(F, len(uv)) if given is None else (given, [])
         reasons += broken
-        for loop in loops or ():
-            check_range("loops", np.asarray(loop), len(uv))
         # If all triangles are positive and the only loop is simple, then it encloses the sum of their areas, so it runs
         # counterclockwise and winds once around what it encloses, and nothing is left to ask.
         plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
         if not broken and not plain:
-            overwound = _overwound(F, uv, sign, known)
+            overwound = overwound_vertices(F, uv, sign, known)
             if np.isfinite(uv[np.concatenate(known)]).all():
                 crossings, found = judge_loops(known, uv)
                 reasons += found
@@ -249,8 +259,7 @@ def certify(
         loops=tuple(known),
         crossings=crossings,
         overwound=overwound,
-        # What nobody can change any more is not copied.
-        F=F if not F.flags.writeable else F.copy(),
+        F=F,
         uv=uv,
     )
 
@@ -304,17 +313,57 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
 
 def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
-    triangles, places = triangle_rows(mesh_triangles(F), copy=False), map_array("uv", uv, finite=False)
-    # Of the numeric types, wide integers and extended precision have values that double has not.
-    given = np.asarray(getattr(uv, "uv", uv))
-    if given.dtype.kind != "f" or given.dtype.itemsize > 8:
-        rounded = np.abs(places) >= 2.0**53 if given.dtype.kind != "f" else (places != given) & ~np.isnan(places)
-        rows = np.flatnonzero(rounded.any(axis=1))
-        if rows.size:
-            # A vertex that is not there is the plainer mistake.
-            check_range("F", triangles, len(places))
-            raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rows)}")
+    triangles = unchangeable(triangle_rows(mesh_triangles(F), copy=False))
+    given = getattr(uv, "uv", uv)
+    places = map_array("uv", given, finite=False)
+    rounded = _rounded(given, places)
+    if rounded.size:
+        # A vertex that is not there is the plainer mistake.
+        check_range("F", triangles, len(places))
+        raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rounded)}")
     return triangles, places
+
+
+def _rounded(given: ArrayLike, places: FloatArray) -> IntArray:
+    """Vertices whose places (n, 2) may not be what was given: of other types double does not have all values."""
+    stored = np.asarray(given)
+    if stored.dtype.kind == "f" and stored.dtype.itemsize > 8:
+        return np.flatnonzero(((places != stored) & ~np.isnan(places)).any(axis=1))
+    if stored.dtype.kind == "f" and not isinstance(given, list | tuple):
+        return np.empty(0, dtype=np.int64)
+    large = np.argwhere(np.abs(places) >= 2.0**53)
+    if stored.dtype.kind == "f":
+        # Of integers and floats in one list NumPy makes doubles, and rounds the integers.
+        kept = [at for at in large.tolist() if _is_rounded(given, places, *at)]
+        large = np.array(kept, dtype=np.int64).reshape(-1, 2)
+    return np.unique(large[:, 0])
+
+
+def _is_rounded(given: Any, places: FloatArray, vertex: int, axis: int) -> bool:
+    """Whether a number in nested lists is another than the double that was made of it."""
+    number = given[vertex][axis]
+    return not isinstance(number, float | np.floating) and int(number) != int(places[vertex, axis])
+
+
+def _given_loops(loops: Iterable[ArrayLike], F: IntArray, n: int) -> list[IntArray]:
+    """Boundary loops as int64, copies, or a ValueError that says what is wrong with them."""
+    if isinstance(loops, str | bytes) or not isinstance(loops, Iterable):
+        raise ValueError(f"loops must be a sequence of boundary loops, not {kind_of(loops)}")
+    taken = []
+    for k, loop in enumerate(loops):
+        name = f"loops[{k}]"
+        array = index_array(name, loop)
+        if array.ndim != 1:
+            advice = "; hand over a list of loops" if array.ndim == 0 else ""
+            raise ValueError(f"{name} must have shape (l,), the vertices of one loop, not {array.shape}{advice}")
+        check_range(name, array, n)
+        if len(array) < 3:
+            vertices = counted("vertex", "vertices", len(array))
+            raise ValueError(f"{name} has {vertices}, but a boundary loop has three or more")
+        taken.append(array)
+    if len(F) and not taken:
+        raise ValueError("loops has no boundary loop: leave it out to have the loops found")
+    return taken
 
 
 def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
@@ -352,12 +401,3 @@ def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
 
 def _dashed(pairs: IntArray) -> list[str]:
     return [f"{i}–{j}" for i, j in pairs.tolist()]
-
-
-def _overwound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
-    """Interior vertices, all triangles around them positive, around which these wind more than once."""
-    turns = np.zeros(len(uv), dtype=np.int64)
-    count_turns(F, uv, turns)
-    turns[F[sign <= 0]] = 0
-    turns[np.concatenate(loops)] = 0
-    return np.flatnonzero(turns > 1)

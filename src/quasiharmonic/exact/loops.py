@@ -103,7 +103,7 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
     Contacts
         Pairs without a common end that meet, and pairs with one that overlap.
     """
-    tail, head = np.ascontiguousarray(ends.T)
+    tail, head = np.array(ends.T, order="C")
     p, q = positions[tail], positions[head]
     found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
     number = 0

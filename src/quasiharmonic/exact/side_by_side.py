@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, unchangeable
 from quasiharmonic.exact.certificate import Certificate, certify, flipped_triangles
 from quasiharmonic.exact.loops import simple_loops
 
@@ -61,10 +61,9 @@ def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certif
         nonfinite=none.copy(),
         bijective=True,
         reasons=(),
-        loops=tuple(loops),
+        loops=tuple(loop.copy() for loop in loops),
         crossings=np.empty((0, 4), dtype=np.int64),
         overwound=none.copy(),
-        # As in `certify`: what somebody could change is copied.
-        F=F if not F.flags.writeable else F.copy(),
+        F=unchangeable(F),
         uv=uv.copy(),
     )

@@ -1,11 +1,11 @@
-"""All triangles of a mesh at once: which way they turn, decided exactly, and how often they wind around a vertex."""
+"""All triangles of a mesh at once: which way they turn, and how often they wind around a vertex, decided exactly."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_range
+from quasiharmonic.arrays import BoolArray, FloatArray, IntArray, check_range
 from quasiharmonic.exact.predicates import orientation_or_nonfinite, sure_orientation
 from quasiharmonic.kernels import compiled
 
@@ -56,6 +56,49 @@ def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
         corners = uv.take(F[chunk], axis=0)
         sign[chunk] = sure_orientation(corners[:, 0], corners[:, 1], corners[:, 2])
     return sign.size - int(np.count_nonzero(sign))
+
+
+def overwound_vertices(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
+    """Find the vertices, all triangles around them positive, whose angles add up to more than 2π, exactly.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    uv : (n, 2) float64
+    sign : (f,) int8
+        Orientations, as `triangle_signs` has them.
+    loops : list of (l,) int64
+        The boundary loops, the surface to their left.
+
+    Returns
+    -------
+    (k,) int64
+        Ascending.
+
+    Notes
+    -----
+    Around a vertex the angles add up to ``2π t`` where it is interior, and to ``2π t + φ₁ − φ₀`` where it is on the
+    boundary: t is how often triangles pass the direction of the x axis (`count_turns`), φ₀ and φ₁, from 0 to below 2π,
+    are the directions of the edges to the next vertex of the loop and to the last one, where the fan begins and ends.
+    So at the boundary they add up to more than 2π if t is 2 or more, or t is 1 and φ₁ > φ₀.
+    """
+    turns = np.zeros(len(uv), dtype=np.int64)
+    count_turns(F, uv, turns)
+    turns[F[sign <= 0]] = 0
+    rim = np.concatenate(loops)
+    once = turns[rim] == 1
+    here, begin, end = rim[once], *(np.concatenate([np.roll(loop, by) for loop in loops])[once] for by in (-1, 1))
+    turns[here[_comes_before(uv[here], uv[begin], uv[end])]] = 2
+    return np.flatnonzero(turns > 1)
+
+
+def _comes_before(centre: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
+    """Whether the direction from a centre to one place is smaller than to another, as angles from 0 to below 2π."""
+    lower_one, lower_other = (
+        (to[:, 1] < centre[:, 1]) | ((to[:, 1] == centre[:, 1]) & (to[:, 0] < centre[:, 0])) for to in (one, other)
+    )
+    turn, _ = orientation_or_nonfinite(centre, one, other)
+    return np.where(lower_one == lower_other, turn > 0, lower_other)
 
 
 @compiled

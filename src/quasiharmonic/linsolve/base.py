@@ -202,7 +202,7 @@ class LinearSolver(ABC):
 
 def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:
     """Private int32 copies of a pattern of an upper triangle, checked entry by entry."""
-    starts, columns = np.asarray(indptr), np.asarray(indices)
+    starts, columns = np.array(indptr), np.array(indices)
     if starts.ndim != 1 or columns.ndim != 1 or starts.size == 0 or starts[0] != 0 or starts[-1] != columns.size:
         raise ValueError("indptr must be one-dimensional, start with 0 and end with the number of indices")
     if columns.size > np.iinfo(np.int32).max:
@@ -211,7 +211,7 @@ def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pa
     if columns.dtype != np.int32:
         # What 32 bits do not hold is out of range, and stays so.
         columns = np.clip(columns, -1, n).astype(np.int32)
-    pattern = np.array(starts, dtype=np.int32), np.array(columns)
+    pattern = starts.astype(np.int32, copy=False), columns
     wrong = wrong_pattern(*pattern)
     if wrong == _EMPTY_ROW:
         raise ValueError(f"row {int(np.argmin(np.diff(starts)))} has no entries; every row needs its diagonal entry")

@@ -13,7 +13,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, own_triangles
 from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve import make_solver, takes_order
 from quasiharmonic.linsolve.pattern import stiffness_pattern
@@ -58,6 +58,7 @@ class Laplacian:
         points: FloatArray | None = None,
     ) -> None:
         self.n = n
+        F = own_triangles(F)
         is_free = np.ones(n, dtype=bool)
         is_free[fixed] = False
         self.free = np.flatnonzero(is_free)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import IntArray, check_range
+from quasiharmonic.arrays import IntArray, check_range, own_triangles
 from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.topology import edge_keys
 
@@ -52,6 +52,7 @@ def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> Stiff
     size : int
         How many are free.
     """
+    F = own_triangles(F)
     check_range("F", F, place.size)
     most = F.size
     made = StiffnessPattern(
@@ -66,7 +67,7 @@ def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> Stiff
         border_fixed=np.empty(most, dtype=np.int64),
     )
     sizes = np.empty(3, dtype=np.int64)
-    find_pattern(np.ascontiguousarray(F, dtype=np.int64), place, *made, sizes)
+    find_pattern(F, place, *made, sizes)
     entries, inner, border = sizes.tolist()
     # What memory is not needed is given back, none of it touched yet.
     lengths = size + 1, size + entries, entries, entries, inner, entries + 1, border, border, border

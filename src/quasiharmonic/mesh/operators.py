@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags, vstack
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, own_triangles
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
 
@@ -78,7 +78,7 @@ def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Refere
     -------
     Operators
     """
-    triangles: IntArray = np.asarray(F, dtype=np.int64)
+    triangles = own_triangles(F)
     mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), triangles, reference)
     f, n = len(triangles), len(V)
     shape, offsets = (f, n), np.arange(0, 3 * f + 1, 3)

@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_range
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, check_range, own_triangles
 from quasiharmonic.kernels import compiled
 
 Reference = Literal["equilateral", "rest", "corrected"]
@@ -59,11 +59,11 @@ def flat_triangles(V: FloatArray, F: NDArray[np.integer]) -> IntArray:
 
 def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray, int]:
     """As `rest_frames`, and how many triangles have no area."""
-    T: IntArray = np.ascontiguousarray(F, dtype=np.int64)
+    T = own_triangles(F)
     check_range("F", T, len(V))
     # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
     exponent = math.frexp(max(V.max(initial=0), -V.min(initial=0)))[1]
-    z1, z2 = np.empty(len(F)), np.empty(len(F), dtype=np.complex128)
+    z1, z2 = np.empty(len(T)), np.empty(len(T), dtype=np.complex128)
     return z1, z2, lay_flat(V, T, exponent, z1, z2)
 
 
@@ -138,7 +138,7 @@ class ReferenceMesh:
 
     def __init__(self, V: FloatArray, F: IntArray, kind: Reference) -> None:
         self.kind = kind
-        self.F = F
+        self.F = F = own_triangles(F)
         self.n = len(V)
         if kind == "equilateral":
             check_range("F", F, self.n)

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import BoolArray, IntArray, check_range, named
+from quasiharmonic.arrays import BoolArray, IntArray, check_range, named, own_triangles, unchangeable
 from quasiharmonic.kernels import compiled
 
 # Half-edges from which on a sparse matrix sorts them sooner than a sort does.
@@ -57,8 +57,7 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     Edges
         Each kind in ascending order of its undirected edge.
     """
-    # Aligned too, which columns of a table of records need not be.
-    T: IntArray = np.require(F, np.int64, ["C", "A"])
+    T = own_triangles(F)
     pairs, sizes = np.empty((T.size, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
     if not sort_edges(T, n, pairs, sizes):
         check_range("F", T, n)
@@ -239,7 +238,7 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     (n,) int64
         The smallest vertex of the component. A vertex without triangle is a component of its own.
     """
-    T: IntArray = np.require(F, np.int64, ["A"])
+    T = own_triangles(F)
     # Two edges of a triangle connect its three vertices.
     return linked(T[:, :2], T[:, 1:], n)
 
@@ -260,6 +259,7 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
         The smallest node of the component.
     """
     label = np.empty(n, dtype=np.int64)
+    tail, head = unchangeable(tail), unchangeable(head)
     if not link_nodes(tail, head, label):
         for nodes in (tail, head):
             check_range("a link", nodes, n, "node", "nodes")

@@ -17,6 +17,7 @@ from quasiharmonic.arrays import (
     held_vertices,
     named,
     triangle_array,
+    unchangeable,
     vertex_array,
 )
 from quasiharmonic.linsolve.laplacian import Laplacian
@@ -51,7 +52,7 @@ class Domain(ReadOnly):
     edges : Edges
         The surface's, by kind.
     loops : list of (l,) int64
-        Boundary loops, the surface to their left.
+        Boundary loops, the surface to their left; not writeable.
 
     Notes
     -----
@@ -61,15 +62,15 @@ class Domain(ReadOnly):
 
     def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike) -> None:
         self.V = vertex_array(V)
-        self.F = triangle_array(F, len(self.V))
+        self.F = unchangeable(triangle_array(F, len(self.V)))
         self.edges = surface_edges(self.F, len(self.V))
         self.loops = trace_loops(self.edges.boundary)
         self.fixed = held_vertices(fixed, len(self.V))
         self._seal()
         self._empty_caches()
 
-    def _read_only(self) -> tuple[FloatArray, IntArray, IntArray]:
-        return self.V, self.F, self.fixed
+    def _read_only(self) -> tuple[FloatArray | IntArray, ...]:
+        return self.V, self.F, self.fixed, *vars(self.edges).values(), *self.loops
 
     def _empty_caches(self) -> None:
         """Nothing made yet of what is made when it is first asked for, and kept."""
