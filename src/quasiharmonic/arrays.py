@@ -100,9 +100,9 @@ def unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
     return own.view(np.ndarray)
 
 
-def own_triangles(F: NDArray[np.integer]) -> IntArray:
-    """Triangles as contiguous int64 that nobody can change, as kernels want them; any numbers."""
-    return unchangeable(np.require(F, np.int64, ["C", "A"]))
+def own_triangles(F: ArrayLike) -> IntArray:
+    """As `triangle_rows`, contiguous and such that nobody can change them: what kernels want."""
+    return unchangeable(triangle_rows(F, copy=False))
 
 
 def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:
@@ -209,6 +209,30 @@ def held_places(target: ArrayLike, k: int) -> FloatArray:
         raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
     check_finite("target", "row", "rows", array)
     return array
+
+
+def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
+    """Boundary loops of three vertices or more each, of ``n``, as (l,) int64; copies.
+
+    Raises
+    ------
+    ValueError
+        When they are not; names the loop.
+    """
+    if isinstance(loops, str | bytes) or not isinstance(loops, Iterable):
+        raise ValueError(f"loops must be a sequence of boundary loops, not {kind_of(loops)}")
+    taken = []
+    for k, loop in enumerate(loops):
+        array = index_array(f"loops[{k}]", loop)
+        if array.ndim != 1:
+            advice = "" if array.ndim else "; hand over a list of loops"
+            raise ValueError(f"loops[{k}] must have shape (l,), the vertices of one loop, not {array.shape}{advice}")
+        check_range(f"loops[{k}]", array, n)
+        if len(array) < 3:
+            vertices = counted("vertex", "vertices", len(array))
+            raise ValueError(f"loops[{k}] has {vertices}, but a boundary loop has three or more")
+        taken.append(array)
+    return taken
 
 
 def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:

@@ -10,14 +10,23 @@ that energy, and it is triangulated anew whenever time goes on, so that things c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_finite, map_array, named, triangle_array
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_finite,
+    kind_of,
+    map_array,
+    named,
+    real_array,
+    triangle_array,
+)
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import ARAP, AreaBarrier, Combination
 from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
@@ -118,10 +127,11 @@ class AirMesh:
         if not 0 < self._gap < np.inf:
             raise ValueError(f"gap must be positive, not {gap}")
         self._loops = boundary_loops(self._F, len(self._rest))
-        self._sizes = [np.asarray(loop).size // 2 for loop in frame]
+        around = _loops_of(frame)
+        self._sizes = [loop.size // 2 for loop in around]
         if min(self._sizes, default=3) < 3:
             raise ValueError(f"loops of the frame have at least 3 points, not {self._sizes}")
-        self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(frame)]))
+        self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(around)]))
         if not self.moment.certificate.bijective:
             raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")
 
@@ -226,7 +236,7 @@ class AirMesh:
 
     def _stacked(self, frame: Sequence[ArrayLike]) -> FloatArray:
         """The frame's points, loop by loop, checked."""
-        loops = [np.asarray(loop, dtype=np.float64) for loop in frame]
+        loops = _loops_of(frame)
         if [loop.shape for loop in loops] != [(size, 2) for size in self._sizes] or not loops:
             shapes = [loop.shape for loop in loops]
             raise ValueError(f"the frame must have loops of {self._sizes} points, not of shapes {shapes}")
@@ -237,6 +247,15 @@ class AirMesh:
     def _triangulated(self, points: FloatArray) -> IntArray:
         """Triangulate what neither shapes nor obstacles cover, without new points."""
         return air_between(points, self._loops, self._sizes)
+
+
+def _loops_of(frame: Iterable[ArrayLike]) -> list[FloatArray]:
+    """Each loop of a frame as an array of real numbers, a copy, of any shape."""
+    if isinstance(frame, str | bytes) or not isinstance(frame, Iterable):
+        raise ValueError(
+            f"frame must be a list of loops (k, 2), the container's and those of obstacles, not {kind_of(frame)}"
+        )
+    return [real_array(f"loop {k} of the frame", loop) for k, loop in enumerate(frame)]
 
 
 def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[int]) -> IntArray:

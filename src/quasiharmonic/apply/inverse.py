@@ -24,7 +24,8 @@ from quasiharmonic.arrays import (
     ReadOnly,
     check_choice,
     check_range,
-    map_array,
+    index_array,
+    real_array,
     true_or_false,
     vertex_array,
 )
@@ -311,15 +312,18 @@ class InverseMap(ReadOnly):
         Raises
         ------
         ValueError
-            When the shape does not fit, or ``at`` names a triangle that is not there.
+            When a shape does not fit, or ``at`` names a triangle that is not there.
         """
         check_choice("per", per, get_args(Per))
         given = np.asarray(values, dtype=np.float64)
         expected = {"vertex": (len(self.V),), "corner": (len(self.F), 3), "triangle": (len(self.F),)}[per]
         if given.shape[: len(expected)] != expected:
             raise ValueError(f"values per {per} must have a shape that begins with {expected}, not {given.shape}")
-        triangle = np.asarray(at.triangle)
+        triangle = index_array("at.triangle", at.triangle)
         check_range("at", triangle, len(self.F), "triangle", "triangles", least=-1)
+        barycentric = real_array("at.barycentric", at.barycentric)
+        if barycentric.shape != (*triangle.shape, 3):
+            raise ValueError(f"at.barycentric must have shape {(*triangle.shape, 3)}, not {barycentric.shape}")
         tail = given.shape[len(expected) :]
         found = np.flatnonzero(triangle.ravel() >= 0)
         t = triangle.ravel()[found]
@@ -327,7 +331,7 @@ class InverseMap(ReadOnly):
         if per == "triangle":
             out[found] = given[t]
         else:
-            barycentric = np.asarray(at.barycentric).reshape(-1, 3)
+            barycentric = barycentric.reshape(-1, 3)
             for start in range(0, t.size, _POINTS):
                 which, here = found[start : start + _POINTS], t[start : start + _POINTS]
                 weights = barycentric[which].reshape(-1, 3, *(1,) * len(tail))

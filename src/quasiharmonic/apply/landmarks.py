@@ -97,7 +97,8 @@ def on_border(points: FloatArray, size: IntArray) -> BoolArray:
 
 
 def _points(points: ArrayLike, name: str) -> FloatArray:
-    array = map_array(name, points if np.size(points) else np.empty((0, 2)), finite=False)
+    array = real_array(name, points)
+    array = map_array(name, array if array.size else np.empty((0, 2)), finite=False)
     check_finite(name, "point", "points", array)
     return array
 

@@ -217,7 +217,9 @@ def _check_flatten(settings: Settings) -> None:
     """Refuse settings of maps onto given boundaries where boundaries are free, and the other way round."""
     if not settings.flatten:
         if settings.energy is not None:
-            raise ValueError("energy is what flatten lowers: ask for that, or for polish")
+            raise ValueError(
+                "energy is for flatten, and flatten was not asked for: ask for it, or give polish its own energy"
+            )
         return
     plain = Settings()
     for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):

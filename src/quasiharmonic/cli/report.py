@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -139,11 +140,18 @@ def _same(path: Path, other: Path) -> bool:
 
 
 _COUNTING = "(counting from 0)"
+# What a message that names elements by their numbers has in it.
+_NUMBERED = re.compile(
+    r"\b(vertex|vertices|nodes?|triangles?|quadrilaterals?|edges?|corners?|loops?|islands?|rows?|between) [-(]?\d"
+)
 
 
 @contextmanager
 def about(source: Path | str) -> Iterator[None]:
-    """Tell of which file a message about a mesh speaks, and how it counts; messages about files say so themselves."""
+    """Tell of which file a message about a mesh speaks, and how it counts where it names elements by numbers.
+
+    Messages about files say themselves of which they speak.
+    """
     from quasiharmonic.io.errors import MeshFileError
 
     try:
@@ -154,7 +162,8 @@ def about(source: Path | str) -> Iterator[None]:
         if str(error).endswith(_COUNTING):
             # Said already, of something more particular.
             raise
-        raise ValueError(f"{source}: {error} {_COUNTING}") from error
+        counting = f" {_COUNTING}" if _NUMBERED.search(str(error)) else ""
+        raise ValueError(f"{source}: {error}{counting}") from error
 
 
 class ReportError(Exception):

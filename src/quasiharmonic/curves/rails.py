@@ -8,7 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_range, index_array, named
+from quasiharmonic.arrays import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    loop_arrays,
+    named,
+)
 from quasiharmonic.curves.curve import Curve
 from quasiharmonic.curves.pieces import as_complex
 
@@ -83,6 +92,7 @@ class Rails:
     @classmethod
     def around(cls, loops: Sequence[IntArray], uv: FloatArray, *, held: ArrayLike = ()) -> Rails:
         """The polygons of boundary loops in a map (n, 2), each vertex told its own."""
+        loops = loop_arrays(loops, len(uv))
         on = {int(v): k for k, loop in enumerate(loops) for v in loop}
         return cls([uv[loop] for loop in loops], on=on, held=held)
 

@@ -63,7 +63,7 @@ class DeformationEnergy:
         rest_F: ArrayLike | None = None,
     ) -> None:
         self.energy = energy
-        self.F = own_triangles(np.asarray(F))
+        self.F = own_triangles(F)
         self._least_places = int(self.F.max(initial=-1)) + 1
         check_range("F", self.F, self._least_places)
         shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))

@@ -13,9 +13,11 @@ from quasiharmonic.arrays import (
     FloatArray,
     IntArray,
     check_choice,
+    check_range,
     counted,
     map_array,
     triangle_array,
+    triangle_rows,
     vertex_array,
 )
 from quasiharmonic.energy.distances import DistanceError, surface_distances
@@ -294,8 +296,16 @@ def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
     (f,) float64
         1 for an equilateral triangle, 0 for one without area, negative for one wound clockwise. The sign is
         exact.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape or dtype, ``F`` refers to vertices that there are not, or a triangle's corner
+        is not finite.
     """
-    corners = np.asarray(points, dtype=np.float64)[np.asarray(F, dtype=np.int64)]
+    places, triangles = map_array("points", points, finite=False), triangle_rows(F)
+    check_range("F", triangles, len(places))
+    corners = places[triangles]
     sign = orientation(*(corners[:, k] for k in range(3)))
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.abs(sides).max(axis=(1, 2), initial=0.0)

@@ -31,7 +31,7 @@ class MassSpring(Energy):
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
-        F = own_triangles(np.asarray(F))
+        F = own_triangles(F)
         shapes = rest_shapes(V, F)
         if shapes.flat.size:
             raise ValueError(

@@ -30,7 +30,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -43,13 +43,11 @@ from quasiharmonic.arrays import (
     ReadOnly,
     check_range,
     counted,
-    index_array,
-    kind_of,
+    loop_arrays,
     map_array,
     named,
-    triangle_rows,
+    own_triangles,
     true_or_false,
-    unchangeable,
 )
 from quasiharmonic.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
 from quasiharmonic.exact.triangles import overwound_vertices, triangle_signs
@@ -59,6 +57,7 @@ from quasiharmonic.showing import Shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(ReadOnly, Shown):
@@ -177,7 +176,7 @@ class Certificate(ReadOnly, Shown):
 
 
 def certify(
-    F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[IntArray] | None = None
+    F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[ArrayLike] | None = None
 ) -> Certificate:
     """Judge a map exactly, on its coordinates as stored.
 
@@ -222,7 +221,9 @@ def certify(
     """
     true_or_false("boundary", boundary)
     F, uv = _taken(F, uv)
-    given = None if loops is None else _given_loops(loops, F, len(uv))
+    given = None if loops is None else loop_arrays(loops, len(uv))
+    if given == [] and len(F):
+        raise ValueError("loops has no boundary loop: leave it out to have the loops found")
     sign, nonfinite = triangle_signs(F, uv)
     flipped = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []
@@ -313,7 +314,7 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
 
 def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
-    triangles = unchangeable(triangle_rows(mesh_triangles(F), copy=False))
+    triangles = own_triangles(mesh_triangles(F))
     given = getattr(uv, "uv", uv)
     places = map_array("uv", given, finite=False)
     rounded = _rounded(given, places)
@@ -343,27 +344,6 @@ def _is_rounded(given: Any, places: FloatArray, vertex: int, axis: int) -> bool:
     """Whether a number in nested lists is another than the double that was made of it."""
     number = given[vertex][axis]
     return not isinstance(number, float | np.floating) and int(number) != int(places[vertex, axis])
-
-
-def _given_loops(loops: Iterable[ArrayLike], F: IntArray, n: int) -> list[IntArray]:
-    """Boundary loops as int64, copies, or a ValueError that says what is wrong with them."""
-    if isinstance(loops, str | bytes) or not isinstance(loops, Iterable):
-        raise ValueError(f"loops must be a sequence of boundary loops, not {kind_of(loops)}")
-    taken = []
-    for k, loop in enumerate(loops):
-        name = f"loops[{k}]"
-        array = index_array(name, loop)
-        if array.ndim != 1:
-            advice = "; hand over a list of loops" if array.ndim == 0 else ""
-            raise ValueError(f"{name} must have shape (l,), the vertices of one loop, not {array.shape}{advice}")
-        check_range(name, array, n)
-        if len(array) < 3:
-            vertices = counted("vertex", "vertices", len(array))
-            raise ValueError(f"{name} has {vertices}, but a boundary loop has three or more")
-        taken.append(array)
-    if len(F) and not taken:
-        raise ValueError("loops has no boundary loop: leave it out to have the loops found")
-    return taken
 
 
 def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:

@@ -22,10 +22,11 @@ References
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, map_array
 from quasiharmonic.exact.predicates import orientation_or_nonfinite
-from quasiharmonic.mesh.elements import corner_triangles
+from quasiharmonic.mesh.elements import corner_triangles, element_rows
 from quasiharmonic.mesh.second_order import FORMS, jacobian_coefficients
 
 # Of the product of the extents: differences of coordinates, products and at most 36 terms lose a unit each, 2⁻⁵³.
@@ -34,20 +35,27 @@ _RELATIVE_BOUND = 64 * 2.0**-53 * float(np.abs(FORMS).sum(axis=(1, 2)).max())
 _UNDERFLOW_BOUND = 2.0**-1000
 
 
-def inverted_elements(F: IntArray, points: FloatArray) -> IntArray:
+def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
     """Find the elements that are inverted, or have no area, somewhere.
 
     Parameters
     ----------
-    F : (f, 3), (f, 4) or (f, 6) int64
+    F : (f, 3), (f, 4) or (f, 6) array of int
         As `quasiharmonic.mesh.elements` has them.
-    points : (n, 2) float64
+    points : (n, 2) array
 
     Returns
     -------
     (k,) int64
         Ascending; those with a coordinate that is not finite too.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape or dtype, or ``F`` refers to nodes that there are not.
     """
+    points = map_array("points", points, finite=False)
+    F = element_rows(F, len(points))
     if F.shape[1] == 6:
         return _curved(points[F])
     triangles, of = (F, np.arange(len(F))) if F.shape[1] == 3 else corner_triangles(F)

@@ -4,18 +4,18 @@ A kernel is a function that fills arrays handed to it. Its NumPy text stands whe
 is decorated by `compiled`; the function of that name in the extension, made of the C files of this folder, takes its
 place where there is one.
 
-*What a kernel checks itself*, and refuses with a TypeError or a ValueError: that there are as many arguments as it takes,
-by position; that arrays are of the very types, aligned, and contiguous unless its C text says otherwise; that those it
-fills are writeable; that the arrays' sizes fit together (`fit` in `arguments.h`). Where its C text says so, also that
-indices are in range; it then answers by a number that says they are not, for its caller to raise.
+*What a kernel checks itself*, and refuses with a TypeError or a ValueError: that it was given as many arguments as it
+takes, by position; that arrays are of the very types, aligned, and contiguous unless its C text says otherwise; that
+those it fills are writeable; that the arrays' sizes fit together (`fit` in `arguments.h`). Where its C text says so,
+also that indices are in range; it then answers by a number that says that they are not, for its caller to raise.
 
-*What it relies on*: indices in arrays are in range otherwise, the numbers that become integers are finite and as large as
-its text says, and no array changes while it runs. It lets other threads run meanwhile, so what somebody else could
-write to would make each check worthless, its own included. Whoever calls has seen to that: a public function takes its
-index arrays once, at the border, checks what it took, and hands on nothing else. `index_array`, `triangle_array`,
-`vertex_array` and their like in `quasiharmonic.arrays` copy; `own_triangles` and `unchangeable` copy what is not in
-memory that nobody can write to, such as the triangles of a `Domain` and of a `Certificate` are in. An array that is not
-writeable may be a view of one that is, and is copied.
+*What it relies on*: that all other indices are in range, that floats which become integers are finite and within the
+bounds that its text names, and that no array changes while it runs. It lets other threads run meanwhile, so every
+check, its own included, is worth nothing for an array that somebody else can write to. Its callers see to this: a
+public function copies its index arrays once, at the border, checks the copy, and hands on nothing else. `index_array`,
+`triangle_array`, `vertex_array` and their like in `quasiharmonic.arrays` copy always; `own_triangles` and
+`unchangeable` do not copy what they made before, such as the triangles of a `Domain` or a `Certificate`. An array that
+is merely not writeable may be a view of one that is, and is copied.
 
 ``QUASIHARMONIC_PURE=1`` in the environment has the NumPy texts run. Both give the same results but for rounding, and in
 the room `exact` the same in every bit.

@@ -35,15 +35,9 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
         When there are none, they are no such elements, refer to nodes that there are not, have a node twice, or a node
         is between other corners in one element than in another.
     """
-    array = index_array("F", F)
+    array = element_rows(F, n)
     if array.size == 0:
         raise ValueError("the mesh has no triangles")
-    if array.ndim != 2 or array.shape[1] not in _TURNED:
-        raise ValueError(
-            "F must have shape (f, 3), (f, 4) or (f, 6), triangles, quadrilaterals or six-node triangles, not "
-            f"{array.shape}"
-        )
-    check_range("F", array, n)
     ordered = np.sort(np.delete(array, 3, axis=1) if array.shape[1] == 4 else array, axis=1)
     twice = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if array.shape[1] == 4:
@@ -52,6 +46,26 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
         raise ValueError(f"{name_elements(array, np.flatnonzero(twice))} with a node twice")
     if array.shape[1] == 6:
         _check_middles(array)
+    return array
+
+
+def element_rows(F: ArrayLike, n: int) -> IntArray:
+    """Any number of elements among ``n`` nodes, and be it none, as (f, 3), (f, 4) or (f, 6) int64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When they are no elements by their shape, or refer to nodes that there are not.
+    """
+    array = index_array("F", F)
+    if array.size == 0:
+        return np.empty((0, 3), dtype=np.int64)
+    if array.ndim != 2 or array.shape[1] not in _TURNED:
+        raise ValueError(
+            "F must have shape (f, 3), (f, 4) or (f, 6), triangles, quadrilaterals or six-node triangles, not "
+            f"{array.shape}"
+        )
+    check_range("F", array, n)
     return array
 
 

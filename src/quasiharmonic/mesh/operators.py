@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags, vstack
 
-from quasiharmonic.arrays import FloatArray, IntArray, own_triangles
+from quasiharmonic.arrays import FloatArray, own_triangles
 from quasiharmonic.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_edges
 

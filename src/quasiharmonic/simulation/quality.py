@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.arrays import FloatArray, IntArray, map_array
 from quasiharmonic.energy.measures import mean_ratio
 from quasiharmonic.exact.predicates import orientation
-from quasiharmonic.mesh.elements import corner_triangles
+from quasiharmonic.mesh.elements import corner_triangles, element_rows
 from quasiharmonic.mesh.second_order import jacobian_coefficients, least_jacobian
 
 
-def element_quality(F: IntArray, points: FloatArray) -> FloatArray:
+def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     """One number for every element, 1 at best and not positive where it is inverted somewhere.
 
     Parameters
     ----------
-    F : (f, 3), (f, 4) or (f, 6) int64
-    points : (n, 2) float64
+    F : (f, 3), (f, 4) or (f, 6) array of int
+    points : (n, 2) array
 
     Returns
     -------
@@ -25,7 +26,15 @@ def element_quality(F: IntArray, points: FloatArray) -> FloatArray:
         Of triangles `quasiharmonic.energy.measures.mean_ratio`. Of quadrilaterals the least over the corners of
         ``2 a b sin φ / (a² + b²)``, with sides a and b at an angle φ: 1 for a square, and its sign is exact. Of
         six-node triangles the mean ratio of the corners' triangle times the least Jacobian determinant over its mean.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape or dtype, ``F`` refers to nodes that there are not, or a node is not at a
+        finite place.
     """
+    points = map_array("points", points)
+    F = element_rows(F, len(points))
     if F.shape[1] == 3:
         return mean_ratio(points, F)
     if F.shape[1] == 4:

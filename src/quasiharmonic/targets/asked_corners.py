@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, vertex_array
+from quasiharmonic.arrays import FloatArray, IntArray, triangle_array, vertex_array
 from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.io.textual import integer
 from quasiharmonic.mesh.topology import boundary_loops
@@ -155,7 +155,7 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
         When arrays are malformed, or the surface is closed.
     """
     points, wanted = vertex_array(V), vertex_array(places, "places")
-    loops = boundary_loops(np.asarray(F), len(points))
+    loops = boundary_loops(triangle_array(F, len(points)), len(points))
     if not loops:
         raise ValueError("the surface is closed: it has no boundary vertices")
     border = np.sort(np.concatenate(loops))

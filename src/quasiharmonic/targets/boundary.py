@@ -102,6 +102,7 @@ def boundary_to(
         [one.reversed for one in found],
         corner_angle,
         exponent,
+        count,
     )
     to = dict(pins.contour_of)
     if 0 not in to.values():

@@ -7,7 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, IntArray, triangle_rows
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    held_places,
+    held_vertices,
+    named,
+    triangle_array,
+    triangle_rows,
+)
 from quasiharmonic.given.objects import mesh_triangles
 from quasiharmonic.mesh.topology import edges, trace_loops
 from quasiharmonic.targets.contours import as_complex
@@ -55,17 +63,26 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     -------
     (s, 2) int64
         The edges, smaller vertex first.
+
+    Raises
+    ------
+    ValueError
+        When an array is malformed, or a boundary vertex is not in ``fixed``.
     """
     F = triangle_rows(mesh_triangles(F))
-    fixed = np.asarray(fixed, dtype=np.int64)
-    places = np.asarray(target, dtype=np.float64)
-    # Of magnitude about one, so that nothing over- or underflows.
-    places = np.ldexp(places, -int(np.frexp(np.abs(places).max())[1]))
-    n = int(F.max()) + 1
+    n = int(F.max(initial=-1)) + 1
+    F = triangle_array(F, n)
+    fixed = held_vertices(fixed, n)
+    places = held_places(target, len(fixed))
     found = edges(F, n)
+    missing = np.setdiff1d(found.boundary, fixed)
+    if missing.size:
+        raise ValueError(f"the boundary {named('vertex', 'vertices', missing)} not in fixed")
+    # Of magnitude about one, so that nothing over- or underflows.
+    places = np.ldexp(places, -int(np.frexp(np.abs(places).max(initial=0))[1]))
     position = np.full((n, 2), np.nan)
     position[fixed] = places
-    least = tolerance * float(np.ptp(places, axis=0).max())
+    least = tolerance * float(np.ptp(places, axis=0).max()) if len(places) else 0.0
     flat = [np.empty((0, 2), dtype=np.int64)]
     for loop in trace_loops(found.boundary):
         chords = chords_of(loop, found.interior, n)

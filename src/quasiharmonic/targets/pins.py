@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.arrays import FloatArray, IntArray, check_range, index_array, kind_of, named
 from quasiharmonic.targets.contours import corners as corners_of
 from quasiharmonic.targets.correspondence import arc, at
 
@@ -34,6 +35,8 @@ class Pins:
         Degrees.
     exponent : int
         Of that power.
+    n : int
+        Number of the surface's vertices.
 
     Attributes
     ----------
@@ -49,6 +52,7 @@ class Pins:
         backwards: list[bool],
         corner_angle: float,
         exponent: int,
+        n: int,
     ) -> None:
         self.loops, self.contours, self.exponent = loops, contours, exponent
         self.sharp = [corners_of(c, corner_angle) for c in contours]
@@ -63,10 +67,10 @@ class Pins:
         self.all_corners = corners is not None and not isinstance(corners, Mapping)
         if corners is None:
             return
-        pairs = list(
-            corners.items() if isinstance(corners, Mapping) else zip(corners, range(len(corners)), strict=True)
-        )
-        self._check_vertices(np.array([vertex for vertex, _ in pairs]))
+        if not isinstance(corners, Iterable):
+            raise ValueError(f'corners are boundary vertices or "auto", not {kind_of(corners)}')
+        pairs = list(corners.items()) if isinstance(corners, Mapping) else [(v, k) for k, v in enumerate(corners)]
+        self._check_vertices([vertex for vertex, _ in pairs], n)
         where = {int(v): (i, k) for i, loop in enumerate(loops) for k, v in enumerate(loop.tolist())}
         for vertex, goal in pairs:
             loop, position = where[int(vertex)]
@@ -85,9 +89,11 @@ class Pins:
         if len(set(self.contour_of.values())) < len(self.contour_of):
             raise ValueError("two boundary loops have vertices that go to the same contour of the outline")
 
-    def _check_vertices(self, vertices: NDArray[np.generic]) -> None:
-        if vertices.size == 0 or vertices.dtype.kind not in "iu":
+    def _check_vertices(self, chosen: list[Any], n: int) -> None:
+        vertices = index_array("corners", chosen)
+        if vertices.ndim != 1 or not vertices.size:
             raise ValueError("corners must name boundary vertices by their integer indices")
+        check_range("corners", vertices, n)
         alone, times = np.unique(vertices, return_counts=True)
         if (times > 1).any():
             raise ValueError(f"corners name {named('vertex', 'vertices', alone[times > 1])} more than once")

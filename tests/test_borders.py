@@ -1,0 +1,383 @@
+"""What public functions take: arrays that change under their hands, that stay the caller's, that are no indices."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+import traceback
+
+import numpy as np
+import pytest
+
+from quasiharmonic import (
+    AirMesh,
+    InverseMap,
+    Problem,
+    Rails,
+    SurfacePoints,
+    certify,
+    distortion,
+    flipped_triangles,
+    is_injective,
+    polish,
+    refine,
+    warp_by_landmarks,
+)
+from quasiharmonic.atlas import SeamedMesh
+from quasiharmonic.cli import main
+from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.energies import ARAP
+from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.exact.elements import inverted_elements
+from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.mesh.topology import boundary_loops, components
+from quasiharmonic.problem import Domain
+from quasiharmonic.simulation.quality import element_quality
+from quasiharmonic.surfaces import disk
+from quasiharmonic.targets import boundary_to, flattened_edges
+
+V, F = disk(2)
+UV = V[:, :2].copy()
+N = len(V)
+LOOPS = boundary_loops(F, N)
+RIM = np.concatenate(LOOPS)
+SQUARE = [[(-3, -3), (3, -3), (3, 3), (-3, 3)]]
+
+# A second thread puts numbers into F that name no vertex, and takes them out again, while a function works on it.
+REWRITTEN = """
+import sys, threading, time
+import numpy as np
+from quasiharmonic import certify, distortion, flatten, flipped_triangles, injective_map, is_injective
+from quasiharmonic import InverseMap, polish
+from quasiharmonic.energy.deformation import DeformationEnergy
+from quasiharmonic.energy.energies import ARAP
+from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.mesh.topology import boundary_loops, components
+from quasiharmonic.surfaces import disk
+
+V, good = disk({rings})
+V = np.ascontiguousarray(V[:, :2])
+rim = np.concatenate(boundary_loops(good, len(V)))
+w = V.view(complex).ravel()
+F = good.copy()
+half = len(F) // 2
+done = False
+
+def rewrite():
+    while not done:
+        F[half:] = 2**40
+        F[half:] = good[half:]
+        time.sleep(0)
+
+threading.Thread(target=rewrite).start()
+taken = refused = 0
+begin = time.perf_counter()
+while time.perf_counter() - begin < 0.4:
+    try:
+        {call}
+        taken += 1
+    except ValueError as error:
+        assert str(error), error
+        refused += 1
+done = True
+print(taken, refused)
+"""
+CALLS = {
+    "certify": "certify(F, V)",
+    "certify with loops": "certify(F, V, loops=[rim])",
+    "flipped_triangles": "flipped_triangles(F, V)",
+    "is_injective": "is_injective(F, V)",
+    "boundary_loops": "boundary_loops(F, len(V))",
+    "components": "components(F, len(V))",
+    "distortion": "distortion(V, F, V)",
+    "flatten": "flatten(V, F, max_iterations=1)",
+    "injective_map": "injective_map(V, F, rim, V[rim])",
+    "polish": "polish(V, F, V, fixed=rim, max_iterations=1)",
+    "InverseMap": "InverseMap(V, F, V).locate(V)",
+    "DeformationEnergy": "DeformationEnergy(V, F, ARAP()).value(w)",
+    "ReferenceMesh": "ReferenceMesh(V, F, 'rest').derivatives(w)",
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_triangles_that_another_thread_rewrites(name):
+    text = REWRITTEN.format(call=CALLS[name], rings=60 if name != "flatten" else 20)
+    ran = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == 0, (ran.returncode, ran.stderr[-2000:])
+    assert sum(map(int, ran.stdout.split())) > 0
+
+
+def plain(array, folder):
+    return array.copy(), lambda kept, now: kept.__setitem__(..., now)
+
+
+def read_only_view(array, folder):
+    base = array.copy()
+    view = base.view()
+    view.flags.writeable = False
+    return view, lambda _, now: base.__setitem__(..., now)
+
+
+def opened_again(array, folder):
+    own = array.copy()
+    own.flags.writeable = False
+
+    def change(kept, now):
+        kept.flags.writeable = True
+        kept[...] = now
+
+    return own, change
+
+
+def of_a_buffer(array, folder):
+    memory = bytearray(array.tobytes())
+    view = np.frombuffer(memory, array.dtype).reshape(array.shape)
+    view.flags.writeable = False
+    return view, lambda _, now: memory.__setitem__(slice(None), np.broadcast_to(now, array.shape).tobytes())
+
+
+def of_a_memoryview(array, folder):
+    base = array.copy()
+    return np.asarray(memoryview(base).toreadonly()), lambda _, now: base.__setitem__(..., now)
+
+
+def of_a_file(array, folder):
+    path = folder / f"{array.shape[0]}.{array.dtype}"
+    array.tofile(path)
+    shared = np.memmap(path, array.dtype, "r+", shape=array.shape)
+    return np.memmap(path, array.dtype, "r", shape=array.shape), lambda _, now: shared.__setitem__(..., now)
+
+
+def of_foreign_memory(array, folder):
+    memory = (ctypes.c_char * array.nbytes).from_buffer_copy(array.tobytes())
+    view = np.frombuffer(memory, array.dtype).reshape(array.shape)
+    view.flags.writeable = False
+    return view, lambda _, now: ctypes.memmove(memory, np.broadcast_to(now, array.shape).tobytes(), array.nbytes)
+
+
+KINDS = (plain, read_only_view, opened_again, of_a_buffer, of_a_memoryview, of_a_file, of_foreign_memory)
+
+
+def found(result):
+    """Every array of a result that makes a promise, by its name."""
+    if isinstance(result, Problem):
+        result = result.domain
+    named = {name: array for name, array in vars(result).items() if isinstance(array, np.ndarray)}
+    named |= {f"loop {k}": loop for k, loop in enumerate(getattr(result, "loops", ()))}
+    if hasattr(result, "certificate"):
+        named |= {f"certificate {name}": array for name, array in found(result.certificate).items()}
+    if hasattr(result, "domain"):
+        named |= {f"domain {name}": array for name, array in found(result.domain).items()}
+    return named
+
+
+RESULTS = {
+    "certify": lambda V, F, uv, rim: certify(F, uv, loops=[rim]),
+    "certify twice": lambda V, F, uv, rim: certify(certify(F, uv, loops=[rim]).F, uv),
+    "Domain": lambda V, F, uv, rim: Domain(V, F, rim),
+    "Problem": lambda V, F, uv, rim: Problem(V, F, rim, uv[rim]),
+    "distortion": lambda V, F, uv, rim: distortion(V, F, uv),
+    "InverseMap": lambda V, F, uv, rim: InverseMap(V, F, uv),
+    "SeamedMesh": lambda V, F, uv, rim: SeamedMesh(V, F, F, uv),
+    "polish": lambda V, F, uv, rim: polish(V, F, uv, fixed=rim, max_iterations=1),
+    "refine": lambda V, F, uv, rim: refine(V, F, [[int(F[0, 0]), int(F[0, 1])]], boundary=True),
+    "AirMesh": lambda V, F, uv, rim: AirMesh(uv, F, SQUARE).moment,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", RESULTS)
+def test_results_do_not_change_with_what_the_caller_keeps(name, kind, tmp_path):
+    given = [kind(array, tmp_path) for array in (V, F, UV, RIM)]
+    writeable = [array.flags.writeable for array, _ in given]
+    result = RESULTS[name](*(array for array, _ in given))
+    assert [array.flags.writeable for array, _ in given] == writeable
+    before = {label: array.copy() for label, array in found(result).items()}
+    assert before
+    for (array, change), now in zip(given, (7.0, F[:, ::-1], -UV, 0), strict=True):
+        change(array, now)
+        np.testing.assert_array_equal(array, np.broadcast_to(now, array.shape))
+    for label, array in found(result).items():
+        np.testing.assert_array_equal(array, before[label], err_msg=label)
+
+
+def test_nobody_can_write_to_what_was_certified():
+    c = certify(F, UV, loops=LOOPS)
+    problem = Problem(V, F, RIM, UV[RIM])
+    for array in (c.F, c.uv, *c.loops, problem.F, *problem.domain.loops, problem.domain.edges.interior):
+        assert not array.flags.writeable
+    for array in (c.F, problem.F, c.F[3:]):
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            array.flags.writeable = True
+    assert LOOPS[0].flags.writeable
+
+
+def test_triangles_that_nobody_can_change_are_not_copied():
+    domain = Domain(V, F, RIM)
+    c = certify(domain.F, UV)
+    assert np.shares_memory(c.F, domain.F)
+    assert np.shares_memory(certify(c.F, UV).F, domain.F)
+    assert not np.shares_memory(certify(F, UV).F, F)
+
+
+BAD = {
+    "one row of two": [[0, 1]],
+    "one row of none": [[]],
+    "floats": [0.5, 1.0],
+    "a mask": np.ones(N, dtype=bool),
+    "matrix": np.zeros((2, 2), dtype=int),
+    "cube": np.zeros((2, 2, 3), dtype=int),
+    "beyond 2^63": np.array([2**63, 1, 2], dtype=np.uint64),
+    "integers and floats": [2**53 + 1, 0.5, 1],
+    "beyond 2^64": [2**70, 1],
+    "negative": [-1, 0, 1],
+    "too large": [0, 1, 10**6],
+    "None": None,
+    "words": ["a", "b"],
+    "one word": "abc",
+    "a number": 3,
+    "a mapping": {"a": 1},
+    "objects": np.array([None, 1], dtype=object),
+    "rows that differ": [[0, 1], [2]],
+    "NaN": [np.nan],
+    "complex": [1j],
+}
+TAKERS = {
+    "certify loops": lambda x: certify(F, UV, loops=x),
+    "certify one loop": lambda x: certify(F, UV, loops=[x]),
+    "certify F": lambda x: certify(x, UV),
+    "is_injective": lambda x: is_injective(x, UV),
+    "flipped_triangles": lambda x: flipped_triangles(x, UV),
+    "Problem F": lambda x: Problem(V, x, RIM, UV[RIM]),
+    "Problem fixed": lambda x: Problem(V, F, x, UV[RIM]),
+    "polish fixed": lambda x: polish(V, F, UV, fixed=x),
+    "refine": lambda x: refine(V, F, x),
+    "SeamedMesh F": lambda x: SeamedMesh(V, x),
+    "SeamedMesh cut": lambda x: SeamedMesh(V, F).cut(x),
+    "distortion": lambda x: distortion(V, x, UV),
+    "InverseMap": lambda x: InverseMap(V, x, UV),
+    "SurfacePoints": lambda x: InverseMap(V, F, UV).surface(SurfacePoints(x, np.ones((3, 3)) / 3)),
+    "boundary_to": lambda x: boundary_to(V, F, "rect:2x1", corners=x),
+    "flattened_edges F": lambda x: flattened_edges(x, RIM, UV[RIM]),
+    "flattened_edges fixed": lambda x: flattened_edges(F, x, UV[RIM]),
+    "AirMesh F": lambda x: AirMesh(UV, x, SQUARE),
+    "AirMesh frame": lambda x: AirMesh(UV, F, x),
+    "landmarks": lambda x: warp_by_landmarks(np.zeros((9, 9)), x, x),
+    "Rails.around": lambda x: Rails.around(x, UV),
+    "Rails on": lambda x: Rails([UV[RIM]], on=x),
+    "boundary_loops": lambda x: boundary_loops(x, N),
+    "components": lambda x: components(x, N),
+    "DeformationEnergy": lambda x: DeformationEnergy(V, x, ARAP()),
+    "ReferenceMesh": lambda x: ReferenceMesh(V, x, "rest"),
+    "mean_ratio": lambda x: mean_ratio(UV, x),
+    "inverted_elements": lambda x: inverted_elements(x, UV),
+    "element_quality": lambda x: element_quality(x, UV),
+}
+
+
+@pytest.mark.parametrize("name", TAKERS)
+def test_what_are_no_indices_is_named(name):
+    refused = 0
+    for what, value in BAD.items():
+        try:
+            TAKERS[name](value)
+        except ValueError as error:
+            refused += 1
+            files = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+            own, message = "quasiharmonic" in files[-1], str(error)
+        except Exception as error:
+            raise AssertionError(f"{what}: {error!r}") from error
+        else:
+            continue
+        # Raised here, and not in NumPy.
+        assert own, (what, message)
+        assert len(message) > 15, what
+    assert refused > len(BAD) // 2
+
+
+@pytest.mark.parametrize(
+    ("loops", "said"),
+    [
+        ([[0, 1]], r"loops\[0\] has 2 vertices, but a boundary loop has three or more"),
+        ([RIM, [3]], r"loops\[1\] has 1 vertex, but"),
+        ([], "loops has no boundary loop: leave it out"),
+        ([[]], r"loops\[0\] has 0 vertices"),
+        (RIM, r"loops\[0\] must have shape \(l,\), the vertices of one loop, not \(\); hand over a list of loops"),
+        ([RIM[None]], r"loops\[0\] must have shape \(l,\), the vertices of one loop, not \(1, 12\)$"),
+        ([RIM + 0.5], r"loops\[0\] must hold integer indices, not float64"),
+        ([RIM > 0], r"loops\[0\] must hold integer indices, not bool"),
+        ([RIM, RIM + N], r"loops\[1\] refers to vertices 26, .*, but there are only vertices 0 … 18"),
+        (
+            [np.array([0, 1, 2**63], dtype=np.uint64)],
+            r"loops\[0\] refers to vertex 9223372036854775808, which no mesh has",
+        ),
+        (7, "loops must be a sequence of boundary loops, not 7"),
+        ("rim", "loops must be a sequence of boundary loops, not 'rim'"),
+    ],
+)
+def test_loops_that_are_none(loops, said):
+    for boundary in (True, False):
+        with pytest.raises(ValueError, match=said):
+            certify(F, UV, loops=loops, boundary=boundary)
+
+
+def test_loops_of_any_integer_type():
+    for dtype in (np.int8, np.int32, np.uint64, ">i4"):
+        assert certify(F, UV, loops=[RIM.astype(dtype)]).bijective
+    assert certify(F, UV, loops=np.array(LOOPS)).bijective
+    assert certify(F, UV, loops=tuple(loop.tolist() for loop in LOOPS)).bijective
+    assert certify(np.empty((0, 3), dtype=int), UV, loops=[]).bijective is False
+
+
+def test_lists_of_integers_and_floats_are_not_rounded():
+    T = [[0, 1, 2]]
+    for wide in (2**53 + 1, -(2**53) - 1, np.int64(2**62 + 1)):
+        for uv in ([[0, 0.5], [wide, 0], [0, 1]], [np.array([0, 0.5]), (wide, 0), [0.0, 1]]):
+            for function in (certify, is_injective, flipped_triangles):
+                with pytest.raises(ValueError, match=r"uv does not fit double precision at vertex 1$"):
+                    function(T, uv)
+    assert is_injective(T, [[0, 0.5], [2**60, 0], [0, 1]])
+    assert is_injective(T, [[0, 0.5], [2.0**60, 0], [0, 1]])
+    assert certify(T, [[0, 0.5], [np.inf, 2**53], [0, 1]]).nonfinite.tolist() == [0]
+
+
+def test_frames_that_are_none():
+    for frame in (None, 3, "rect:2x1"):
+        with pytest.raises(ValueError, match=r"frame must be a list of loops \(k, 2\), .*, not"):
+            AirMesh(UV, F, frame)
+    with pytest.raises(ValueError, match="loop 0 of the frame must hold real numbers, not None"):
+        AirMesh(UV, F, [None])
+
+
+def test_a_corner_that_is_no_vertex():
+    for corner in (N, -1, 10**6):
+        with pytest.raises(ValueError, match=f"corners refers to vertex {corner}, but there are only vertices 0 … 18"):
+            boundary_to(V, F, "rect:2x1", corners=[*RIM[:3], corner])
+        with pytest.raises(ValueError, match=f"corners refers to vertex {corner}"):
+            boundary_to(V, F, "rect:2x1", corners={corner: (0.0, 0.0)})
+    with pytest.raises(ValueError, match="vertex 0 in corners, but not on the boundary"):
+        boundary_to(V, F, "rect:2x1", corners=[*RIM[:3], 0])
+
+
+@pytest.mark.parametrize(
+    ("options", "said", "counted"),
+    [
+        (["--to", "letter:QH"], "an outline is made of one character", False),
+        (["--to", "star:30"], "too few to keep the 60 corners", False),
+        (["--to", "rect:1x1", "--corners", "0,1,2,4"], "vertex 4 in corners, but not on the boundary", True),
+        (["--to", "rect:1x1", "--corners", "0,1,2,9"], "corners refers to vertex 9", True),
+    ],
+)
+def test_how_it_counts_is_said_where_something_is_counted(options, said, counted, tmp_path, capsys):
+    mesh = tmp_path / "tent.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0.5 0.5 0\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
+    assert main(["map", str(mesh), "-o", str(tmp_path / "out.obj"), *options]) == 2
+    complained = capsys.readouterr().err
+    assert said in complained
+    assert complained.rstrip().endswith("(counting from 0)") == counted
+
+
+def test_an_energy_without_a_flattening(tmp_path, capsys):
+    assert main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), "--energy", "mips", "--polish", "mips"]) == 2
+    assert "energy is for flatten, and flatten was not asked for" in capsys.readouterr().err
