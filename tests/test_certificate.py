@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,6 +11,9 @@ from hypothesis import strategies as st
 
 from quasiharmonic.exact.certificate import Obstacle, certify, flipped_triangles, is_injective
 from quasiharmonic.exact.predicates import SegmentRelation
+from quasiharmonic.ladder.mapping import injective_map
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import annulus
 from shared.exact import exact_orientation, exact_relation
 
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
@@ -314,15 +318,123 @@ def test_a_fan_wound_once_is_not_overwound(rng):
         assert not certify(*fan(np.round(uv, 1))).overwound.size
 
 
-def test_only_interior_vertices_with_positive_triangles_are_overwound():
+def test_only_vertices_with_positive_triangles_are_overwound():
     F, uv = fan(polar(np.linspace(1, 2, 12), np.arange(12) / 5))
     c = certify(F[:-1], uv)  # vertex 0 is on the boundary now
     assert c.injective
-    assert kinds(c) == {Obstacle.SELF_INTERSECTION}
+    assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.OVERWOUND}
+    np.testing.assert_array_equal(c.overwound, [0])
     t = np.array([0, 0.3, 0.6, 0.5, 0.8, 1.1, 1.4, 1.7])
     c = certify(*fan(polar(np.linspace(1, 2, 8), t)))
     np.testing.assert_array_equal(c.flipped, [2])
     assert not c.overwound.size
+
+
+def overwound_exactly(F, uv):
+    """Vertices, all triangles around them positive, with angles of more than 2π in all: by products of fractions."""
+    found = []
+    for v in np.unique(F).tolist():
+        rows = [np.roll(t, -int(np.argmax(t == v))).tolist() for t in F if v in t]
+        if any(exact_orientation(*uv[row]) <= 0 for row in rows):
+            continue
+        following = {b: c for _, b, c in rows}
+        # A fan begins where no other triangle of it ends; a closed one anywhere.
+        here = next((b for b in following if b not in following.values()), rows[0][1])
+        x, y, whole = Fraction(1), Fraction(0), 0
+        for _ in rows:
+            (bx, by), (cx, cy) = (
+                [Fraction(p) - Fraction(q) for p, q in zip(uv[i].tolist(), uv[v].tolist(), strict=True)]
+                for i in (here, following[here])
+            )
+            dx, dy = bx * cx + by * cy, bx * cy - by * cx
+            lower = y < 0 or (y == 0 and x < 0)
+            x, y = x * dx - y * dy, x * dy + y * dx
+            # By less than half a turn: from the lower half to the upper one is past a whole turn.
+            whole += lower and (y > 0 or (y == 0 and x > 0))
+            here = following[here]
+        if whole > 1 or (whole == 1 and (y != 0 or x < 0)):
+            found.append(v)
+    return found
+
+
+def open_fan(rng, triangles):
+    """Positive triangles around vertex 0, which is on the boundary, at whole numbers."""
+    points = [rng.integers(-2, 3, 2)]
+    while len(points) <= triangles:
+        place = rng.integers(-2, 3, 2)
+        x, y = points[-1]
+        if x * place[1] - y * place[0] > 0:
+            points.append(place)
+        elif not points[-1].any():
+            points = [place]
+    rim = np.arange(1, triangles + 1)
+    return np.stack([np.zeros_like(rim), rim, rim + 1], axis=1), np.vstack([[0, 0], points]).astype(float)
+
+
+def test_boundary_vertices_around_which_triangles_wind_more_than_once(rng):
+    counted = {True: 0, False: 0}
+    for _ in range(150):
+        F, uv = open_fan(rng, int(rng.integers(2, 9)))
+        F, uv = F[rng.permutation(len(F))], uv * rng.choice([1.0, 1e-200, 3e150])
+        c = certify(F, uv)
+        assert c.injective
+        np.testing.assert_array_equal(c.overwound, overwound_exactly(F, uv))
+        assert (Obstacle.OVERWOUND in kinds(c)) == bool(c.overwound.size)
+        assert not (c.bijective and c.overwound.size)
+        counted[bool(c.overwound.size)] += 1
+    assert counted[True] > 20
+    assert counted[False] > 20
+
+
+def test_maps_of_annuli_overwound_or_not(rng):
+    """Rings of whole numbers, some with a loop reflected, and torn; a third of them with triangles inverted."""
+    seen = 0
+    for _ in range(120):
+        columns = int(rng.integers(4, 9))
+        F, uv = ring(columns=columns)
+        if rng.random() < 0.6:
+            uv[1::2] *= [-0.5, 0.5]
+        uv = np.round(uv * 8) + rng.integers(-2, 3, uv.shape)
+        if rng.random() < 0.3:
+            F = F[:-2]
+        F = np.roll(F, int(rng.integers(3)), axis=1)
+        c = certify(F, uv)
+        np.testing.assert_array_equal(c.overwound, [] if c.bijective else overwound_exactly(F, uv))
+        assert not (c.bijective and overwound_exactly(F, uv))
+        seen += bool(c.overwound.size)
+    assert seen
+
+
+def test_an_annulus_with_its_inner_loop_reflected():
+    V, F = annulus(6)
+    outer, inner = sorted(boundary_loops(F, len(V)), key=lambda loop: -np.abs(V[loop]).max())
+    target = np.concatenate([V[outer], V[inner] * [-0.5, 0.5]])
+    result = injective_map(V, F, np.concatenate([outer, inner]), target)
+    c = result.certificate
+    assert c.injective
+    assert not c.bijective
+    assert c.overwound.tolist() == [21, 38] == overwound_exactly(F, result.uv)
+    assert set(c.overwound) <= set(inner)
+    assert "triangles wind more than once around vertices 21, 38" in result.summary()
+    assert c.to_dict()["overwound"] == [21, 38]
+
+
+def test_a_slit_that_is_closed_is_not_overwound():
+    """The angles at its end are 2π exactly: its sides lie on each other, which is a crossing."""
+    t = np.arange(9) / 8
+    F, uv = fan(np.round(polar(1 + 0 * t, t) * 4))
+    for turn in range(8):
+        # Vertex 9 is where vertex 1 is.
+        np.testing.assert_array_equal(uv[1], uv[9])
+        turned = uv @ [[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[3, 4], [-4, 3]], [[5, -12], [12, 5]]][turn % 4]
+        c = certify(F[:-1], turned)
+        assert c.injective
+        assert not c.overwound.size
+        assert len(c.crossings)
+        turned[9] += (turned[2] - turned[9]) * 2.0**-40
+        assert certify(F[:-1], turned).overwound.tolist() == [0]
+        turned[9] += (turned[8] - turned[9]) * 2.0**-30
+        assert not certify(F[:-1], turned).overwound.size
 
 
 def test_branched_sheets_with_simple_loops_apart():
