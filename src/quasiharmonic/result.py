@@ -185,7 +185,8 @@ class MapResult(ReadOnly, Shown):
     Attributes
     ----------
     uv : (n, 2) float64
-        Positions, the fixed vertices exactly at their target.
+        Positions, the fixed vertices exactly at their target. Yours to write to: the certificate has a copy
+        of its own, and stays about that.
     status : Status
         What happened and what to do next.
     certificate : Certificate

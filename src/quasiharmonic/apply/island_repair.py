@@ -215,12 +215,16 @@ class IslandRepair:
                 self.uv[vertices] = _uninterrupted(polished).uv
 
     def _overwound(self, free: BoolArray) -> bool:
-        """Whether triangles wind more than once around a vertex of the patch, as positive ones can."""
+        """Whether triangles wind more than once around an interior vertex of the patch, as positive ones can.
+
+        At boundary vertices the boundary, which stays, may leave no choice.
+        """
         patch = np.zeros(len(self.uv), dtype=np.bool_)
         patch[self._F[free[self._F].any(axis=1)]] = True
         around = self._F[patch[self._F].any(axis=1)]
         F, first = renumbered(fans(around)[0], around)
-        return bool(certify(F, self.uv[around.ravel()[first]]).overwound.size)
+        found = certify(F, self.uv[around.ravel()[first]])
+        return bool(found.overwound.size and np.setdiff1d(found.overwound, np.concatenate(found.loops)).size)
 
     def _explain(self) -> None:
         """Say why there still are inverted triangles, as far as no attempt has said it."""
