@@ -28,6 +28,7 @@ from quasiharmonic import (
     warp_by_landmarks,
 )
 from quasiharmonic.atlas import SeamedMesh
+from quasiharmonic.atlas.packing import packed
 from quasiharmonic.cli import main
 from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import ARAP
@@ -38,6 +39,7 @@ from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.mesh.operators import operators
 from quasiharmonic.mesh.reference import ReferenceMesh
 from quasiharmonic.mesh.topology import boundary_loops, components
+from quasiharmonic.plot import plot_map
 from quasiharmonic.problem import Domain
 from quasiharmonic.simulation.quality import element_quality
 from quasiharmonic.surfaces import disk
@@ -333,6 +335,9 @@ TAKERS = {
     "landmarks": lambda x: warp_by_landmarks(np.zeros((9, 9)), x, x),
     "Rails.around": lambda x: Rails.around(x, UV),
     "Rails on": lambda x: Rails([UV[RIM]], on=x),
+    "packed uv": lambda x: packed(x, [F], [1.0]),
+    "packed F": lambda x: packed([UV], x, [1.0]),
+    "plot_map": lambda x: plot_map(V, x, UV),
     "boundary_loops": lambda x: boundary_loops(x, N),
     "components": lambda x: components(x, N),
     "DeformationEnergy": lambda x: DeformationEnergy(V, x, ARAP()),

@@ -7,13 +7,22 @@ that is decided exactly on what is handed back.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from math import sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, map_array, named, real_array, triangle_array
+from quasiharmonic.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    kind_of,
+    map_array,
+    named,
+    real_array,
+    triangle_array,
+)
 from quasiharmonic.atlas.skyline import Laid, laid
 from quasiharmonic.exact.certificate import flipped_triangles
 
@@ -95,6 +104,9 @@ def _checked(
 ) -> tuple[list[FloatArray], list[IntArray], FloatArray]:
     """Arrays of the right types and shapes, or a ValueError that says which are not."""
     surface = real_array("areas", areas)
+    for name, arrays in (("uv", uv), ("F", F)):
+        if not isinstance(arrays, Sized) or isinstance(arrays, str | bytes):
+            raise ValueError(f"{name} must be a list of arrays, one for every island, not {kind_of(arrays)}")
     if surface.ndim != 1 or not len(uv) == len(F) == len(surface):
         raise ValueError(
             f"there are {len(uv)} islands' places, {len(F)} islands' triangles and areas of shape {surface.shape}: one "

@@ -55,7 +55,14 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     Returns
     -------
     View
+
+    Raises
+    ------
+    ValueError
+        When there are no triangles.
     """
+    if not len(F):
+        raise ValueError("the mesh has no triangles to draw")
     V = drawable(V)
     if V.shape[1] == 2:
         V = np.column_stack([V, np.zeros(len(V))])
