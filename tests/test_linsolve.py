@@ -614,7 +614,9 @@ Panic.__name__ = "PanicException"
 @pytest.fixture
 def damaged(monkeypatch):
     """Make rslab's symbolic and numeric objects do as they are told instead of what they should."""
-    library = pytest.importorskip("rslab")
+    if not rslab.Rslab.present():
+        pytest.skip("rslab is not installed")
+    library = rslab.library()
     analyze = library.analyze
 
     class Stub:
@@ -710,6 +712,81 @@ def test_rslab_gives_the_same_bits_on_any_number_of_threads(monkeypatch):
         answers.append(solve(A, rhs, "rslab"))
     np.testing.assert_array_equal(answers[0], answers[1])
     np.testing.assert_array_equal(answers[0], answers[2])
+
+
+# Solves with rslab, and threads that end before the next one begins.
+_THREADS = """
+import sys, threading
+import numpy as np
+from quasiharmonic.linsolve import make_solver
+n = 300
+indptr, indices = np.append(np.arange(0, 2 * n - 1, 2), 2 * n - 1), np.append(np.repeat(np.arange(n), 2)[1:], [])
+values = np.where(np.arange(2 * n - 1) % 2, -1.0, 2.0)
+found = []
+def solve(name="rslab"):
+    with make_solver(indptr, indices.astype(int), name=name) as solver:
+        solver.factor(values)
+        solver.solve(np.ones(n))
+        found.append(solver.name)
+def one_by_one(*tasks):
+    for task in tasks:
+        thread = threading.Thread(target=task)
+        thread.start()
+        thread.join()
+"""
+_ENDING = {
+    "threads that end": "one_by_one(*[solve] * 30)\nsolve()",
+    "threads that overlap": """
+barrier = threading.Barrier(3)
+def solve_together():
+    barrier.wait()
+    solve()
+for _ in range(3):
+    threads = [threading.Thread(target=solve_together) for _ in range(3)]
+    for thread in threads: thread.start()
+    for thread in threads: thread.join()
+one_by_one(*[solve] * 30)
+""",
+    "a second copy of the module": """
+one_by_one(solve)
+for name in [name for name in sys.modules if name.startswith("quasiharmonic.linsolve")]: del sys.modules[name]
+from quasiharmonic.linsolve import make_solver
+one_by_one(*[solve] * 30)
+""",
+}
+
+
+def finished(code):
+    """What a process prints that runs this code."""
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.split()
+
+
+@needs_rslab
+@pytest.mark.parametrize("trial", _ENDING)
+def test_rslab_outlives_the_thread_that_used_it_first(trial):
+    assert set(finished(_THREADS + _ENDING[trial] + "\nprint(*found)")) == {"rslab"}
+
+
+@needs_rslab
+def test_an_rslab_that_others_imported_is_not_used():
+    """The thread that imported it may have ended, after which it crashes."""
+    code = """
+from importlib import import_module
+import quasiharmonic.linsolve
+for other in ("pardiso", "cholmod"): del quasiharmonic.linsolve.BACKENDS[other]
+quasiharmonic.linsolve.QDLDL_UP_TO = 0
+one_by_one(lambda: import_module("rslab"))
+one_by_one(*[lambda: solve("auto")] * 6)
+try:
+    solve()
+except ImportError as error:
+    print(*found, error)
+"""
+    said = finished(_THREADS + code)
+    assert " ".join(said[6:]).startswith("rslab was imported by other code before quasiharmonic used it")
+    assert len(set(said[:6])) == 1
+    assert said[0] in ("qdldl", "superlu")
 
 
 _FORK = """

@@ -49,6 +49,16 @@ def test_the_zip_brings_all_that_is_needed(extension):
     assert hasattr(bpy.types, "QHM_PT_uv")
 
 
+def test_flatten_a_large_model_twice():
+    """Each time in a thread of its own, and the linear solver of large systems minds in which it is loaded."""
+    bpy.ops.mesh.primitive_monkey_add()
+    bpy.context.object.modifiers.new("finer", "SUBSURF").levels = 2
+    bpy.ops.object.modifier_apply(modifier="finer")
+    for _ in range(2):
+        assert bpy.ops.uv.qhm_flatten() == {"FINISHED"}
+    assert scenes.verdict(bpy.context.object).injective
+
+
 def test_flatten(thing):
     before, kept = scenes.places(thing), scenes.everything_else(thing)
     assert bpy.ops.uv.qhm_flatten() == {"FINISHED"}

@@ -2,12 +2,20 @@
 
 It is young, so it is never alone. What it fails at in any other way than by finding the matrix indefinite, an error of
 its own or a solution whose residual is wrong, is done again by QDLDL, or by SuperLU where that is not installed either.
+
+It is loaded by a thread of its own that never ends. rslab 1.7 brings an allocator, mimalloc 3.3, that keeps the heap of
+the thread that loads it under that thread's identifier, and frees the heap, but not the identifier, when the thread
+ends. The system gives the identifier to a later thread, which then takes the heap that is gone, and the process crashes
+(microsoft/mimalloc#1287; on Linux and macOS). An identifier that stays in use is given to no other thread.
 """
 
 from __future__ import annotations
 
 import os
+import sys
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import cache
 from importlib.util import find_spec
 from typing import Any, TypeVar
@@ -36,6 +44,10 @@ _SINGULAR = "rank-deficient"
 _Made = TypeVar("_Made")
 # The process that rslab has worked in first. After a fork it waits for ever for threads that are not there (1.7).
 _home: list[int] = []
+# The thread that loads rslab, and what it loads: one entry at most. A forked process looks at neither, see `_home`.
+_LOADER = "quasiharmonic: loads rslab"
+_loading: list[Future[Any]] = []
+_lock = threading.Lock()
 
 
 class Rslab(LinearSolver):
@@ -52,14 +64,13 @@ class Rslab(LinearSolver):
         return find_spec("rslab") is not None
 
     def _analyse(self) -> None:
-        import rslab
         from scipy.sparse import csc_matrix
 
         # The upper triangle by rows is the lower triangle by columns, which is what rslab reads.
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
         self._symbolic: Any = self._tried(
-            lambda: rslab.analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=_NEMIN, threads=threads)
+            lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=_NEMIN, threads=threads)
         )
         self._numeric: Any = None
         self._second: LinearSolver | None = None
@@ -123,6 +134,43 @@ class Rslab(LinearSolver):
             if type(error).__name__ != "PanicException":
                 raise
         return None
+
+
+def library() -> Any:
+    """The package rslab, loaded by a thread that lives as long as the process.
+
+    Raises
+    ------
+    ImportError
+        It cannot be loaded, or something else has loaded it before, perhaps in a thread that has ended.
+    """
+    with _lock:
+        if not _loading:
+            _loading.append(_load())
+    return _loading[0].result()
+
+
+def _load() -> Future[Any]:
+    """Start the thread that loads rslab."""
+    if "rslab" in sys.modules and all(thread.name != _LOADER for thread in threading.enumerate()):
+        raise ImportError(
+            "rslab was imported by other code before quasiharmonic used it: if the thread that imported it has ended, "
+            "a later thread may crash in it. Solve with quasiharmonic before rslab is imported, or with another solver"
+        )
+    loaded: Future[Any] = Future()
+    threading.Thread(target=_import_and_stay, args=(loaded,), name=_LOADER, daemon=True).start()
+    return loaded
+
+
+def _import_and_stay(loaded: Future[Any]) -> None:
+    """Import rslab, and never end."""
+    try:
+        import rslab
+
+        loaded.set_result(rslab)
+    except BaseException as error:
+        loaded.set_exception(error)
+    threading.Event().wait()
 
 
 def _threads() -> int:
