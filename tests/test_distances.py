@@ -443,6 +443,7 @@ def asked():
     return Settings(SymmetricDirichlet(), "distances", 1e-3, 100, "auto", None, 0)
 
 
+@pytest.mark.slow
 def test_a_coarse_mesh_serves_the_fine_one(folded, asked):
     plain = flatten(folded.V, folded.F)
     found = kept_by_coarse(folded, 16, asked, least=900)
@@ -501,7 +502,7 @@ def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh():
     assert given.stages[-1].name == "guarded descent, distances"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_hundred_thousand_triangles_take_about_as_long_as_without_distances():
     V, F = surfaces.grid(388, 388)
     V = np.column_stack([V, 0.3 * np.sin(7 * V[:, 0]) * np.cos(5 * V[:, 1])])
