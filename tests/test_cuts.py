@@ -275,6 +275,7 @@ class TestWorth:
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]
 
+    @pytest.mark.slow
     def test_the_same_whatever_the_unit_the_place_and_the_view(self):
         V, F = surfaces.starfish(4, 16)
         V = jittered(V)

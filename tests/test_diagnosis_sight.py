@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 import time
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -26,6 +27,7 @@ from shared.polygons import U, circle, random_polygon, spiral
 from shared.small_meshes import loose_wheel, wheel
 
 
+@cache
 def polygons():
     rng = np.random.default_rng(11)
     random = [
@@ -239,6 +241,7 @@ def crooked_wheel(n, mesh=wheel):
     return onto(mesh(n), circle(n) * np.exp(2 * np.random.default_rng(0).normal(size=n))[:, None])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mesh", [wheel, loose_wheel])
 def test_hubs_of_thousands_of_neighbours_are_placed(mesh):
     problem = crooked_wheel(2_000, mesh)

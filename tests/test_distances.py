@@ -466,6 +466,7 @@ def test_rings_too_few_for_any_coarser_mesh(folded, asked):
     assert kept_by_coarse(folded, 20, asked, least=len(folded.V)) is None
 
 
+@pytest.mark.slow
 def test_what_the_coarse_way_tells_and_records(folded, asked):
     steps = []
     found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record=1), least=900)
@@ -477,6 +478,7 @@ def test_what_the_coarse_way_tells_and_records(folded, asked):
     assert np.array_equal(last.uv, np.ldexp(found.uv, folded.exponent))
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_coarse_mesh_hands_back_a_map_of_the_surface(folded, asked):
     def stop(step):
         if step.iteration == 1:
@@ -541,6 +543,7 @@ def test_flatten_ends_with_the_descent_of_distances():
     assert [kept.iteration for kept in result.path] == [*range(len(result.history))]
 
 
+@pytest.mark.slow
 def test_flatten_keeps_the_distances_of_each_piece(dome):
     V, F = dome
     both = np.concatenate([V, 0.5 * V + [5, 0, 0]]), np.concatenate([F, F + len(V)])
