@@ -1,12 +1,45 @@
 from __future__ import annotations
 
-import numpy as np
+import os
+
 import pytest
+
+# One thread in each process: there may be one for each core, and on small problems one thread is quicker even alone.
+# Read by libraries when they are loaded, so before NumPy is imported.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+# From this many on a worker's memory, half a gigabyte, and its start are not worth its time.
+MOST_WORKERS = 8
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):
+    """A worker for each core; none where files are named, most of which have ended before workers have started."""
+    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
+        return None  # the plugin's own way to set it
+    if any(".py" in argument for argument in config.args):
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(MOST_WORKERS, cores)
+
+
+def pytest_addoption(parser):
+    parser.addoption("--nightly", action="store_true", help="run the tests that .ci/nightly runs, too")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("nightly"):
+        left = [item for item in items if item.get_closest_marker("nightly")]
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if item not in left]
 
 
 @pytest.fixture
 def rng():
     """Random numbers, the same ones every time."""
+    import numpy as np
+
     return np.random.default_rng(20231)
 
 

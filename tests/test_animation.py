@@ -93,6 +93,7 @@ def test_polished_frames_do_not_leap(head):
     assert animation.energies.mean() <= 1.1 * np.mean(alone)
 
 
+@pytest.mark.slow
 def test_the_sweeps_are_what_shortens_leaps(head):
     """With a limit that cannot be met on the way forward alone."""
     V, F, loop = head

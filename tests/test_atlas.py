@@ -231,6 +231,7 @@ class TestSeenFromOutside:
         assert vertices.max() < len(io.read_mesh(source).V)
         assert len(np.unique(vertices)) < len(vertices)
 
+    @pytest.mark.slow
     def test_a_batch_with_seams_has_its_page(self, source, tmp_path):
         assert run("batch", tmp_path, "-o", tmp_path / "out", "--flatten", "-j", "1") == 0
         assert run("report", tmp_path / "out") == 0

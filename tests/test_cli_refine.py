@@ -184,16 +184,20 @@ def test_kill_9_leaves_each_file_old_or_new(tmp_path):
     old = [b"old " * 99, b"older", b"oldest"]
     rng = np.random.default_rng()
     killed = 0
-    for _ in range(4):
+    for _ in range(12):
         for path, text in zip(files, old, strict=True):
             path.write_bytes(text)
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             # Most of the time goes by before anything is written.
             time.sleep(took * rng.uniform(0.6, 1.1))
             process.kill()
+        if process.returncode == 0:  # the machine is less busy than it was
+            took *= 0.9
         killed += process.returncode != 0
         now = [path.read_bytes() for path in files]
         assert all(text in pair for text, *pair in zip(now, old, new, strict=True))
         # The mesh comes last.
         assert now[0] == old[0] or now == new
+        if killed == 3:
+            break
     assert killed

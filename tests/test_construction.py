@@ -79,7 +79,9 @@ def test_any_polygon(seed, kind):
         check(problem, construct(problem))
 
 
-@pytest.mark.parametrize(("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), (6, 6)])
+@pytest.mark.parametrize(
+    ("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), pytest.param(6, 6, marks=pytest.mark.slow)]
+)
 def test_holes_and_pins_in_any_place(holes, pins):
     problem = with_holes(np.random.default_rng(holes), holes, pins)
     assert is_simple(problem)

@@ -256,6 +256,7 @@ class TestWorth:
             told, true = shrinking.energy(shrinking.of(open_at | graph.rim_vertices)), energy_of(V, F, cut)
             assert 0.4 * true < told < 2.5 * true + 0.2
 
+    @pytest.mark.slow
     def test_arms_are_reached(self):
         V, F = surfaces.starfish(5, 24)
         cut = find_cuts(V, F)
@@ -267,12 +268,14 @@ class TestWorth:
         assert length_of(V, cut) < 5 * 1.3
         assert energy_of(V, F, cut) < 0.1 * energy_of(V, F, find_cuts(V, F, gain=np.inf))
 
+    @pytest.mark.slow
     def test_more_gain_asked_for_makes_cuts_shorter(self):
         V, F = surfaces.starfish(5, 24)
         lengths = [length_of(V, find_cuts(V, F, gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]
 
+    @pytest.mark.slow
     def test_the_same_whatever_the_unit_the_place_and_the_view(self):
         V, F = surfaces.starfish(4, 16)
         V = jittered(V)

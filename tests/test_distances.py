@@ -443,6 +443,7 @@ def asked():
     return Settings(SymmetricDirichlet(), "distances", 1e-3, 100, "auto", None, 0)
 
 
+@pytest.mark.slow
 def test_a_coarse_mesh_serves_the_fine_one(folded, asked):
     plain = flatten(folded.V, folded.F)
     found = kept_by_coarse(folded, 16, asked, least=900)
@@ -465,6 +466,7 @@ def test_rings_too_few_for_any_coarser_mesh(folded, asked):
     assert kept_by_coarse(folded, 20, asked, least=len(folded.V)) is None
 
 
+@pytest.mark.slow
 def test_what_the_coarse_way_tells_and_records(folded, asked):
     steps = []
     found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record=1), least=900)
@@ -476,6 +478,7 @@ def test_what_the_coarse_way_tells_and_records(folded, asked):
     assert np.array_equal(last.uv, np.ldexp(found.uv, folded.exponent))
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_coarse_mesh_hands_back_a_map_of_the_surface(folded, asked):
     def stop(step):
         if step.iteration == 1:
@@ -501,7 +504,7 @@ def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh():
     assert given.stages[-1].name == "guarded descent, distances"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_hundred_thousand_triangles_take_about_as_long_as_without_distances():
     V, F = surfaces.grid(388, 388)
     V = np.column_stack([V, 0.3 * np.sin(7 * V[:, 0]) * np.cos(5 * V[:, 1])])
@@ -540,6 +543,7 @@ def test_flatten_ends_with_the_descent_of_distances():
     assert [kept.iteration for kept in result.path] == [*range(len(result.history))]
 
 
+@pytest.mark.slow
 def test_flatten_keeps_the_distances_of_each_piece(dome):
     V, F = dome
     both = np.concatenate([V, 0.5 * V + [5, 0, 0]]), np.concatenate([F, F + len(V)])

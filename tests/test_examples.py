@@ -380,7 +380,7 @@ def test_figure_21(example):
 
 
 def test_figure_23(example):
-    numbers = example("figure_23")
+    numbers = example("figure_23", size=20)
     for row in numbers.values():
         for name in ("ARAP", "springs", "areas"):
             assert row[name]["and V₃"]["flips"] == 0

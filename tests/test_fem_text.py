@@ -7,6 +7,7 @@ import lzma
 import struct
 import tracemalloc
 import zlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -224,7 +225,7 @@ header_type="{"UInt32" if word == "u4" else "UInt64"}"{compressor}>
     return (text + tail).encode() + appended + b"</AppendedData></VTKFile>"
 
 
-ZLIB, LZMA = (zlib.compress, "vtkZLibDataCompressor"), (lzma.compress, "vtkLZMADataCompressor")
+ZLIB, LZMA = (zlib.compress, "vtkZLibDataCompressor"), (partial(lzma.compress, preset=0), "vtkLZMADataCompressor")
 
 
 @pytest.mark.parametrize(("order", "word"), [("<", "u4"), (">", "u8")])

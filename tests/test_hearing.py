@@ -169,6 +169,7 @@ def crossing():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seconds", [4, pytest.param(12, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     "run",
     [
@@ -178,6 +179,6 @@ def crossing():
     ],
     ids=["repair", "diagnosis", "distances"],
 )
-def test_every_half_second(run):
+def test_every_half_second(run, seconds):
     # No factorisation here takes long. Processor time, since the machine may be busy with other things.
-    assert longest(run, 12) < 0.5
+    assert longest(run, seconds) < 0.5

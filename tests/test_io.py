@@ -777,9 +777,6 @@ def test_kill_9_leaves_the_old_file_or_a_new_one(tmp_path):
     script = f"""
 import numpy as np
 from quasiharmonic.io import MeshData, write_map
-from shared.written import written
-from shared.datasets import write_problem
-from shared.solvable import star_problem
 F = np.arange(3 * 3000).reshape(-1, 3)
 mesh = MeshData(np.ones((9000, 3)), F)
 print("ready", flush=True)
@@ -790,7 +787,7 @@ for k in range(10**9):
     rng = np.random.default_rng()
     for _ in range(5):
         with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
-            process.stdout.readline()
+            assert process.stdout.readline() == b"ready\n"
             time.sleep(rng.uniform(0, 0.15))
             process.send_signal(signal.SIGKILL)
         mesh = io.read_mesh(path)

@@ -120,6 +120,7 @@ def test_an_obj_opens_with_its_picture(tmp_path, qhm):
     np.testing.assert_allclose(seen, there.vertices[:, :2], atol=1 / 32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])
 def test_a_glb_is_drawn_with_its_picture_by_another_library(suffix, tmp_path):
     """Colours that it finds at the vertices, and ours where these are drawn, are those of the picture."""
@@ -196,6 +197,7 @@ def test_a_picture_that_is_damaged_is_named(tmp_path):
     assert not (tmp_path / "out.png").exists()
 
 
+@pytest.mark.slow
 def test_a_picture_is_drawn_on_the_surface_alone(tmp_path, qhm):
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
     asked = "plot", tmp_path / "in.obj", "-o", tmp_path / "out.png", "--picture", gradient(tmp_path / "photo.png")

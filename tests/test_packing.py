@@ -151,6 +151,7 @@ def test_share_of_the_square():
         assert sum(areas_of(packed(uv, F, areas_of(uv, F), margin=0), F)) > least
 
 
+@pytest.mark.slow
 def test_a_thousand_islands():
     uv, F = rectangles(1000)
     began = time.process_time()

@@ -91,6 +91,7 @@ io.open = builtins.open = opens
 """
 
 
+@pytest.mark.slow
 def test_a_data_set_is_solved_on_a_system_without_what_is_unixs(tmp_path):
     """In an encoding that has few signs, too, and names that it does not have."""
     (tmp_path / "elsewhere").mkdir()

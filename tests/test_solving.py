@@ -418,6 +418,7 @@ class TestLinearSolver:
         monkeypatch.setattr(solver, "factor", fail_twice, raising=False)
         assert solve(problem).injective
 
+    @pytest.mark.slow
     def test_indefinite_for_good_is_a_status(self, monkeypatch):
         problem = Problem(*turned_ring(180))
         solver = problem.domain.laplacian("superlu").solver

@@ -390,9 +390,12 @@ def test_what_is_no_curve_is_refused(loop, outline, options, message):
 
 
 FONTS = "DejaVuSans-Bold", "DejaVuSerif-Italic", "DejaVuSansMono", "cmr10", "STIXGeneral"
+LARGE_FONTS = FONTS[:3]
 
 
-@pytest.mark.parametrize("font", FONTS)
+@pytest.mark.parametrize(
+    "font", [pytest.param(font, marks=[pytest.mark.slow] if font in LARGE_FONTS else []) for font in FONTS]
+)
 def test_glyphs_are_those_of_freetype_to_the_last_bit(font):
     """Letters, ligatures, accents put on letters, Greek, Cyrillic, signs: read here, and by way of matplotlib."""
     from matplotlib import get_data_path

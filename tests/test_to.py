@@ -258,7 +258,7 @@ def test_too_few_vertices_for_the_shape_are_refused():
     V, F = surfaces.disk(3)
     with pytest.raises(ValueError, match=r"the boundary is no outline itself: boundary loop 0 meets itself.*too few"):
         boundary_to(V, F, spiral)
-    V, F = surfaces.disk(40)
+    V, F = surfaces.disk(20)
     fixed, target = boundary_to(V, F, spiral)
     assert injective_map(V, F, fixed, target).certificate.bijective
 
@@ -706,6 +706,7 @@ def test_to_a_word(qhm):
     assert qhm(surfaces.cat(20), "--to", "word:QH")[0] == 0
 
 
+@pytest.mark.slow
 def test_refusal_and_refinement(qhm):
     V, F = surfaces.disk(2)
     ring = np.arange(len(V) - 12, len(V))
