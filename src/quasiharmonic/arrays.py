@@ -48,7 +48,8 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
         raise ValueError(f"{name} must hold real numbers, not {_held(values, array)}")
     if array.dtype == np.float64:
         return np.array(array, order="C")
-    with np.errstate(over="ignore"):
+    # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=np.float64, order="C")
 
 

@@ -189,6 +189,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
     import numpy as np
 
     from quasiharmonic import io
+    from quasiharmonic.arrays import real_array
 
     try:
         array = np.load(path, allow_pickle=False)
@@ -204,7 +205,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
             f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {held.size}, 2) for fixed vertices "
             f"only, not {array.dtype} {array.shape}"
         )
-    return np.asarray(array if array.shape[1] == held.size else array[:, held], dtype=np.float64)
+    return real_array(f"{path}: its array", array if array.shape[1] == held.size else array[:, held])
 
 
 def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[bool, list[str]]:
