@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from quasiharmonic.cli.streams import tell
+
 if TYPE_CHECKING:
     from quasiharmonic.batch import Progress
     from quasiharmonic.cli.arguments import Commands
@@ -149,10 +151,7 @@ def run(options: argparse.Namespace) -> int:
         )
     except KeyboardInterrupt:
         show.clear()
-        print(
-            f"qhm batch: interrupted; what was finished is kept in {options.output}, and the same command goes on",
-            file=sys.stderr,
-        )
+        tell(f"qhm batch: interrupted; what was finished is kept in {options.output}, and the same command goes on")
         return 2
     finally:
         show.clear()
@@ -197,7 +196,7 @@ class _Display:
             sys.stderr.write("\r\x1b[K" + text[: shutil.get_terminal_size().columns - 1])
             sys.stderr.flush()
         else:
-            print(text, file=sys.stderr, flush=True)
+            tell(text)
 
     def clear(self) -> None:
         """Take the line away."""

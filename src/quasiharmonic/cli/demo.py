@@ -47,5 +47,5 @@ def run(options: argparse.Namespace) -> int:
         map.draw(folder / "demo.png", judged, [problem], mapped)
         facts = {**mapped.to_dict(), **judged.to_dict(), **report.sizes(problem.domain)}
         report.emit(facts, str(folder / "demo.json"), report.of_maps(mapped, judged, folder / "demo.obj"))
-        print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}")
+        print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if judged.injective else 1
