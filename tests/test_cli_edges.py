@@ -184,6 +184,47 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         assert not any(word in str(raised.value) for word in REPRESENTATIONS)
 
 
+# --- options without effect ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "needs"),
+    [
+        ("map m.obj -o o.obj --plot-kind map", "--plot"),
+        ("map m.obj -o o.obj --margin 0.1", "--pack"),
+        ("map m.obj -o o.obj --font x", "--to"),
+        ("map m.obj -o o.obj --to disk --font x", "only for letter: and word:"),
+        ("map m.obj -o o.obj --corner-angle 9", "--to"),
+        ("map m.obj -o o.obj --corners auto", "--to"),
+        ("map m.obj -o o.obj --cut", "--to"),
+        ("map m.obj -o o.obj --to disk --pieces m.obj", "--slide"),
+        ("flatten m.obj -o o.obj --rings 3", "--energy distances"),
+        ("flatten m.obj -o o.obj --unit cm", "--pattern"),
+        ("flatten m.obj -o o.obj --allowance 1", "--pattern"),
+        ("polish m.obj -o o.obj --margin 0.1", "--pack"),
+        ("polish m.obj -o o.obj --to disk", "--slide"),
+        ("harmonise m.obj -o o.obj --margin 0.1", "--pack"),
+        ("animate m.obj m.obj -o o --limit 2", "--polish"),
+        ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second belongs to a moving picture"),
+        ("measure m.obj --rings 3", "--distances"),
+        ("plot m.obj -o o.png --measure mips", "--kind distortion"),
+        ("plot m.obj -o o.png --kind texture --measure isometric", "--kind distortion"),
+        ("plot m.obj -o o.png --kind map --picture p.png", "--kind map"),
+        ("check m.obj --plot o.png", "--boundary"),
+        ("check m.obj --boundary --as float64", "--as"),
+        ("check m.obj --boundary --any-triangulation", "--any-triangulation"),
+        ("batch . -o o --flatten --strategy speed", "--strategy"),
+        ("batch . -o o --to disk --energy mips", "flatten"),
+        ("batch . -o o --to disk --slide", "polish"),
+        ("batch . -o o --corners auto", "name one by to"),
+    ],
+)
+def test_an_option_without_effect_is_refused(folder, capsys, call, needs):
+    assert run(*call.split()) == 2
+    assert needs in capsys.readouterr().err
+    assert left(folder) == ["m.obj"]
+
+
 # --- closed streams ---------------------------------------------------------------------------------------------------
 
 

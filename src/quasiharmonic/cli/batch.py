@@ -120,6 +120,10 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import batch
     from quasiharmonic.cli import report
 
+    if options.flatten and options.strategy is not None:
+        raise ValueError(
+            "--strategy is of maps onto a given boundary, and --flatten sets it free: leave one of them out"
+        )
     settings = batch.Settings(
         to=options.to,
         flatten=options.flatten,
@@ -127,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
         cut=options.cut,
         corners=options.corners,
         refine=options.refine,
-        strategy=options.strategy,
+        strategy=options.strategy or "speed",
         polish=options.polish,
         slide=options.slide,
         reference=options.reference,
