@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 
-from quasiharmonic import io
+from quasiharmonic import io, repair
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.surfaces import cat
+from quasiharmonic.surfaces import cat, disk
+from shared.damaged import VALID
+from shared.gltf_files import SQUARE, square
 
 HEAD = b"ply\nformat ascii 1.0\ncomment made by hand\n"
 MIXED = (
@@ -22,8 +26,6 @@ MIXED = (
 
 def swapped(data):
     """A text file of ours as big-endian bytes."""
-    import struct
-
     body = data.split(b"end_header\n")[1].splitlines()
     rows = [line.split() for line in body]
     out = data.split(b"end_header\n")[0].replace(b"ascii", b"binary_big_endian") + b"end_header\n"
@@ -185,3 +187,47 @@ def test_bad_stl(data, tmp_path):
     path.write_bytes(data)
     with pytest.raises(MeshFileError, match=r"bad\.stl"):
         io.read_mesh(path)
+
+
+def with_floats(data):
+    """A PLY file with places and colours of vertices, and places of corners, all of them floats."""
+    F = np.array([[0, 1, 2], [0, 2, 3]], dtype="<i4")
+    names = ["x", "y", "z", "s", "t", "red", "green", "blue"]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 4", *(f"property float {n}" for n in names)]
+    header += ["element face 2", "property list uchar int vertex_indices", "property list uchar float texcoord"]
+    text = "\n".join([*header, "end_header\n"]).encode()
+    faces = b"".join(b"\3" + corners.tobytes() + b"\6" + data[corners, :2].tobytes() for corners in F)
+    return text + np.hstack([data, data[:, :2], data]).tobytes() + faces
+
+
+@pytest.mark.parametrize(
+    ("name", "order", "data"),
+    [
+        ("a.ply", "<", VALID["binary.ply"]),
+        ("b.ply", ">", swapped(MIXED)),
+        ("c.ply", "<", with_floats(SQUARE)),
+        ("d.stl", "<", VALID["binary.stl"]),
+        ("e.glb", "<", square(TEXCOORD_0=SQUARE[:, :2]).glb()),
+    ],
+)
+def test_a_signalling_nan_is_an_error_and_no_warning(name, order, data, tmp_path):
+    """Wherever it stands in a binary file."""
+    number, not_finite = struct.pack(f"{order}I", 0x7FA00001), 0
+    for at in range(max(0, len(data) - 160), len(data) - 3):
+        (tmp_path / name).write_bytes(data[:at] + number + data[at + 4 :])
+        try:
+            io.read_mesh(tmp_path / name)
+        except MeshFileError as error:
+            not_finite += "not finite" in str(error)
+    assert not_finite
+
+
+@pytest.mark.parametrize(("kind", "bits"), [("f4", 0x7FA00001), ("f8", 0x7FF4000000000001)])
+def test_a_signalling_nan_in_an_array_is_an_error_and_no_warning(kind, bits):
+    V, F = disk(3)
+    odd = V.astype(kind)
+    odd.view(f"u{kind[1]}")[0, 0] = bits
+    with pytest.raises(ValueError, match="not finite at vertex 0"):
+        repair(odd, F, V)
+    # A place that is no number is one to be found.
+    assert np.isfinite(repair(V, F, odd).uv).all()

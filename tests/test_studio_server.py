@@ -7,10 +7,13 @@ import contextlib
 import http.client
 import os
 import signal
+import socket
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 pytest.importorskip("websockets", reason="the extra studio is not installed")
@@ -20,6 +23,7 @@ from websockets.sync.client import connect
 
 from quasiharmonic.cli import main
 from quasiharmonic.studio import server as served
+from quasiharmonic.studio import worker
 from quasiharmonic.studio.assets import assets, bundle
 from quasiharmonic.studio.protocol import decode, encode
 from quasiharmonic.surfaces import cat
@@ -242,3 +246,206 @@ def test_a_file_that_is_no_mesh_is_refused_before_anything_is_served(tmp_path, c
     (tmp_path / "a.obj").write_text("v 0 0 0\nf 1 2 3\n")
     assert main(["studio", str(tmp_path / "a.obj"), "--no-browser"]) == 2
     assert "a.obj" in capsys.readouterr().err
+
+
+# --- many pages at once, and messages without end --------------------------------------------------------------------
+
+
+class Stuck:
+    """A page whose process starts late, takes no message, and ends when it is asked to."""
+
+    started = 0
+    begins: asyncio.Event
+    ends: asyncio.Event
+
+    @classmethod
+    async def start(cls, source, tell):
+        cls.started += 1
+        await cls.begins.wait()
+        return cls()
+
+    async def send(self, message, *, stops=False):
+        await asyncio.Event().wait()
+
+    async def run(self):
+        await self.ends.wait()
+        return "it has ended"
+
+    def end(self):
+        self.ends.set()
+
+    async def ended(self):
+        pass
+
+
+@pytest.fixture
+def stuck(monkeypatch):
+    monkeypatch.setattr(served, "Page", Stuck)
+    monkeypatch.setattr(served, "MOST_BYTES", 32 << 20)
+    Stuck.started, Stuck.begins, Stuck.ends = 0, asyncio.Event(), asyncio.Event()
+    with Running("") as server:
+        yield server
+        for event in (Stuck.begins, Stuck.ends):
+            server.loop.call_soon_threadsafe(event.set)
+
+
+def first_word(page):
+    """What a page receives first: a greeting, or why it is closed."""
+    try:
+        return decode(page.recv(timeout=10)).header["kind"]
+    except ConnectionClosed as closed:
+        return closed.rcvd.code
+
+
+def test_pages_opened_at_once_are_no_more_than_pages_opened_one_by_one(stuck):
+    with contextlib.ExitStack() as opened, ThreadPoolExecutor(20) as threads:
+        pages = [opened.enter_context(page) for page in threads.map(lambda _: stuck.page(), range(20))]
+        words = list(threads.map(first_word, pages))
+        assert words.count("hello") == served.MOST_PAGES
+        assert words.count(served.TRY_LATER) == 20 - served.MOST_PAGES
+        assert Stuck.started == served.MOST_PAGES
+        for event in (Stuck.begins, Stuck.ends):
+            stuck.loop.call_soon_threadsafe(event.set)
+        for page in pages:
+            with contextlib.suppress(ConnectionClosed):
+                hear(page, "never")
+    time.sleep(0.1)
+    with stuck.page() as page:
+        assert first_word(page) == "hello"
+
+
+def test_a_page_whose_process_cannot_be_started_gets_the_reason(running, monkeypatch, capfd):
+    def start(source, tell):
+        raise OSError(11, "no more processes")
+
+    monkeypatch.setattr(served.Page, "start", start)
+    with running.page() as page:
+        assert "no more processes" in hear(page, "note").header["text"]
+        assert first_word(page) == served.TRY_LATER
+    assert capfd.readouterr().err == ""
+
+
+def test_messages_that_nobody_takes_are_not_read(stuck):
+    """Two of them wait in the server, one or two more on the way to it; the page keeps the others."""
+    message = encode({"do": "load"}, {"content": np.zeros(16 << 20, dtype=np.uint8)})
+    sent = []
+
+    def flood(page):
+        with contextlib.suppress(ConnectionClosed):
+            for number in range(12):
+                page.send(message)
+                sent.append(number)
+
+    stuck.loop.call_soon_threadsafe(Stuck.begins.set)
+    with stuck.page() as page:
+        hear(page, "hello")
+        thread = threading.Thread(target=flood, args=(page,))
+        thread.start()
+        thread.join(1)
+        assert thread.is_alive()
+        assert len(sent) <= 4
+        page.socket.shutdown(socket.SHUT_RDWR)
+        thread.join(10)
+
+
+class Endless:
+    """A file of equal messages without an end."""
+
+    def __init__(self, message):
+        self.message, self.messages, self.head = message, 0, False
+
+    def read(self, count):
+        self.head = not self.head
+        if self.head:
+            return len(self.message).to_bytes(8, "little")
+        self.messages += 1
+        return self.message
+
+
+def test_a_process_reads_no_more_than_may_wait(monkeypatch):
+    monkeypatch.setattr(worker, "MOST_WAITING", 1 << 20)
+    source = Endless(encode({"do": "load"}, {"content": np.zeros(1 << 18, dtype=np.uint8)}))
+    inbox = worker.Inbox(source)
+    for taken in range(1, 20):
+        inbox.take()
+        time.sleep(0.002)
+        # Three wait, and the next is at hand.
+        assert source.messages <= taken + 4
+    assert inbox.waiting()
+
+
+# --- malformed requests ----------------------------------------------------------------------------------------------
+
+UPGRADE = (
+    b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+)
+SOCKET = b"GET /TOKEN/socket HTTP/1.1\r\nHOSTORIGIN" + UPGRADE + b"\r\n"
+# HOST, ORIGIN and TOKEN stand for what the server's own page sends; an answer of None is a connection that is closed.
+MALFORMED = {
+    "brackets": (b"GET //[x HTTP/1.1\r\nHOST\r\n", 403),
+    "brackets around the token": (b"GET //[TOKEN/ HTTP/1.1\r\nHOST\r\n", 403),
+    "a bracket behind the token": (b"GET /TOKEN/[ HTTP/1.1\r\nHOST\r\n", 404),
+    "an address": (b"GET http://[x/ HTTP/1.1\r\nHOST\r\n", 400),
+    "a star": (b"GET * HTTP/1.1\r\nHOST\r\n", 400),
+    "an empty path": (b"GET  HTTP/1.1\r\nHOST\r\n", 400),
+    "NUL": (b"GET /TOKEN/\0 HTTP/1.1\r\nHOST\r\n", 404),
+    "NUL for a token": (b"GET /\0/ HTTP/1.1\r\nHOST\r\n", 403),
+    "percent": (b"GET /TOKEN/%zz%00%ff HTTP/1.1\r\nHOST\r\n", 404),
+    "a long path": (b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\nHOST\r\n", (414, None)),
+    "a long header": (b"GET / HTTP/1.1\r\nHOSTX: " + b"a" * 100_000 + b"\r\n\r\n", (431, None)),
+    "many headers": (b"GET / HTTP/1.1\r\nHOST" + b"X: a\r\n" * 2000 + b"\r\n", (431, None)),
+    "no host": (b"GET / HTTP/1.1\r\n\r\n", 421),
+    "two hosts": (b"GET / HTTP/1.1\r\nHOSTHOST\r\n", 421),
+    "a host in UTF-8": (b"GET / HTTP/1.1\r\nHost: \xc3\xa9\r\n\r\n", 421),
+    "a header in UTF-8": (b"GET / HTTP/1.1\r\nHOSTX: \xc3\xa9\r\n\r\n", 403),
+    "POST": (b"POST /TOKEN/ HTTP/1.1\r\nHOST\r\n", (405, None)),
+    "PUT for a socket": (SOCKET.replace(b"GET", b"PUT"), (405, None)),
+    "no upgrade": (b"GET /TOKEN/socket HTTP/1.1\r\nHOSTORIGIN\r\n", 426),
+    "a key in UTF-8": (SOCKET.replace(b"dGh", b"\xff\xff\xff"), 400),
+    "a short key": (SOCKET.replace(b"dGhl", b""), 400),
+    "another version": (SOCKET.replace(b": 13", b": 99"), 400),
+    "an origin in UTF-8": (SOCKET.replace(b"ORIGIN", b"Origin: \xc3\xa9\r\n"), 403),
+    "a path in UTF-8": (b"GET /\xc3\xa9 HTTP/1.1\r\nHOST\r\n", (400, None)),
+    "a host with NUL": (b"GET / HTTP/1.1\r\nHost: \0\r\n\r\n", None),
+    "no header": (b"GET / HTTP/1.1\r\nHOSTnonsense\r\n\r\n", None),
+    "a body": (b"GET /TOKEN/ HTTP/1.1\r\nHOSTContent-Length: 3\r\n\r\nabc", None),
+    "HTTP/2": (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", None),
+    "TLS": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", None),
+    "half a line": (b"GET / HT", None),
+    "nothing": (b"", None),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_a_malformed_request_gets_an_error_and_the_terminal_stays_silent(running, capfd, name):
+    request, expected = MALFORMED[name]
+    port = running.studio.port
+    request = request.replace(b"HOST", b"Host: 127.0.0.1:%d\r\n" % port).replace(
+        b"TOKEN", running.studio.token.encode()
+    )
+    request = request.replace(b"ORIGIN", b"Origin: http://127.0.0.1:%d\r\n" % port)
+    answer = b""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as raw, contextlib.suppress(ConnectionError):
+        # The server may close the connection before it has read all of a request.
+        raw.sendall(request)
+        if not request.endswith(b"\n"):
+            raw.shutdown(socket.SHUT_WR)
+        while part := raw.recv(1 << 16):
+            answer += part
+    status = int(answer.split()[1]) if answer else None
+    assert status in (expected if isinstance(expected, tuple) else (expected,))
+    assert running.get(f"/{running.studio.token}/")[0] == 200
+    assert capfd.readouterr().err == ""
+
+
+def test_a_defect_of_the_server_is_logged(running, monkeypatch, caplog):
+    def broken():
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(served, "assets", broken)
+    assert running.get(f"/{running.studio.token}/")[0] == 500
+    until = time.monotonic() + 5
+    while "a defect" not in caplog.text and time.monotonic() < until:
+        time.sleep(0.01)
+    assert "a defect" in caplog.text

@@ -9,12 +9,15 @@ def main() -> int:
     try:
         from quasiharmonic.cli import main as run
 
-        return run()
+        status = run()
+    except SystemExit as end:
+        # A page of help, the version, or a wrong call.
+        status = end.code if isinstance(end.code, int) else 0
     except KeyboardInterrupt:
         import sys
 
         print("qhm: interrupted, nothing was written", file=sys.stderr)
-        return 2
+        status = 2
     finally:
         import signal
 
@@ -23,6 +26,9 @@ def main() -> int:
         # An interrupt that came out of an `exec`, as of a dataclass while it is loaded, counts as unhandled, and would
         # end the process by a signal in place of its status, until another one runs through.
         exec("")
+    from quasiharmonic.cli.streams import finish
+
+    return finish(status)
 
 
 if __name__ == "__main__":

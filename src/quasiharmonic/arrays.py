@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from numbers import Integral, Number, Real
-from os import PathLike
+from os import PathLike, fspath
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -51,7 +51,8 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
         raise ValueError(f"{name} must hold real numbers, not {_held(values, array)}")
     if array.dtype == np.float64:
         return np.array(array, order="C")
-    with np.errstate(over="ignore"):
+    # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=np.float64, order="C")
 
 
@@ -299,8 +300,11 @@ def _held(values: object, array: NDArray[Any]) -> str:
 
 def kind_of(value: object) -> str:
     """Name what was given, for messages: ``a Trimesh``, ``None``, ``'letter:R'``."""
-    if value is None or isinstance(value, str | bytes | Number | PathLike):
-        return repr(value) if len(repr(value)) <= 80 else f"{repr(value)[:77]}…"
+    if isinstance(value, PathLike):
+        value = fspath(value)
+    if value is None or isinstance(value, str | bytes | Number):
+        text = str(value) if isinstance(value, Number) else repr(value)
+        return text if len(text) <= 80 else f"{text[:77]}…"
     name = type(value).__name__
     return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
@@ -308,25 +312,25 @@ def kind_of(value: object) -> str:
 def whole_number(name: str, value: Any, *, least: int) -> None:
     """Raise a ValueError for what is not an integer of at least ``least``."""
     if not isinstance(value, Integral) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")
+        raise ValueError(f"{name} must be a whole number of at least {least}, not {kind_of(value)}")
 
 
 def true_or_false(name: str, value: Any) -> None:
     """Raise a ValueError for what is neither: a word that says no would count as yes."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False, not {value!r}")
+        raise ValueError(f"{name} must be True or False, not {kind_of(value)}")
 
 
 def not_negative(name: str, value: Any) -> None:
     """Raise a ValueError for what is not a finite number of at least zero."""
     if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
-        raise ValueError(f"{name} must be a finite number of at least 0, not {value!r}")
+        raise ValueError(f"{name} must be a finite number of at least 0, not {kind_of(value)}")
 
 
 def check_callback(callback: Any) -> None:
     """Raise a ValueError for what is neither callable nor None, before anything is computed that would call it."""
     if callback is not None and not callable(callback):
-        raise ValueError(f"callback must be callable, or None, not {callback!r}")
+        raise ValueError(f"callback must be callable, or None, not {kind_of(callback)}")
 
 
 def work(force: ComplexArray, displacement: ComplexArray) -> float:

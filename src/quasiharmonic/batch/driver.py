@@ -16,11 +16,12 @@ from typing import Any, get_args
 from quasiharmonic import __version__
 from quasiharmonic.arrays import check_callback
 from quasiharmonic.batch import records
+from quasiharmonic.batch.lock import FILE as LOCK
 from quasiharmonic.batch.lock import alone
 from quasiharmonic.batch.problems import MARKER, ProblemFiles, find_problems, small_together
 from quasiharmonic.batch.settings import Orders, Settings
 from quasiharmonic.batch.supervisor import ClosedError, Finished, Supervisor, resident
-from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.atomic import new_folder, write_whole
 from quasiharmonic.io.errors import OutputError
 
 # Seconds between two calls of a callback while nothing is finished.
@@ -149,8 +150,8 @@ def run(
     began = time.perf_counter()
     # Counted first and found once more while they are solved, so that no list of them is kept.
     progress = Progress(_count(source, settings, folder))
-    _make(folder)
-    with alone(folder):
+    _check_folder(folder)
+    with new_folder(folder, leftovers=frozenset({LOCK})), alone(folder):
         _prepare(folder, source, settings)
         orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
         todo = find_problems(source, plain=settings.plain)
@@ -257,13 +258,12 @@ def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> 
     return count
 
 
-def _make(folder: Path) -> None:
-    """Make the run's folder, unless it is one already."""
+def _check_folder(folder: Path) -> None:
+    """Refuse what stands where the run's folder is to be, if it is no such folder."""
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise OutputError(f"cannot write to {folder}: it is no folder")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         tables = [name for name in records.TABLES if (folder / name).exists()]
-    except FileExistsError as error:
-        raise OutputError(f"cannot write to {folder}: it is no folder") from error
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     if tables and not (folder / MARKER).exists():

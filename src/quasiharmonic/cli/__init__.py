@@ -2,21 +2,21 @@
 
 Exit status 0: what was asked for holds, and a written file is certified injective. 1: a map was written
 or judged that is not injective. 2: the input or the call is wrong, and nothing was written. 3: a map was
-written, but what should be told about it could not be, the verdict perhaps included.
+written, but what should be told about it could not be, the verdict perhaps included. 141: nothing was to be written,
+and nobody reads standard output any more.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from importlib import import_module
 from io import TextIOWrapper
 
 from quasiharmonic.cli.interrupts import Interrupts
-from quasiharmonic.cli.report import ReportError
+from quasiharmonic.cli.report import ReportError, in_words
+from quasiharmonic.cli.streams import NO_READER, tell
 from quasiharmonic.cli.version import Version
 
 # The modules of the subcommands by their names, in the order of the help.
@@ -42,6 +42,9 @@ COMMANDS = {
 }
 
 
+_INTERRUPTED = "interrupted, nothing was written"
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``qhm`` and return its exit status.
 
@@ -57,34 +60,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     with Interrupts() as interrupts:
         words = sys.argv[1:] if argv is None else list(argv)
         # Those of other commands would have to be imported and declared for nothing.
-        options = parser_of([words[0]] if words and words[0] in COMMANDS else COMMANDS).parse_args(words)
+        parser = parser_of([words[0]] if words and words[0] in COMMANDS else COMMANDS)
+        try:
+            options = parser.parse_args(words)
+        except OSError as error:
+            # Of the version, which is printed meanwhile.
+            return _fail("--version", error, 2)
         run: Callable[[argparse.Namespace], int] = options.run
         try:
             return run(options)
         except ReportError as error:
-            return _fail(options.command, str(error), 3)
+            return _fail(options.command, error, 3)
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
             # Wrong input of any kind: the library's messages name the elements and what to do.
-            return _fail(options.command, str(error), 2)
+            return _fail(options.command, error, 2)
         except KeyboardInterrupt:
-            return _fail(options.command, "interrupted, nothing was written", 2)
+            return _fail(options.command, _INTERRUPTED, 2)
         except Exception as error:
             if interrupts.happened:
-                return _fail(options.command, "interrupted, nothing was written", 2)
+                return _fail(options.command, _INTERRUPTED, 2)
             if isinstance(error, ImportError):
-                return _fail(options.command, str(error), 2)
+                return _fail(options.command, error, 2)
             raise
 
 
-def _fail(command: str, message: str, status: int) -> int:
-    with suppress(OSError):
-        print(f"qhm {command}: {message}", file=sys.stderr)
-    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
-        try:
-            stream.flush()
-        except (OSError, AttributeError):
-            # Whoever read it has gone, or a disk is full: keep the interpreter from tripping over it again at its end.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+def _fail(command: str, why: str | Exception, status: int) -> int:
+    """Say why a command fails, unless it is that nobody listens; the exit status."""
+    if isinstance(why, BrokenPipeError):
+        return NO_READER
+    tell(f"qhm {command}: {why if isinstance(why, str) else in_words(why)}")
     return status
 
 

@@ -113,7 +113,10 @@ def run(options: argparse.Namespace) -> int:
         )
     if not animation.frames:
         raise KeyboardInterrupt
-    written = {folder: _write_frames(folder, mesh, animation) for folder in folders}
+    written: dict[Path, tuple[bool, list[str]]] = {}
+    for folder in folders:
+        with report.after_writing(folders[0]) if written else nullcontext():
+            written[folder] = _write_frames(folder, mesh, animation)
     for t, path in enumerate(drawn):
         # What could not be drawn is wrong output, unless something is written already.
         before = [*folders, *drawn[:t]]
@@ -189,6 +192,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
     import numpy as np
 
     from quasiharmonic import io
+    from quasiharmonic.arrays import real_array
 
     try:
         array = np.load(path, allow_pickle=False)
@@ -204,7 +208,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
             f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {held.size}, 2) for fixed vertices "
             f"only, not {array.dtype} {array.shape}"
         )
-    return np.asarray(array if array.shape[1] == held.size else array[:, held], dtype=np.float64)
+    return real_array(f"{path}: its array", array if array.shape[1] == held.size else array[:, held])
 
 
 def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[bool, list[str]]:
@@ -218,18 +222,20 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
         Frames in the folder that are of another run.
     """
     from quasiharmonic import io
-    from quasiharmonic.cli import judging
+    from quasiharmonic.cli import judging, report
 
     certified = True
-    folder.mkdir(parents=True, exist_ok=True)
     digits = max(4, len(str(len(animation.frames) - 1)))
-    written = set()
-    for t, frame in enumerate(animation.frames):
-        if frame.injective:
+    written: set[str] = set()
+    with io.new_folder(folder):
+        for t, frame in enumerate(animation.frames):
+            if not frame.injective:
+                continue
             path = folder / f"{t:0{digits}}.obj"
-            io.write_mapped(path, mesh.with_map(frame.uv))
-            written.add(path.name)
-            certified &= judging.judge(io.read_mesh(path)).injective
+            with report.after_writing(folder / min(written)) if written else nullcontext():
+                io.write_mapped(path, mesh.with_map(frame.uv))
+                written.add(path.name)
+                certified &= judging.judge(io.read_mesh(path)).injective
     others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
     return certified, sorted(others)
 

@@ -42,7 +42,6 @@ def add_strategy(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--strategy",
         choices=STRATEGIES,
-        default="speed",
         help="what finds a map soonest, or the paper's own pipeline, si-log first (default: speed)",
     )
 
@@ -65,7 +64,7 @@ def settle(options: argparse.Namespace, name: str, default: object, *, asked: bo
     options : argparse.Namespace
         Has None for what was not given. Changed.
     name : str
-        Of the option, without its dashes.
+        Of its value among the options.
     default : object
         What it is where it was not given.
     asked : bool
@@ -81,7 +80,8 @@ def settle(options: argparse.Namespace, name: str, default: object, *, asked: bo
     if getattr(options, name) is None:
         setattr(options, name, default)
     elif not asked:
-        raise ValueError(f"--{name} belongs to {belongs}, which was not asked for: add that, or leave --{name} out")
+        option = "--" + name.replace("_", "-")
+        raise ValueError(f"{option} belongs to {belongs}, which was not asked for: add that, or leave {option} out")
 
 
 def steps(text: str) -> int:

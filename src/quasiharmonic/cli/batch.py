@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from quasiharmonic.cli.streams import tell
+
 if TYPE_CHECKING:
     from quasiharmonic.batch import Progress
     from quasiharmonic.cli.arguments import Commands
@@ -118,6 +120,10 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import batch
     from quasiharmonic.cli import report
 
+    if options.flatten and options.strategy is not None:
+        raise ValueError(
+            "--strategy is of maps onto a given boundary, and --flatten sets it free: leave one of them out"
+        )
     settings = batch.Settings(
         to=options.to,
         flatten=options.flatten,
@@ -125,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
         cut=options.cut,
         corners=options.corners,
         refine=options.refine,
-        strategy=options.strategy,
+        strategy=options.strategy or "speed",
         polish=options.polish,
         slide=options.slide,
         reference=options.reference,
@@ -149,10 +155,7 @@ def run(options: argparse.Namespace) -> int:
         )
     except KeyboardInterrupt:
         show.clear()
-        print(
-            f"qhm batch: interrupted; what was finished is kept in {options.output}, and the same command goes on",
-            file=sys.stderr,
-        )
+        tell(f"qhm batch: interrupted; what was finished is kept in {options.output}, and the same command goes on")
         return 2
     finally:
         show.clear()
@@ -197,7 +200,7 @@ class _Display:
             sys.stderr.write("\r\x1b[K" + text[: shutil.get_terminal_size().columns - 1])
             sys.stderr.flush()
         else:
-            print(text, file=sys.stderr, flush=True)
+            tell(text)
 
     def clear(self) -> None:
         """Take the line away."""

@@ -27,7 +27,6 @@ def add_parser(commands: Commands) -> None:
         "--as",
         dest="precision",
         choices=("float64", "float32"),
-        default="float64",
         help="judge the positions as a reader in this precision sees them (default: float64)",
     )
     parser.add_argument(
@@ -54,18 +53,21 @@ def run(options: argparse.Namespace) -> int:
 
     report.check_json(options.json, inputs=(options.input,))
     if options.boundary:
+        if options.precision is not None or options.any_triangulation:
+            raise ValueError("--boundary judges no map: leave --as and --any-triangulation out")
         return boundary.run(options)
+    precision = options.precision or "float64"
     if options.plot is not None:
         raise ValueError("--plot draws what --boundary numbers: ask for that too, or for qhm plot")
     mesh = io.read_mesh(options.input)
-    judged = judging.judge(mesh, precision=options.precision)
+    judged = judging.judge(mesh, precision=precision)
     further = len(judged.V) - len(mesh.V)
     facts = {
         **judged.to_dict(),
         # Of the triangles as they lie, mirrored ones included.
         "injective": judged.certificate.injective,
         "input": str(options.input),
-        "precision": options.precision,
+        "precision": precision,
         "triangles": len(mesh.F),
         "further_places": further,
     }

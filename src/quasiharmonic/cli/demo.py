@@ -37,18 +37,15 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.problem import Problem
 
     folder: Path = options.output
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(f"cannot make the folder {folder}: {error.strerror}") from error
-    V, F = surfaces.cat()
-    (loop,) = boundary_loops(F, len(V))
-    problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
-    mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
-    judged = judging.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
+    with io.new_folder(folder):
+        V, F = surfaces.cat()
+        (loop,) = boundary_loops(F, len(V))
+        problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
+        mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
+        judged = judging.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(folder / "demo.obj"):
         map.draw(folder / "demo.png", judged, [problem], mapped)
         facts = {**mapped.to_dict(), **judged.to_dict(), **report.sizes(problem.domain)}
         report.emit(facts, str(folder / "demo.json"), report.of_maps(mapped, judged, folder / "demo.obj"))
-        print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}")
+        print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if judged.injective else 1

@@ -113,12 +113,11 @@ def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
 
 def tell_losses(output: Path, mesh: MeshData) -> None:
     """Say, before it is written, what a file will not have of a mesh."""
-    import sys
-
     from quasiharmonic import io
+    from quasiharmonic.cli.streams import tell
 
     if lost := io.not_held(output, mesh):
-        print(f"{output} will not have: {'; '.join(lost)}", file=sys.stderr, flush=True)
+        tell(f"{output} will not have: {'; '.join(lost)}")
 
 
 def write(output: Path, mesh: MeshData) -> Judged:

@@ -46,8 +46,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--plot-kind",
         choices=("map", "distortion"),
-        default="map",
-        help="draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂), with its histogram",
+        help="for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram",
     )
     seams.add_packing(parser)
     material.add_options(parser)
@@ -75,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.atlas.mapped import each_island
     from quasiharmonic.atlas.refined import written_over
-    from quasiharmonic.cli import judging, material, report, seams, sliding, targets
+    from quasiharmonic.cli import arguments, judging, material, report, seams, sliding, targets
     from quasiharmonic.result import Status
 
     began = time.perf_counter()
@@ -83,6 +82,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("--slide moves the boundary while distortion is lowered, which --no-polish forbids")
     sliding.check_options(options)
     seams.check_packing(options)
+    arguments.settle(options, "plot_kind", "map", asked=options.plot is not None, belongs="--plot")
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     if options.to is not None:
         # The handles of a folder say which vertices its own vt hold.
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
         one = targets.pose(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        chosen = options.strategy, options.polish, options.max_iterations, options.linear_solver
+        chosen = options.strategy or "speed", options.polish, options.max_iterations, options.linear_solver
         result = search(problem, *chosen, slide=one.slide if options.polish else False, refine=options.refine)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt

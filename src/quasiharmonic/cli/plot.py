@@ -33,9 +33,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--measure",
         choices=arguments.MEASURES,
-        default="isometric",
         metavar="NAME",
-        help="what --kind distortion shows: %(choices)s (default: %(default)s)",
+        help="what --kind distortion shows: %(choices)s (default: isometric)",
     )
     parser.add_argument(
         "--picture",
@@ -49,11 +48,13 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, draw."""
     from quasiharmonic import io
-    from quasiharmonic.cli import report
+    from quasiharmonic.cli import arguments, report
     from quasiharmonic.exact.certificate import flipped_triangles
     from quasiharmonic.plot import save_distortion_figure, save_map_figure, save_texture_figure
 
     report.check_picture("-o", options.output, inputs=(options.input, options.picture))
+    shows_measure = options.kind == "distortion"
+    arguments.settle(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
     if options.picture is not None and options.kind not in (None, "texture"):
         raise ValueError(f"--picture is drawn on the surface, which --kind {options.kind} does not: leave that out")
     V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))

@@ -60,7 +60,8 @@ def run(options: argparse.Namespace) -> int:
     with report.about(mesh_path):
         problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
         result = refine_problem(problem)
-    write(output, handles, origin, mesh, problem, result)
+    with io.no_remains(output, handles, origin):
+        write(output, handles, origin, mesh, problem, result)
     with report.after_writing(output):
         split = len(result.refined.parents)
         facts = {

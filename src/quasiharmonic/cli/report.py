@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.cli.streams import tell
+
 if TYPE_CHECKING:
     from quasiharmonic.atlas.mapped import MappedAtlas
     from quasiharmonic.cli.judging import Judged
@@ -45,7 +47,7 @@ def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
         if sys.stdout is None:
             raise OSError("standard output is closed")
         print(json.dumps(facts, allow_nan=False), flush=True)
-        print(text, file=sys.stderr, flush=True)
+        tell(text)
         return
     if destination is not None:
         from quasiharmonic.io import write_whole
@@ -166,6 +168,16 @@ def about(source: Path | str) -> Iterator[None]:
         raise ValueError(f"{source}: {error}{counting}") from error
 
 
+def in_words(error: Exception) -> str:
+    """The message of an error, an error of the system without its number."""
+    from quasiharmonic.io.errors import printable
+
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    named = isinstance(error.filename, str | bytes)
+    return f"{printable(error.filename)}: {error.strerror}" if named else error.strerror
+
+
 class ReportError(Exception):
     """The map is written, but what should be told about it could not be."""
 
@@ -176,6 +188,6 @@ def after_writing(output: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ArithmeticError, ImportError) as error:
-        raise ReportError(f"{output} is written, but the report failed: {error}") from error
+        raise ReportError(f"{output} is written, but the report failed: {in_words(error)}") from error
     except KeyboardInterrupt:
         raise ReportError(f"{output} is written; interrupted before the report") from None

@@ -15,6 +15,7 @@ from quasiharmonic.arrays import (
     IntArray,
     check_range,
     index_array,
+    kind_of,
     loop_arrays,
     named,
 )
@@ -72,7 +73,7 @@ class Rails:
         if isinstance(curves, Curve) or (isinstance(curves, np.ndarray) and curves.ndim == 2):
             curves = [curves]
         if not isinstance(curves, Iterable):
-            raise ValueError(f"curves must be a Curve, a polygon (k, 2) or a list of those, not {curves!r}")
+            raise ValueError(f"curves must be a Curve, a polygon (k, 2) or a list of those, not {kind_of(curves)}")
         self.curves = [curve if isinstance(curve, Curve) else Curve.polygon(curve) for curve in curves]
         if not self.curves:
             raise ValueError("there is no curve to slide along")
@@ -208,7 +209,7 @@ def rails_of(slide: bool | Rails, loops: Sequence[IntArray], uv: FloatArray) -> 
         return slide
     if slide is True:
         return Rails.around(loops, uv)
-    raise ValueError(f"slide must be True or Rails, not {slide!r}")
+    raise ValueError(f"slide must be True or Rails, not {kind_of(slide)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ def drawn(shown: Shown, kind: str, *, measure: str = "isometric") -> Figure:
             return _certificate(shown)
         case Diagnosis():
             return _diagnosis(shown)
-    raise TypeError(f"nothing is known to draw of {shown!r}")
+    raise TypeError(f"nothing is known to draw of a {type(shown).__name__}")
 
 
 def _result(result: MapResult, kind: str, measure: str) -> Figure:

@@ -9,7 +9,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import FloatArray, IntArray, check_callback, map_array, named, not_negative, whole_number
+from quasiharmonic.arrays import (
+    FloatArray,
+    IntArray,
+    check_callback,
+    kind_of,
+    map_array,
+    named,
+    not_negative,
+    whole_number,
+)
 from quasiharmonic.curves.rails import Rails
 from quasiharmonic.energy.approach import descend
 from quasiharmonic.energy.deformation import DeformationEnergy, positive_weights, signed_areas
@@ -263,7 +272,7 @@ def energy_named(energy: str | Energy) -> Energy:
             raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}")
         return ENERGIES[energy]
     if not isinstance(energy, Energy):
-        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}")
+        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {kind_of(energy)}")
     if not energy.barrier:
         raise ValueError(
             f"{type(energy).__name__} is no barrier: it would let the first triangles collapse and stop there; "

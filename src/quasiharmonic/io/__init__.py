@@ -8,7 +8,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.io.atomic import check_writable, new_folder, no_remains, write_whole
 from quasiharmonic.io.errors import MeshFileError, OutputError
 from quasiharmonic.io.gltfmesh import read_gltf
 from quasiharmonic.io.gltfwrite import write_gltf
@@ -44,6 +44,8 @@ __all__ = [
     "cut_at_seams",
     "map_of",
     "mapped",
+    "new_folder",
+    "no_remains",
     "not_held",
     "problem_arrays",
     "problem_files",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.errors import OutputError, printable
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
@@ -48,7 +48,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     except OutputError:
         raise
     except (OSError, ValueError) as error:
-        raise OutputError(f"cannot write {path!r}: {_reason(error)}") from error
+        raise OutputError(f"cannot write {printable(path)}: {_reason(error)}") from error
     return target
 
 
@@ -97,6 +97,60 @@ def write_whole(
             part.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise OutputError(f"cannot write {path}: {_reason(error)}") from error
+        raise
+
+
+@contextlib.contextmanager
+def new_folder(path: str | os.PathLike[str], *, leftovers: frozenset[str] = frozenset()) -> Iterator[None]:
+    """Make a folder with those above it that are missing; remove what was made if the block fails and leaves it empty.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The folder, which may be there already.
+    leftovers : frozenset of str
+        Names of files that count as nothing.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be made.
+    """
+    folder = Path(os.path.abspath(path))
+    missing = [place for place in (folder, *folder.parents) if not os.path.lexists(place)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        _remove_empty(missing)
+        raise OutputError(f"cannot make the folder {printable(path)}: {_reason(error)}") from error
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            if missing and {entry.name for entry in folder.iterdir()} <= leftovers:
+                for name in leftovers:
+                    (folder / name).unlink(missing_ok=True)
+        _remove_empty(missing)
+        raise
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders, the innermost first, up to the first one that cannot be removed."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
+
+
+@contextlib.contextmanager
+def no_remains(*paths: Path) -> Iterator[None]:
+    """Remove those of some files that are new, if the block fails."""
+    new = [path for path in paths if not os.path.lexists(path)]
+    try:
+        yield
+    except BaseException:
+        for path in new:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
         raise
 
 

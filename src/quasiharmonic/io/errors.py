@@ -8,6 +8,12 @@ import os
 _MOST = 300
 
 
+def printable(path: str | bytes | os.PathLike[str]) -> str:
+    """A file name as messages show it: what no terminal can show is escaped."""
+    text = os.fsdecode(path)
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in text)
+
+
 class MeshFileError(ValueError):
     """A file that cannot be read as what it should be; the message says where, why and what to do.
 
@@ -36,9 +42,9 @@ class MeshFileError(ValueError):
     def __str__(self) -> str:
         at = "" if self.line is None else f" at line {self.line}"
         then = f"; {self.remedy}" if self.remedy else ""
-        text = f"{os.fspath(self.path)}: {self.what}{at}{then}"
-        # A file name that is not valid Unicode must not make the message unprintable.
-        return text.encode("utf-8", "backslashreplace").decode()
+        text = f"{self.what}{at}{then}"
+        # What is not valid Unicode must not make the message unprintable.
+        return f"{printable(self.path)}: {text.encode('utf-8', 'backslashreplace').decode()}"
 
 
 class OutputError(OSError):

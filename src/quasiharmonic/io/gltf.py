@@ -16,7 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, printable
 from quasiharmonic.io.textual import read_bytes
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -176,7 +176,7 @@ def load(path: str | os.PathLike[str]) -> Document:
         version = str(tree["asset"]["version"])
         _check_lists(tree)
     except (*DAMAGE, RecursionError) as error:
-        raise MeshFileError(path, f"is no glTF file: {error}") from error
+        raise MeshFileError(path, f"is no glTF file: {fault(error)}") from error
     if not version.startswith("2."):
         raise MeshFileError(path, f"is glTF {version[:20]}", remedy="save it as glTF 2.0")
     packed = [name for name in _PACKED if f'"{name}"' in json.dumps(tree.get("extensionsUsed", []))]
@@ -185,9 +185,26 @@ def load(path: str | os.PathLike[str]) -> Document:
     try:
         buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
         views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
+    except MeshFileError:
+        # Of a file that this one refers to.
+        raise
     except DAMAGE as error:
-        raise MeshFileError(path, f"is damaged: {error!r}") from error
+        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
     return Document(tree, views)
+
+
+def fault(error: Exception) -> str:
+    """What is wrong with a document, from the error that it led to."""
+    match error:
+        case ValueError():
+            return str(error)
+        case KeyError():
+            return f"an entry lacks {printable(str(error.args[0]))[:80]}"
+        case IndexError():
+            return "an entry refers to another that is not there"
+        case RecursionError():
+            return "its entries are nested too deeply"
+    return "an entry is not of the kind that it should be"
 
 
 def picture_type(data: bytes) -> str | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.gltf import DAMAGE, Document, load, whole
+from quasiharmonic.io.gltf import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.meshdata import Carried, MeshData
 from quasiharmonic.io.normals import normal_lines
 from quasiharmonic.io.welding import welded
@@ -115,8 +115,7 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
         with np.errstate(over="ignore", invalid="ignore"):
             mesh = _mesh(document, os.fspath(path))
     except (*DAMAGE, RecursionError) as error:
-        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
-        raise MeshFileError(path, f"is damaged: {text}") from error
+        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
     if mesh is None:
         raise MeshFileError(path, "holds no triangles", remedy="a surface is needed")
     return mesh

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.atomic import write_whole
-from quasiharmonic.io.materials import with_libraries, write_material
+from quasiharmonic.io.atomic import no_remains, write_whole
+from quasiharmonic.io.materials import companions, with_libraries, write_material
 from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
 from quasiharmonic.io.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.textual import integer_table, number_table, read_text
@@ -86,11 +86,13 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
     OutputError
         When it cannot be written; the old file is then untouched.
     """
-    if mesh.texture is not None:
-        mesh = write_material(path, mesh, durable=durable)
-    mesh = with_libraries(path, mesh)
-    pieces = (piece.replace(b"\n", mesh.newline) for piece in _pieces(mesh))
-    write_whole(path, lambda file: file.writelines(pieces), durable=durable)
+    beside = () if mesh.texture is None else companions(path, mesh.texture)
+    with no_remains(*beside):
+        if mesh.texture is not None:
+            mesh = write_material(path, mesh, durable=durable)
+        mesh = with_libraries(path, mesh)
+        pieces = (piece.replace(b"\n", mesh.newline) for piece in _pieces(mesh))
+        write_whole(path, lambda file: file.writelines(pieces), durable=durable)
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:

@@ -79,7 +79,9 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
     """
     data = read_bytes(path)
     try:
-        return _mesh(decoded(data), os.fspath(path))
+        # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+        with np.errstate(invalid="ignore"):
+            return _mesh(decoded(data), os.fspath(path))
     except ValueError as error:
         raise MeshFileError(path, str(error), remedy="" if data else "it is empty") from error
 

@@ -63,7 +63,9 @@ def _binary(data: bytes) -> FloatArray | None:
     count = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     if len(data) < _HEADER or len(data) != _HEADER + count * _FACET.itemsize:
         return None
-    return np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64)
+    # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+    with np.errstate(invalid="ignore"):
+        return np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64)
 
 
 def _text(data: bytes) -> FloatArray | None:

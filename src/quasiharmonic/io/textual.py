@@ -50,7 +50,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     except MeshFileError:
         raise
     except ValueError as error:
-        raise MeshFileError(ascii(path), f"is not a file name: {error}") from error
+        raise MeshFileError(path, f"is not a file name: {error}") from error
 
 
 def read_text(path: str | os.PathLike[str]) -> bytes:

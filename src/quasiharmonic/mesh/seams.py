@@ -118,7 +118,8 @@ class SeamedMesh:
             place: IntArray = np.arange(int(self.FT.max(initial=-1)) + 1)
         else:
             # Equal numbers are one place, those that are none included.
-            pairs = np.ascontiguousarray(self.uv + 0.0).view(np.complex128).ravel()
+            with np.errstate(invalid="ignore"):  # a signalling NaN
+                pairs = np.ascontiguousarray(self.uv + 0.0).view(np.complex128).ravel()
             place = np.unique(pairs, return_inverse=True)[1].ravel()
         corners = self.F[self.mapped] * max(len(place), 1) + place[self.FT[self.mapped]]
         return np.unique(corners, return_inverse=True)[1].reshape(-1, 3)

@@ -15,6 +15,7 @@ from quasiharmonic.arrays import (
     IntArray,
     check_callback,
     check_choice,
+    kind_of,
     map_array,
     named,
     not_negative,
@@ -273,7 +274,7 @@ def _energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
     if energy is None or isinstance(energy, Energy):
         return energy
     if energy not in ENERGIES:
-        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {energy!r}")
+        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {kind_of(energy)}")
     return ENERGIES[energy](domain.V, domain.F)
 
 

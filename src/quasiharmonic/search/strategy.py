@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import takewhile
 
+from quasiharmonic.arrays import kind_of
 from quasiharmonic.descent import (
     Alternating,
     Combing,
@@ -128,7 +129,9 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
     given = list(strategy) if isinstance(strategy, Sequence) else []
     stages = [stage for stage in given if isinstance(stage, SearchStage)]
     if not stages or len(stages) < len(given):
-        raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+        raise ValueError(
+            f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {kind_of(strategy)}"
+        )
     return stages
 
 

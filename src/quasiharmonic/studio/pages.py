@@ -16,6 +16,8 @@ MOST_MEMORY = 6 << 30
 # Seconds between two looks at that, and those that a process may be deaf to "stop".
 _LOOK = 0.5
 _DEAF = 15.0
+# Bytes that are handed to a process at a time; no second copy of a large message is made.
+_PIECE = 1 << 18
 
 
 class Page:
@@ -55,8 +57,10 @@ class Page:
         if stops and self._stop_asked is None:
             self._stop_asked = asyncio.get_running_loop().time()
         with suppress(ConnectionError, RuntimeError):
-            self._process.stdin.write(len(message).to_bytes(8, "little") + message)
-            await self._process.stdin.drain()
+            self._process.stdin.write(len(message).to_bytes(8, "little"))
+            for start in range(0, len(message), _PIECE):
+                self._process.stdin.write(message[start : start + _PIECE])
+                await self._process.stdin.drain()
 
     async def run(self) -> str:
         """Carry on what the process tells until it ends; why it has."""

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import logging
 import secrets
 from collections.abc import Callable
 from http import HTTPStatus
-from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.http11 import Request, Response
 
 from quasiharmonic.studio.assets import assets
@@ -55,6 +55,7 @@ class Studio:
         self.token = secrets.token_urlsafe(24) if token is None else token
         self.port = 0
         self._pages: set[Page] = set()
+        self._open = 0
 
     @property
     def address(self) -> str:
@@ -82,10 +83,13 @@ class Studio:
             port,
             process_request=self._request,
             max_size=MOST_BYTES + (1 << 20),
-            max_queue=64,
+            # A message is read when the one before it has been taken: no more than one waits, however large.
+            max_queue=0,
             compression=None,
+            logger=_logger(),
             server_header=None,
             ping_timeout=60,
+            close_timeout=2,
         ) as server:
             self.port = _port_of(server)
             ready(self.address)
@@ -99,8 +103,13 @@ class Studio:
         hosts = request.headers.get_all("Host")
         if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
             return _answer(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
-        path = urlsplit(request.path).path
-        token, slash, name = path.removeprefix("/").partition("/")
+        if getattr(request, "method", "GET") != "GET":
+            return _answer(HTTPStatus.METHOD_NOT_ALLOWED, "files are read with GET", allow="GET")
+        path = request.path.partition("?")[0]
+        key = "".join(request.headers.get_all("Sec-WebSocket-Key"))
+        if not path.startswith("/") or not path.isascii() or not key.isascii():
+            return _answer(HTTPStatus.BAD_REQUEST, "the request is malformed")
+        token, slash, name = path[1:].partition("/")
         if not hmac.compare_digest(token.encode(), self.token.encode()):
             return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of it")
         if not slash:
@@ -117,25 +126,40 @@ class Studio:
         return _answer(HTTPStatus.OK, asset.content, asset.kind)
 
     async def _page(self, connection: ServerConnection) -> None:
-        """Be between a page and its process until one of them goes."""
-        if len(self._pages) >= MOST_PAGES:
+        """Connect a page with a process, if there are not too many pages."""
+        if self._open >= MOST_PAGES:
             # Said here and not in the answer to the request, which a browser shows to no script.
             await connection.close(TRY_LATER, f"{MOST_PAGES} pages are open")
             return
+        # Counted before anything is awaited: pages that are opened at once must not all find room.
+        self._open += 1
+        try:
+            await self._carry(connection)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._open -= 1
+
+    async def _carry(self, connection: ServerConnection) -> None:
+        """Carry messages between a page and its process until one of them ends."""
 
         async def tell(message: bytes) -> None:
             await connection.send(message)
 
         await tell(encode({"kind": "hello", "most_bytes": MOST_BYTES}))
-        page = await Page.start(self.source, tell)
+        try:
+            page = await Page.start(self.source, tell)
+        except OSError as error:
+            reason = f"no process can be started for this page: {error.strerror or error}"
+            await tell(encode({"kind": "note", "level": "error", "text": reason}))
+            await connection.close(TRY_LATER, reason[:100])
+            return
         self._pages.add(page)
         listening = asyncio.ensure_future(self._listen(connection, page))
         try:
             why = await page.run()
             await tell(encode({"kind": "note", "level": "gone", "text": f"{why}. The page begins anew."}))
             await connection.close(1011, "the process has ended")
-        except ConnectionClosed:
-            pass
         finally:
             listening.cancel()
             await page.ended()
@@ -161,13 +185,22 @@ class Studio:
             page.end()
 
 
-def _answer(
-    status: HTTPStatus, body: str | bytes, kind: str = "text/plain; charset=utf-8", *, location: str | None = None
-) -> Response:
+def _logger() -> logging.Logger:
+    """A logger that passes on errors of the server, and leaves out what only a client has done wrong."""
+    logger = logging.getLogger(__name__)
+    logger.addFilter(_not_the_clients)
+    return logger
+
+
+def _not_the_clients(record: logging.LogRecord) -> bool:
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, (WebSocketException, EOFError, ConnectionError))
+
+
+def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; charset=utf-8", **further: str) -> Response:
     content = body.encode() + b"\n" if isinstance(body, str) else body
     headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
-    if location is not None:
-        headers["Location"] = location
+    headers.update({name.title(): value for name, value in further.items()})
     return Response(status.value, status.phrase, headers, content)
 
 

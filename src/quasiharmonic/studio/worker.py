@@ -19,6 +19,11 @@ from quasiharmonic.studio.protocol import Array, Frame, decode, encode
 from quasiharmonic.studio.session import Session
 from quasiharmonic.studio.sheets import read_sheet
 
+#: Bytes of messages that may wait.
+MOST_WAITING = 256 << 20
+# Bytes that a message takes beside its contents.
+_OVERHEAD = 1024
+
 
 def serve(source: str) -> None:
     """Do what comes on standard input until that ends.
@@ -61,36 +66,44 @@ class Inbox:
     Parameters
     ----------
     source : binary file
-        Read by a thread of its own. Where it ends, so does the process.
+        Read by a thread of its own, which stops while too many bytes wait. Where it ends, so does the process.
     """
 
     def __init__(self, source: BinaryIO) -> None:
-        self._messages: deque[Frame] = deque()
-        self._arrived = threading.Condition()
+        self._messages: deque[tuple[Frame, int]] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
         threading.Thread(target=self._listen, args=(source,), daemon=True).start()
 
     def _listen(self, source: BinaryIO) -> None:
         while len(head := source.read(8)) == 8:
-            self.put(decode(source.read(int.from_bytes(head, "little"))))
+            length = int.from_bytes(head, "little")
+            self._put(decode(source.read(length)), length + _OVERHEAD)
         # The page has gone, and nobody waits for what is at hand.
         os._exit(0)
 
-    def put(self, frame: Frame) -> None:
-        """Add a message."""
-        with self._arrived:
-            what = frame.header.get("do")
-            if what == "drag" and self._messages and self._messages[-1].header.get("do") == "drag":
-                self._messages.pop()
-            self._messages.append(frame)
-            self._arrived.notify()
+    def _put(self, frame: Frame, size: int) -> None:
+        """Add a message as soon as there is room for it."""
+        with self._changed:
+            last = self._messages[-1][0].header.get("do") if self._messages else None
+            if frame.header.get("do") == last == "drag":
+                self._bytes -= self._messages.pop()[1]
+            while self._messages and self._bytes + size > MOST_WAITING:
+                self._changed.wait()
+            self._messages.append((frame, size))
+            self._bytes += size
+            self._changed.notify()
 
     def take(self) -> Frame:
         """The next message, as soon as there is one."""
-        with self._arrived:
+        with self._changed:
             while not self._messages:
-                self._arrived.wait()
-            return self._messages.popleft()
+                self._changed.wait()
+            frame, size = self._messages.popleft()
+            self._bytes -= size
+            self._changed.notify()
+            return frame
 
     def waiting(self) -> bool:
         """Whether there is one that makes what is going on needless; to save something does not."""
-        return any(frame.header.get("do") != "save" for frame in self._messages.copy())
+        return any(frame.header.get("do") != "save" for frame, _ in self._messages.copy())

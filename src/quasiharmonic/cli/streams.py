@@ -1,0 +1,55 @@
+"""Standard output and standard error, whose readers may have gone."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import suppress
+
+#: What a shell shows of a process that wrote to a pipe without a reader: 128 and the number of SIGPIPE.
+NO_READER = 141
+
+
+def tell(text: str) -> None:
+    """Print on standard error, if somebody reads it; what is said there decides nothing."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(text, file=sys.stderr, flush=True)
+
+
+def finish(status: int) -> int:
+    """Write out what the two streams still hold, so that Python has nothing left to stumble over at its end.
+
+    Parameters
+    ----------
+    status : int
+        The exit status so far.
+
+    Returns
+    -------
+    int
+        The same; `NO_READER` where it was 0 and nobody reads standard output, 2 where it was 0 and standard output
+        cannot be written.
+    """
+    error = _flush(1)
+    _flush(2)
+    if error is None or status:
+        return status
+    if isinstance(error, BrokenPipeError):
+        return NO_READER
+    tell(f"qhm: standard output cannot be written: {error.strerror or error}")
+    return 2
+
+
+def _flush(number: int) -> OSError | None:
+    stream = sys.stdout if number == 1 else sys.stderr
+    if stream is None:
+        return None
+    try:
+        stream.flush()
+    except OSError as error:
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, number)
+        os.close(null)
+        return error
+    return None

@@ -1,0 +1,274 @@
+"""What the command says and leaves where files, folders and streams are not as they should be."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from quasiharmonic import flatten, io, polish
+from quasiharmonic.io import MeshData, MeshFileError, OutputError
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.surfaces import disk
+from shared.commands import run
+from shared.gltf_files import square
+
+posix = pytest.mark.skipif(os.name != "posix", reason="closes streams by the shell")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory: a mesh with a map, and nothing else."""
+    monkeypatch.chdir(tmp_path)
+    V, F = disk(3)
+    io.write_obj("m.obj", MeshData(V, F).with_map(V))
+    return tmp_path
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """No file can be written any more, after so many."""
+
+    def set_full(after=0):
+        left = iter(range(after))
+
+        def fsync(number):
+            if next(left, None) is None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+    return set_full
+
+
+# --- folders and files of a command that fails ------------------------------------------------------------------------
+
+
+def frames(folder, count):
+    V, _ = disk(3)
+    np.save(folder / "frames.npy", np.stack([V * (1 + 0.01 * k) for k in range(count)]))
+    return folder / "frames.npy"
+
+
+def left(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    ("call", "after"),
+    [
+        ("demo -o new/D", 0),
+        ("animate m.obj frames.npy -o new/D", 0),
+        ("batch . --to disk -o new/D", 0),
+        *(("map m.obj -o o.obj --material", k) for k in range(3)),
+        *(("refine m.obj -o o.obj", k) for k in range(3)),
+    ],
+)
+def test_a_full_disk_leaves_nothing_behind(folder, full_disk, capsys, call, after):
+    frames(folder, 2)
+    before = left(folder)
+    full_disk(after)
+    assert run(*call.split()) == 2
+    assert os.strerror(errno.ENOSPC) in capsys.readouterr().err
+    assert left(folder) == before
+
+
+def test_a_folder_that_was_there_stays(folder, full_disk, capsys):
+    (folder / "D").mkdir()
+    full_disk()
+    assert run("demo", "-o", "D") == 2
+    assert left(folder) == ["D", "m.obj"]
+
+
+def test_frames_that_are_written_are_told(folder, full_disk, capsys):
+    frames(folder, 3)
+    full_disk(2)
+    assert run("animate", "m.obj", "frames.npy", "-o", "D") == 3
+    assert "0000.obj is written" in capsys.readouterr().err
+    assert left(folder / "D") == ["0000.obj", "0001.obj"]
+
+
+def test_a_folder_that_cannot_be_made(folder, capsys):
+    (folder / "file").write_text("")
+    for call in ("demo -o file/D", "demo -o file"):
+        assert run(*call.split()) == 2
+        assert "cannot make the folder file" in capsys.readouterr().err
+    assert left(folder) == ["file", "m.obj"]
+
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+
+REPRESENTATIONS = "Path(", "Error(", "errno", "Errno", "object at 0x", "np.float64(", "<class"
+
+
+def test_outputs_that_cannot_be_named(folder, capsys):
+    os.symlink("loop.obj", folder / "loop.obj")
+    for name in ("loop.obj", "a\0b.obj"):
+        with pytest.raises(OutputError) as raised:
+            io.check_writable(folder / name)
+        said = str(raised.value)
+        assert not any(word in said for word in REPRESENTATIONS)
+        assert said.isprintable()
+
+
+def test_inputs_that_cannot_be_named(folder):
+    for name in ("a\0b.obj", "a\udcffb.obj", "a\nb.obj"):
+        with pytest.raises(MeshFileError) as raised:
+            io.read_mesh(folder / name)
+        said = str(raised.value)
+        assert not any(word in said for word in REPRESENTATIONS)
+        assert said.isprintable()
+
+
+def without(document, name):
+    del document.tree["bufferViews"][0][name]
+    return document
+
+
+def changed(document, path, value):
+    at = document.tree
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = value
+    return document
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: square().gltf(uri="none.bin"), "none.bin: there is no such file"),
+        (lambda: square().gltf(uri="../none.bin"), "is not in the folder of the file"),
+        (lambda: without(square(), "buffer").gltf(), "an entry lacks buffer"),
+        (lambda: without(square(), "byteLength").gltf(), "an entry lacks byteLength"),
+        (lambda: changed(square(), ("bufferViews", 0, "buffer"), 9).gltf(), "refers to another that is not there"),
+        (lambda: changed(square(), ("accessors", 0, "componentType"), 9).gltf(), "an entry lacks 9"),
+        (lambda: changed(square(), ("accessors", 0, "componentType"), []).gltf(), "not of the kind that it should be"),
+        (lambda: changed(square(), ("meshes", 0, "primitives"), 7).gltf(), "not of the kind that it should be"),
+        (lambda: b'{"asset": {}}', "an entry lacks version"),
+        (lambda: b"[1]", "not of the kind that it should be"),
+        (lambda: b"[" * 100_000, "nested too deeply"),
+    ],
+)
+def test_damaged_gltf_is_described_in_words(folder, make, said):
+    (folder / "a.gltf").write_bytes(make())
+    with pytest.raises(MeshFileError, match=r"a\.gltf|none\.bin") as raised:
+        io.read_mesh(folder / "a.gltf")
+    assert said in str(raised.value)
+    assert not any(word in str(raised.value) for word in REPRESENTATIONS)
+
+
+def test_a_missing_file_is_named_without_the_number_of_the_error(folder, capsys):
+    for call in ("field none.npy -o o.npy", "animate m.obj none.npy -o D", "flatten none.obj -o o.obj"):
+        assert run(*call.split()) == 2
+        said = capsys.readouterr().err
+        assert "none." in said
+        assert not any(word in said for word in REPRESENTATIONS)
+
+
+@pytest.mark.parametrize("value", [object(), np.float64(-1.5), {}])
+def test_arguments_of_another_kind_are_named_shortly(value, folder):
+    V, F = disk(3)
+    (rim,) = boundary_loops(F, len(V))
+    for call in (
+        lambda: flatten(V, F, max_iterations=value),
+        lambda: flatten(V, F, callback=value),
+        lambda: polish(V, F, V, fixed=rim, slide=value),
+        lambda: polish(V, F, V, fixed=rim, energy=value),
+    ):
+        with pytest.raises(ValueError, match="must be") as raised:
+            call()
+        assert not any(word in str(raised.value) for word in REPRESENTATIONS)
+
+
+# --- options without effect ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "needs"),
+    [
+        ("map m.obj -o o.obj --plot-kind map", "--plot"),
+        ("map m.obj -o o.obj --margin 0.1", "--pack"),
+        ("map m.obj -o o.obj --font x", "--to"),
+        ("map m.obj -o o.obj --to disk --font x", "only for letter: and word:"),
+        ("map m.obj -o o.obj --corner-angle 9", "--to"),
+        ("map m.obj -o o.obj --corners auto", "--to"),
+        ("map m.obj -o o.obj --cut", "--to"),
+        ("map m.obj -o o.obj --to disk --pieces m.obj", "--slide"),
+        ("flatten m.obj -o o.obj --rings 3", "--energy distances"),
+        ("flatten m.obj -o o.obj --unit cm", "--pattern"),
+        ("flatten m.obj -o o.obj --allowance 1", "--pattern"),
+        ("polish m.obj -o o.obj --margin 0.1", "--pack"),
+        ("polish m.obj -o o.obj --to disk", "--slide"),
+        ("harmonise m.obj -o o.obj --margin 0.1", "--pack"),
+        ("animate m.obj m.obj -o o --limit 2", "--polish"),
+        ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second belongs to a moving picture"),
+        ("measure m.obj --rings 3", "--distances"),
+        ("plot m.obj -o o.png --measure mips", "--kind distortion"),
+        ("plot m.obj -o o.png --kind texture --measure isometric", "--kind distortion"),
+        ("plot m.obj -o o.png --kind map --picture p.png", "--kind map"),
+        ("check m.obj --plot o.png", "--boundary"),
+        ("check m.obj --boundary --as float64", "--as"),
+        ("check m.obj --boundary --any-triangulation", "--any-triangulation"),
+        ("batch . -o o --flatten --strategy speed", "--strategy"),
+        ("batch . -o o --to disk --energy mips", "flatten"),
+        ("batch . -o o --to disk --slide", "polish"),
+        ("batch . -o o --corners auto", "name one by to"),
+    ],
+)
+def test_an_option_without_effect_is_refused(folder, capsys, call, needs):
+    assert run(*call.split()) == 2
+    assert needs in capsys.readouterr().err
+    assert left(folder) == ["m.obj"]
+
+
+# --- closed streams ---------------------------------------------------------------------------------------------------
+
+
+def shell(call, streams, *, unbuffered=False):
+    """Exit status and what is said on standard error by a command with streams of its own."""
+    command = f"set -o pipefail; {sys.executable} -m quasiharmonic {call} {streams}"
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1" if unbuffered else ""}
+    done = subprocess.run(["bash", "-c", command], capture_output=True, env=environment)
+    return done.returncode, done.stderr.decode()
+
+
+@posix
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj", "measure m.obj"])
+def test_without_a_reader_the_command_ends_in_silence(folder, call, unbuffered):
+    status, said = shell(call, "| true", unbuffered=unbuffered)
+    # argparse passes over what it cannot print.
+    assert status == 141 or ("help" in call and unbuffered and status == 0)
+    assert said == ""
+
+
+@posix
+@pytest.mark.parametrize("streams", ["2>&-", ">&- 2>&-", "2>&1 | true"])
+@pytest.mark.parametrize(("call", "status"), [("--version", (0, 141)), ("check m.obj", (0, 141)), ("check none", (2,))])
+def test_without_a_standard_error_the_command_ends_in_silence(folder, call, status, streams):
+    found, said = shell(call, streams)
+    assert found in status
+    assert said == ""
+
+
+@posix
+def test_a_report_in_json_stays_alone_without_a_standard_error(folder):
+    command = f"{sys.executable} -m quasiharmonic check m.obj --json - 2>&-"
+    done = subprocess.run(["bash", "-c", command], stdout=subprocess.PIPE)
+    assert done.returncode == 0
+    assert done.stdout.count(b"\n") == 1
+
+
+@posix
+def test_a_full_standard_output_is_said(folder):
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full on this system")
+    for call in ("--version", "check m.obj"):
+        status, said = shell(call, "> /dev/full")
+        assert status == 2
+        assert os.strerror(errno.ENOSPC) in said
+        assert "Traceback" not in said
