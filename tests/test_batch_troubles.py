@@ -79,12 +79,12 @@ class TestTroubles:
     def test_real_limits(self, tmp_path):
         """No trouble made up: a mesh that takes longer, and then more memory, than it may."""
         source = tmp_path / "set"
-        write_problem(source / "large", *star_of(160))
+        write_problem(source / "large", *star_of(230))
         write_problem(source / "small", *star_of(4))
         out = tmp_path / "out"
-        assert batch.run(source, out, jobs=1, time_limit=0.4).outcomes == {"timeout": 1, "injective": 1}
+        assert batch.run(source, out, jobs=1, time_limit=0.8).outcomes == {"timeout": 1, "injective": 1}
         # The same limit or less: nothing to be gained.
-        assert batch.run(source, out, jobs=1, time_limit=0.2).resumed == 2
+        assert batch.run(source, out, jobs=1, time_limit=0.4).resumed == 2
         if Path("/proc/self/statm").exists():
             limited = batch.run(source, out, jobs=1, memory_limit=60 << 20)
             assert (limited.outcomes, limited.resumed) == ({"memory": 1, "injective": 1}, 1)
