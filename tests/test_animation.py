@@ -82,6 +82,7 @@ def test_frames_that_are_searched_for_stay_near(pinned, most):
     assert animation.largest_move <= most
 
 
+@pytest.mark.slow
 def test_polished_frames_do_not_leap(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 24)

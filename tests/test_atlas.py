@@ -173,6 +173,7 @@ class TestMirroredAndStacked:
 
 
 class TestCut:
+    @pytest.mark.slow
     def test_a_closed_surface_stays_watertight(self, tmp_path):
         V, F = starfish(rings=12)
         (tmp_path / "in.obj").write_text(

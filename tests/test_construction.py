@@ -71,6 +71,7 @@ def test_polygons(kind, seed):
     check(problem, construct(problem, thin=seed > 1))
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
 def test_any_polygon(seed, kind):

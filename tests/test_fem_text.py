@@ -275,7 +275,7 @@ def test_what_is_wrong_with_a_vtu_file_is_said(tmp_path, data, message):
 
 
 @pytest.mark.parametrize("coder", [ZLIB, LZMA], ids=["zlib", "lzma"])
-@pytest.mark.parametrize("form", ["inline", "raw"])
+@pytest.mark.parametrize("form", ["inline", pytest.param("raw", marks=pytest.mark.slow)])
 def test_nothing_is_unpacked_beyond_what_there_is_room_for(tmp_path, form, coder):
     pack, name = coder
     zeros = bytes(32 << 20)

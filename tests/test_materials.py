@@ -159,6 +159,7 @@ def test_the_checkerboard_is_a_picture_that_repeats(tmp_path):
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) == 2
 
 
+@pytest.mark.slow
 def test_a_picture_is_repeated_and_its_glass_is_white(tmp_path):
     from PIL import Image
 

@@ -195,6 +195,7 @@ def test_degenerate_map_is_drawn(planar):
     assert red(image).any()
 
 
+@pytest.mark.slow
 def test_no_display_and_no_pyplot():
     code = (
         "import sys, quasiharmonic.plot as p\n"

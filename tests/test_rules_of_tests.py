@@ -6,6 +6,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,11 @@ MODULES = sorted(FOLDER.rglob("*.py"))
 TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
 # What `namedtuple` offers has an underscore so that it is no field, what notebooks ask for by custom: none is private.
 PUBLIC = {"_replace", "_asdict", "_fields", "_make", "_repr_html_", "_repr_png_"}
+
+
+@cache
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def private(name):
@@ -51,8 +57,7 @@ def private_names(tree):
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(FOLDER).as_posix())
 def test_rules(path):
-    text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text)
+    text, tree = path.read_text(encoding="utf-8"), parsed(path)
     assert not [module for module, _ in imports(tree) if module.split(".")[-1] in TESTS | {"conftest"}]
     assert not list(private_names(tree))
     assert not re.search(r"parents\[[2-9]\]|\.parent\.parent\.parent", text), "looks outside the checkout"
@@ -81,7 +86,7 @@ def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
     wanted = {
         node.args[0].value
         for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip"
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

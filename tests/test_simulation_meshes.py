@@ -33,6 +33,7 @@ def dent(points, depth, waves=1):
 # ---- chains ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fifty_small_steps_end_as_one_large_step_does(flap):
     points, F, body = flap
     whole = morph(points, F, body, turned(points[body], 50))
@@ -258,6 +259,7 @@ def test_elements_that_cannot_be_righted_are_told():
     assert side[0] in F[morphed.inverted[0]]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_righted_is_tried_in_silence():
     points, F = second_order(*surfaces.grid(5, 5))
     side = np.flatnonzero(((points == 0) | (points == 1)).any(axis=1))

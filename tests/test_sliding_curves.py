@@ -182,15 +182,10 @@ def test_an_outline_is_on_its_curves(text):
         assert curve.nearest(middle)[1].max() < 1.01e-6 * max(1, np.ptp(contour))
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "QH",
-        "G",
-        "R8",
-        *(pytest.param(t, marks=pytest.mark.slow) for t in ("LOVE", "mesh", "OOO", "LEEL", "SCAF", "&@", "Wgy")),
-    ],
-)
+LONG_WORDS = "LOVE", "mesh", "R8", "OOO", "LEEL", "SCAF", "&@", "Wgy"
+
+
+@pytest.mark.parametrize("text", ["QH", "G", *(pytest.param(text, marks=pytest.mark.slow) for text in LONG_WORDS)])
 def test_a_word_follows_the_curves_of_its_letters(text):
     pytest.importorskip("shapely")
     contours, curves = outline(f"word:{text}"), outline_curves(f"word:{text}")

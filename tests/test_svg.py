@@ -295,6 +295,7 @@ SAMPLE = drawing(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, len(SAMPLE)), st.integers(0, 6), st.text(max_size=5)), max_size=4))
 def test_damaged_drawings_are_read_or_refused(tmp_path_factory, edits):
