@@ -26,9 +26,9 @@ from quasiharmonic.flattening.cascade import COARSEST, RATIO, STEPS, carried, cl
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.distance_descent import DistanceDescent, followed, in_scale, sampling_of
 from quasiharmonic.flattening.distance_energy import DistanceEnergy
-from quasiharmonic.flattening.hierarchy import Hierarchy, Level
+from quasiharmonic.flattening.hierarchy import LOWEST, Hierarchy, Level
 from quasiharmonic.flattening.piece import Piece, Settings
-from quasiharmonic.flattening.touching_up import LOWEST, thick_energy, touched_up
+from quasiharmonic.flattening.touching_up import thick_energy, touched_up
 from quasiharmonic.result import MapResult, Snapshot, Stage, Step
 
 # On the coarse mesh so many rings at least are as long as those asked for.
