@@ -43,6 +43,8 @@ from quasiharmonic.result import MapResult, Status, Step
 
 # A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
 _SAMPLED = 10.0
+# How descents end that nobody has stopped.
+_DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
 
 
 @takes_mesh
@@ -88,7 +90,7 @@ def flatten(
         How much each triangle's distortion counts; positive, 1 by default.
     start : (n, 2) array, optional
         An injective map to begin with, of any size. Where it overlaps itself, and so does all that the descent makes
-        of it, a start of the library's own is taken.
+        of it, or where that collapses, a start of the library's own is taken.
     unit_square : bool
         Scale the map evenly into the unit square. By default it is in the surface's own unit of length.
     rings : int
@@ -118,7 +120,8 @@ def flatten(
     MapResult
         Its ``uv`` is bijective, certified; the principal axis lies along x, the bounding box begins at the origin, and
         several pieces stand side by side. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration,
-        ``EXHAUSTED`` when doubles cannot express a better map, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+        ``EXHAUSTED`` when doubles cannot express a better map, ``COLLAPSED`` when the map is stretched far more than
+        the surface asks for, whatever it was started from, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
         With pins it may also be ``IMPOSSIBLE``, the ``diagnosis`` naming why, or what the search has ended with; the
         map then is the best found, and only the certificate says what it is, as after an interrupt of that search.
 
@@ -204,7 +207,7 @@ def flatten(
     if unit_square:
         uv = in_unit_square(uv)
     status, certificate = furthest_last(result.status for result in results), certify(F, uv, loops=_loops(parts))
-    if held and not certificate.bijective and status in (Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING):
+    if held and not certificate.bijective and status in _DESCENDED:
         # Beside what is held so far away, or at such a size, doubles do not tell the triangles of the others.
         status = Status.ROUNDED
     return MapResult(
@@ -266,6 +269,7 @@ def _with_distances(piece: Piece, start: FloatArray | None, rings: int, settings
         return replace(found, status=Status.INTERRUPTED)
     return replace(
         then,
+        status=Status.COLLAPSED if found.status is Status.COLLAPSED else then.status,
         stages=found.stages + then.stages,
         history=found.history + then.history,
         path=found.path + then.path,
