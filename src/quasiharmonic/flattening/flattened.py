@@ -34,7 +34,7 @@ from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.flattening.distance_cascade import kept_by_coarse
 from quasiharmonic.flattening.distance_descent import kept
-from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
+from quasiharmonic.flattening.layout import in_given_unit, in_range, in_unit_square, laid_along_axis, side_by_side
 from quasiharmonic.flattening.parts import Part, furthest_last, parts_of
 from quasiharmonic.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
 from quasiharmonic.given.taking import takes_mesh
@@ -129,7 +129,7 @@ def flatten(
     ------
     ValueError
         When the input is malformed (see `Problem`), a surface is closed or has handles, a rest triangle has no area, or
-        ``start`` is not injective; the message names the elements.
+        ``start`` is not injective; the message names the elements. When the map does not fit into the range of doubles.
     KeyboardInterrupt
         When Ctrl-C comes before there is a bijective map.
 
@@ -198,10 +198,12 @@ def flatten(
     first = len(results) - len(free)
     placed = [result.uv for result in results[:first]]
     low = placed[0].min(axis=0) if placed else 0.0
-    boxes = [uv - low for uv in placed]
+    with np.errstate(over="ignore"):
+        boxes = [in_range(uv - low) for uv in placed]
     boxes += [_laid_out(part.piece, result.uv) for part, result in zip(free, results[first:], strict=True)]
     beside = side_by_side(boxes, gap) if len(boxes) > 1 else boxes
-    placed += [place + low for place in beside[len(placed) :]]
+    with np.errstate(over="ignore"):
+        placed += [in_range(place + low) for place in beside[len(placed) :]]
     uv = np.zeros((len(V), 2))
     uv[np.concatenate([part.vertices for part in [*held, *free]])] = np.concatenate(placed)
     if unit_square:
@@ -289,7 +291,7 @@ def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
 
 def _laid_out(piece: Piece, uv: FloatArray) -> FloatArray:
     """A piece's map in the surface's unit, along its axis; unturned where that would cost an inverted triangle."""
-    laid = np.ldexp(laid_along_axis(piece.F, uv), piece.exponent)
+    laid = in_given_unit(laid_along_axis(piece.F, uv), piece.exponent)
     if certify(piece.F, laid, loops=piece.loops).bijective:
         return laid
-    return np.ldexp(uv, piece.exponent)
+    return in_given_unit(uv, piece.exponent)

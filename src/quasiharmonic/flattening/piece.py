@@ -22,6 +22,7 @@ from quasiharmonic.flattening.cascade import coarse_start
 from quasiharmonic.flattening.collapse import has_collapsed
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import FreeDescent, GuardedDescent, descend
+from quasiharmonic.flattening.layout import in_given_unit
 from quasiharmonic.flattening.start import disk_start
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
@@ -173,6 +174,8 @@ class Flattening:
         self._overlaps = False
         self._overlapping: FloatArray | None = None
         self._starts = self._own_starts()
+        # The solver and the energy of those that there have been.
+        self._begun: set[tuple[str, float]] = set()
         # Of the last descent.
         self._steps = 0
         self._solver = ""
@@ -315,8 +318,13 @@ class Flattening:
             uv = start()
             if uv is None:
                 continue
-            uv = self._bijective = self._in_scale(uv)
+            uv = self._in_scale(uv)
             energy = self._measure.value(in_units(uv, 0))
+            if (self._settings.linear_solver, energy) in self._begun:
+                # Of a small surface the coarse mesh is the surface itself.
+                continue
+            self._begun.add((self._settings.linear_solver, energy))
+            self._bijective = uv
             what = f"start anew, {name}" if self._stages else "start"
             self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
             return uv, energy < _NEAR
@@ -409,6 +417,6 @@ class Flattening:
         settings, number = self._settings, len(self._history)
         self._history.append(Step(number, 0, self._measure.value(descent.w)))
         if settings.record and number % settings.record == 0:
-            self._path.append(Snapshot(number, np.ldexp(descent.uv, self._piece.exponent)))
+            self._path.append(Snapshot(number, in_given_unit(descent.uv, self._piece.exponent)))
         if settings.callback is not None:
             settings.callback(self._history[-1])
