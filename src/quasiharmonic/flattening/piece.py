@@ -242,8 +242,9 @@ class Flattening:
 
     def _collapsed(self, status: Status) -> bool:
         """Whether the descent that has ended so has come to a stand at a map which is far from what there should be."""
-        # A free descent that has converged is at a minimum, whatever that is like.
-        converged = status is Status.POLISHED and not self._overlaps
+        # What has converged is at a minimum, whatever that is like; only barriers of a boundary without room may feign
+        # it, and then there is a map to compare with.
+        converged = status is Status.POLISHED and self._overlapping is None
         falling = status is Status.STILL_FALLING and self._steps < _MANY
         if converged or falling or status is Status.INTERRUPTED:
             return False
