@@ -13,10 +13,14 @@ from quasiharmonic import (
     certify,
     diagnose,
     distortion,
+    flatten,
+    flatten_derivative,
     flipped_triangles,
     injective_map,
     io,
+    keep_distances,
     polish,
+    polish_derivative,
     refine_problem,
 )
 from quasiharmonic.cli import main
@@ -306,3 +310,49 @@ def test_numbers_that_are_none(bad):
     certificate = certify(F, broken)
     assert certificate.nonfinite.tolist() == np.flatnonzero((F == 4).any(axis=1)).tolist()
     assert not certificate.injective
+
+
+class TestFlatteningAtScales:
+    @pytest.mark.parametrize("scale", [1e-322, 1e-310, 1e-300, 1.0, 1e300])
+    @pytest.mark.parametrize("place", [[0.0, 0.0], [1.0, 2.0], [1e-300, 1e-300], [1e300, 2.0], [1.7e308, -1.7e308]])
+    def test_one_pin_anywhere_gives_finite_positions(self, scale, place):
+        V, F = cat(3)
+        result = flatten(V / np.abs(V).max() * scale, F, fixed=[3], target=[place], record=1)
+        assert np.isfinite(result.uv).all()
+        assert all(np.isfinite(snapshot.uv).all() for snapshot in result.path)
+        np.testing.assert_array_equal(result.uv[3], place)
+        if not result.certificate.bijective:
+            # Doubles do not tell triangles of this size so far from the origin.
+            assert result.status is Status.ROUNDED
+            assert np.abs(place).max() > 1e10 * scale
+
+    @pytest.mark.parametrize("pins", [{}, {"fixed": [3, 9], "target": [[1e308, 2], [-1e308, 3.0]]}])
+    def test_maps_beyond_the_range_of_doubles_are_refused(self, pins):
+        V, F = cat(6)
+        scale = 1.0 if pins else 1e308
+        with pytest.raises(ValueError, match="range of doubles"):
+            flatten(V / np.abs(V).max() * scale, F, **pins)
+
+    @pytest.mark.parametrize("flat", [1e-6, 1e-7, 1e-8, 1e-9])
+    @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "distances"])
+    def test_thin_disks(self, flat, energy):
+        V, F = disk(2)
+        thin = np.column_stack([V * [1, flat], np.zeros(len(V))])
+        assert flatten(thin, F, energy=energy).certificate.bijective
+        assert keep_distances(thin, F, thin[:, :2]).certificate.bijective
+
+
+@pytest.mark.parametrize("scale", [1e-310, 1e-200, 1e-100, 1e100, 1e200, 1e300])
+def test_derivatives_are_finite_or_refused(scale):
+    V, F = np.array([[0, 0, 0], [1, 0, 0], [0.3, 0.8, 0]]) * scale, np.array([[0, 1, 2]])
+    uv = flatten(V, F).uv
+    for derivative_of in (
+        lambda: flatten_derivative(V, F, uv),
+        lambda: polish_derivative(V, F, uv, fixed=[0, 1, 2]),
+    ):
+        if 1e-150 < scale < 1e150:
+            derivative = derivative_of()
+            assert np.isfinite(derivative.jvp(rest=1e-3 * V)).all()
+        else:
+            with pytest.raises(ValueError, match="triangle 0 at rest leave the range of doubles"):
+                derivative_of()

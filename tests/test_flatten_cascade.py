@@ -7,16 +7,21 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from quasiharmonic.cuts.finding import find_cuts
 from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.energy.measures import distortion
 from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.exact.certificate import certify, is_injective
 from quasiharmonic.flattening.cascade import coarse_start
+from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.flattened import flatten
 from quasiharmonic.flattening.hierarchy import Hierarchy
 from quasiharmonic.flattening.start import disk_start
 from quasiharmonic.flattening.touching_up import thick_energy, touched_up
+from quasiharmonic.mesh.seams import SeamedMesh
 from quasiharmonic.mesh.topology import boundary_loops, edges
-from quasiharmonic.surfaces import annulus, cat, grid, random_delaunay
+from quasiharmonic.result import Status
+from quasiharmonic.surfaces import annulus, cat, grid, random_delaunay, starfish
 
 
 def in_space(V):
@@ -136,3 +141,32 @@ def test_touching_up_opens_what_is_nearly_closed():
     after = touched_up(V, F, loops, uv)
     assert certify(F, after).bijective
     assert energy.value(in_units(after, 0)) < before / 100
+
+
+def cut_starfish(arms, rings, gain):
+    """A closed surface with limbs cut open: both sides of each seam are at the same places at rest."""
+    V, F = starfish(arms, rings)
+    cut = SeamedMesh(V, F).cut(find_cuts(V, F, gain=gain)).opened()
+    return cut.V / np.abs(cut.V).max(), cut.F
+
+
+@pytest.mark.parametrize("arms", [3, 5])
+@pytest.mark.parametrize("guarded", [False, True])
+def test_a_coarse_start_leaves_room_between_the_sides_of_a_seam(arms, guarded):
+    V, F = cut_starfish(arms, 20, 0.01)
+    loops = boundary_loops(F, len(V))
+    uv = coarse_start(V, F, loops, guarded=guarded)
+    assert certify(F, uv).bijective
+    # A vertex that was carried to its copy on the other side left 1e-12, which no barrier opens again.
+    w = in_units(uv, 0)
+    assert Rim(loops).contacts(w).room(w) > 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("linear_solver", ["auto", "qdldl"])
+def test_a_large_surface_with_limbs_does_not_collapse(linear_solver):
+    V, F = cut_starfish(3, 66, 0.1)
+    result = flatten(V, F, linear_solver=linear_solver)
+    assert result.certificate.bijective
+    assert result.status is Status.POLISHED
+    assert distortion(V, F, result.uv).summary("isometric").maximum < 10

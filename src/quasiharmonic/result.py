@@ -51,8 +51,14 @@ class Status(Enum):
         "iteration: allow more iterations for less of it."
     )
     EXHAUSTED = (
-        "Every triangle is strictly positive, decided exactly. The distortion falls no further because triangles "
-        "are as small as double precision can resolve: an energy that minds their size would open them up."
+        "Every triangle is strictly positive, decided exactly. The distortion falls no further: doubles express no "
+        "better map near this one. Where energy='mips' has left triangles tiny, energy='symmetric-dirichlet' opens "
+        "them up; another linear_solver may get further, too."
+    )
+    COLLAPSED = (
+        "Every triangle is strictly positive, decided exactly, but the map has collapsed: it stretches triangles far "
+        "more than the surface asks for, and no other start has led to a better one. More cuts (find_cuts with a "
+        "smaller gain), a map to begin with (start), or energy='symmetric-dirichlet', if it was another, may help."
     )
     NEARBY = (
         "Every triangle is strictly positive, decided exactly, and the distortion is as low as the frames before and "

@@ -24,7 +24,9 @@ _FURTHEST_LAST = (
     Status.ENTANGLED,
     Status.NO_ROOM,
     Status.OUT_OF_ITERATIONS,
+    Status.COLLAPSED,
     Status.STILL_FALLING,
+    Status.EXHAUSTED,
 )
 
 

@@ -73,7 +73,8 @@ class Turning:
         Returns
         -------
         callable
-            From a length t to the map there, in first order ``w + t · direction``.
+            From a length t to the map there, in first order ``w + t · direction``. It may raise
+            `quasiharmonic.linsolve.NotPositiveDefinite` where rounding leaves no digit of it.
         """
         (p, q), (dp, dq) = self._derivatives(w), self._derivatives(direction)
         angle = rates(self._F, self._g, w, direction).imag

@@ -20,6 +20,7 @@ from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.energy.turning import Turning, rates
 from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.result import Status
 
 # Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean
@@ -163,7 +164,12 @@ class FreeDescent(NewtonDescent):
         path = self._turning.path(self.w, full)
 
         def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-            return self.tried(path(t), bound)
+            try:
+                there = path(t)
+            except NotPositiveDefinite:
+                # Rest triangles so thin that the path's own system has no solution to any digit.
+                return np.inf, None
+            return self.tried(there, bound)
 
         taken = backtrack(trial, self.value, promise, tries=1)
         if taken is None:

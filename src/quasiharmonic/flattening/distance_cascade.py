@@ -26,9 +26,10 @@ from quasiharmonic.flattening.cascade import COARSEST, RATIO, STEPS, carried, cl
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.distance_descent import DistanceDescent, followed, in_scale, sampling_of
 from quasiharmonic.flattening.distance_energy import DistanceEnergy
-from quasiharmonic.flattening.hierarchy import Hierarchy, Level
+from quasiharmonic.flattening.hierarchy import LOWEST, Hierarchy, Level
+from quasiharmonic.flattening.layout import in_given_unit
 from quasiharmonic.flattening.piece import Piece, Settings
-from quasiharmonic.flattening.touching_up import LOWEST, thick_energy, touched_up
+from quasiharmonic.flattening.touching_up import thick_energy, touched_up
 from quasiharmonic.result import MapResult, Snapshot, Stage, Step
 
 # On the coarse mesh so many rings at least are as long as those asked for.
@@ -104,7 +105,7 @@ def kept_by_coarse(piece: Piece, rings: int, settings: Settings, *, least: int =
         certificate=certify(piece.F, found, loops=piece.loops),
         stages=stages,
         history=history,
-        path=[Snapshot(history[-1].iteration, np.ldexp(found, piece.exponent))] if settings.record else [],
+        path=[Snapshot(history[-1].iteration, in_given_unit(found, piece.exponent))] if settings.record else [],
         linear_solver=descent.system.solver.name,
         seconds=seconds,
     )

@@ -30,6 +30,7 @@ from quasiharmonic.exact.certificate import certify
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent
 from quasiharmonic.flattening.distance_energy import DistanceEnergy, PairForm
+from quasiharmonic.flattening.layout import in_given_unit
 from quasiharmonic.flattening.piece import Piece, Settings
 from quasiharmonic.given.taking import takes_mesh
 from quasiharmonic.hearing import heard
@@ -132,7 +133,7 @@ def keep_distances(
         raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
     settings = Settings(SymmetricDirichlet(), "distances", tolerance, max_iterations, linear_solver, callback, record)
     result = kept(piece, places, rings, settings)
-    uv = np.ldexp(result.uv, piece.exponent)
+    uv = in_given_unit(result.uv, piece.exponent)
     certificate = certify(piece.F, uv, loops=piece.loops)
     rest = np.ldexp(piece.V, piece.exponent)
     return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began, V=rest)
@@ -170,7 +171,7 @@ def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first:
     def report(value: float) -> None:
         history.append(Step(first + len(history), 0, value))
         if settings.record and history[-1].iteration % settings.record == 0:
-            path.append(Snapshot(history[-1].iteration, np.ldexp(descent.uv, piece.exponent)))
+            path.append(Snapshot(history[-1].iteration, in_given_unit(descent.uv, piece.exponent)))
         if settings.callback is not None:
             settings.callback(history[-1])
 

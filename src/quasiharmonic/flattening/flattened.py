@@ -34,7 +34,7 @@ from quasiharmonic.energy.polishing import energy_named
 from quasiharmonic.exact.certificate import certify, flipped_triangles
 from quasiharmonic.flattening.distance_cascade import kept_by_coarse
 from quasiharmonic.flattening.distance_descent import kept
-from quasiharmonic.flattening.layout import in_unit_square, laid_along_axis, side_by_side
+from quasiharmonic.flattening.layout import in_given_unit, in_range, in_unit_square, laid_along_axis, side_by_side
 from quasiharmonic.flattening.parts import Part, furthest_last, parts_of
 from quasiharmonic.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
 from quasiharmonic.given.taking import takes_mesh
@@ -43,6 +43,8 @@ from quasiharmonic.result import MapResult, Status, Step
 
 # A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
 _SAMPLED = 10.0
+# How descents end that nobody has stopped.
+_DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
 
 
 @takes_mesh
@@ -88,7 +90,7 @@ def flatten(
         How much each triangle's distortion counts; positive, 1 by default.
     start : (n, 2) array, optional
         An injective map to begin with, of any size. Where it overlaps itself, and so does all that the descent makes
-        of it, a start of the library's own is taken.
+        of it, or where that collapses, a start of the library's own is taken.
     unit_square : bool
         Scale the map evenly into the unit square. By default it is in the surface's own unit of length.
     rings : int
@@ -118,7 +120,8 @@ def flatten(
     MapResult
         Its ``uv`` is bijective, certified; the principal axis lies along x, the bounding box begins at the origin, and
         several pieces stand side by side. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration,
-        ``EXHAUSTED`` when doubles cannot express a better map, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+        ``EXHAUSTED`` when doubles cannot express a better map, ``COLLAPSED`` when the map is stretched far more than
+        the surface asks for, whatever it was started from, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
         With pins it may also be ``IMPOSSIBLE``, the ``diagnosis`` naming why, or what the search has ended with; the
         map then is the best found, and only the certificate says what it is, as after an interrupt of that search.
 
@@ -126,7 +129,7 @@ def flatten(
     ------
     ValueError
         When the input is malformed (see `Problem`), a surface is closed or has handles, a rest triangle has no area, or
-        ``start`` is not injective; the message names the elements.
+        ``start`` is not injective; the message names the elements. When the map does not fit into the range of doubles.
     KeyboardInterrupt
         When Ctrl-C comes before there is a bijective map.
 
@@ -195,16 +198,18 @@ def flatten(
     first = len(results) - len(free)
     placed = [result.uv for result in results[:first]]
     low = placed[0].min(axis=0) if placed else 0.0
-    boxes = [uv - low for uv in placed]
+    with np.errstate(over="ignore"):
+        boxes = [in_range(uv - low) for uv in placed]
     boxes += [_laid_out(part.piece, result.uv) for part, result in zip(free, results[first:], strict=True)]
     beside = side_by_side(boxes, gap) if len(boxes) > 1 else boxes
-    placed += [place + low for place in beside[len(placed) :]]
+    with np.errstate(over="ignore"):
+        placed += [in_range(place + low) for place in beside[len(placed) :]]
     uv = np.zeros((len(V), 2))
     uv[np.concatenate([part.vertices for part in [*held, *free]])] = np.concatenate(placed)
     if unit_square:
         uv = in_unit_square(uv)
     status, certificate = furthest_last(result.status for result in results), certify(F, uv, loops=_loops(parts))
-    if held and not certificate.bijective and status in (Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING):
+    if held and not certificate.bijective and status in _DESCENDED:
         # Beside what is held so far away, or at such a size, doubles do not tell the triangles of the others.
         status = Status.ROUNDED
     return MapResult(
@@ -266,6 +271,7 @@ def _with_distances(piece: Piece, start: FloatArray | None, rings: int, settings
         return replace(found, status=Status.INTERRUPTED)
     return replace(
         then,
+        status=Status.COLLAPSED if found.status is Status.COLLAPSED else then.status,
         stages=found.stages + then.stages,
         history=found.history + then.history,
         path=found.path + then.path,
@@ -285,7 +291,7 @@ def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
 
 def _laid_out(piece: Piece, uv: FloatArray) -> FloatArray:
     """A piece's map in the surface's unit, along its axis; unturned where that would cost an inverted triangle."""
-    laid = np.ldexp(laid_along_axis(piece.F, uv), piece.exponent)
+    laid = in_given_unit(laid_along_axis(piece.F, uv), piece.exponent)
     if certify(piece.F, laid, loops=piece.loops).bijective:
         return laid
-    return np.ldexp(uv, piece.exponent)
+    return in_given_unit(uv, piece.exponent)

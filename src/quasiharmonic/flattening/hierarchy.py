@@ -26,6 +26,8 @@ from quasiharmonic.mesh.topology import boundary_loops
 _RIGID = 1e-2
 # A vertex keeps its place if none of its triangles has less than this share of the area that it has laid out flat.
 _LEAST = 0.05
+#: Triangles of a mesh whose triangles were never there are no lower than this share of their longest side.
+LOWEST = 0.05
 # Angles around a vertex of the boundary add up to this at most when its ring is laid out.
 _WIDEST = 1.9 * np.pi
 
@@ -215,10 +217,14 @@ def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, 
     """Whether no triangle around a vertex has lost most of the area that it should have."""
     now, then = around - place[:, None], flat
     last = -1 if rim else None
+    following = np.roll(then, -1, axis=1)
     area = (now.conj() * np.roll(now, -1, axis=1)).imag[:, :last]
-    rest = (then.conj() * np.roll(then, -1, axis=1)).imag[:, :last]
+    rest = (then.conj() * following).imag[:, :last]
+    # Both sides of a seam are at one place at rest: a triangle between them has no area there, but needs some.
+    longest = np.maximum(np.maximum(np.abs(then), np.abs(following)), np.abs(following - then))[:, :last]
+    rest = np.maximum(rest, LOWEST * longest**2)
     scale = area.sum(axis=1) / rest.sum(axis=1)
-    least = np.maximum(_LEAST * scale[:, None] * np.maximum(rest, 0), 0)
+    least = np.maximum(_LEAST * scale[:, None] * rest, 0)
     good: BoolArray = (area > least).all(axis=1)
     return good
 

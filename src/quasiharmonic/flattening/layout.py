@@ -49,13 +49,46 @@ def side_by_side(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArr
     """Shift maps (n, 2) whose bounding boxes begin at the origin such that they stand in a row.
 
     Between them there is a share of the largest side of all, or ``gap`` if that is more.
+
+    Raises
+    ------
+    ValueError
+        When they are so large that the row leaves the numbers' range.
     """
     gap = max(gap, _GAP * max(float(part.max()) for part in parts))
     shifted, right = [], 0.0
-    for part in parts:
-        shifted.append(part + np.array([right, 0.0]))
-        right = float(shifted[-1][:, 0].max()) + gap
-    return shifted
+    with np.errstate(over="ignore"):
+        for part in parts:
+            shifted.append(part + np.array([right, 0.0]))
+            right = float(shifted[-1][:, 0].max()) + gap
+    return [in_range(places) for places in shifted]
+
+
+def in_range(uv: FloatArray) -> FloatArray:
+    """A map as it is.
+
+    Raises
+    ------
+    ValueError
+        When positions have left the numbers' range.
+    """
+    if not np.isfinite(uv).all():
+        raise ValueError(
+            "the map does not fit into the range of doubles, beyond 1e308: scale the surface, or pins, down"
+        )
+    return uv
+
+
+def in_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
+    """A map in units of ``2 ** exponent`` in the unit that all was given in.
+
+    Raises
+    ------
+    ValueError
+        As `in_range`.
+    """
+    with np.errstate(over="ignore"):
+        return in_range(np.ldexp(uv, exponent))
 
 
 def in_unit_square(uv: FloatArray) -> FloatArray:

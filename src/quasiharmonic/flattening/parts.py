@@ -14,7 +14,13 @@ from quasiharmonic.result import Status
 
 # Several pieces together are as far as the one that comes first here; the status of those that have no bijective map is
 # told in another way.
-_FURTHEST_LAST = Status.INTERRUPTED, Status.STILL_FALLING, Status.EXHAUSTED, Status.POLISHED
+_FURTHEST_LAST = (
+    Status.INTERRUPTED,
+    Status.COLLAPSED,
+    Status.STILL_FALLING,
+    Status.EXHAUSTED,
+    Status.POLISHED,
+)
 
 
 class Part(NamedTuple):

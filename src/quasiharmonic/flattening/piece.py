@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,9 +19,12 @@ from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.exact.certificate import certify, is_injective
 from quasiharmonic.flattening.cascade import coarse_start
+from quasiharmonic.flattening.collapse import has_collapsed
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import FreeDescent, GuardedDescent, descend
+from quasiharmonic.flattening.layout import in_given_unit
 from quasiharmonic.flattening.start import disk_start
+from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 
@@ -28,6 +32,9 @@ from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
 COARSE_FROM = 50_000
 # A mean energy below this is near enough to the least for Newton's own steps.
 _NEAR = 1.0
+# ... and below this also where the boundary is guarded, which makes steps short whatever they aim at. From above, steps
+# of Newton's that halve it at best would be too many.
+_FAR = 1e4
 # Energies are equal if they differ by no more than this part of them.
 _SAME = 1e-6
 # Of so many last maps of a free descent the latest is looked for that is bijective, if its energy is at most so many
@@ -36,6 +43,10 @@ _RECENT, _NOT_FAR = 12, 10.0
 # Every so many steps of a free descent it is looked whether so much of the boundary has met itself that it will not
 # come apart again.
 _LOOK_EVERY, _TANGLED = 8, 0.1
+# Two descents from different starts have come to the same if their energies differ by no more than this part of them.
+_AGREE = 0.1
+# A descent that has not come to an end in so many steps is asked whether it will get anywhere.
+_MANY = 100
 
 
 @dataclass(frozen=True)
@@ -133,6 +144,17 @@ class Piece:
         return DeformationEnergy(self.V, self.F, density, weights=weights)
 
 
+@dataclass
+class _Attempt:
+    """Where descents from one start have ended."""
+
+    energy: float
+    uv: FloatArray
+    status: Status
+    solver: str
+    stages: range
+
+
 class Flattening:
     """The descent of one surface's map, and what is to be told of it.
 
@@ -148,6 +170,14 @@ class Flattening:
         self._rim = Rim(piece.loops)
         self._measure = piece.energy(settings.density, weights)
         self._bijective: FloatArray | None = None
+        # Whether a free descent has ended on itself, and the map, if that had come to rest.
+        self._overlaps = False
+        self._overlapping: FloatArray | None = None
+        self._starts = self._own_starts()
+        # The solver and the energy of those that there have been.
+        self._begun: set[tuple[str, float]] = set()
+        # Of the last descent.
+        self._steps = 0
         self._solver = ""
         self._stages: list[Stage] = []
         self._history: list[Step] = []
@@ -164,6 +194,8 @@ class Flattening:
         began = time.perf_counter()
         try:
             status = self._descended(start)
+            if self._collapsed(status):
+                status = self._begun_otherwise(status)
         except KeyboardInterrupt:
             if self._bijective is None:
                 raise
@@ -198,29 +230,123 @@ class Flattening:
             status = self._descent(own, guarded=False, near=near)
             if status is not None:
                 return status
+        return self._guarded()
+
+    def _guarded(self) -> Status:
+        """Descend from the bijective map at hand to bijective ones."""
         assert self._bijective is not None
-        status = self._descent(self._bijective, guarded=True, near=True)
+        near = self._measure.value(in_units(self._bijective, 0)) < _FAR
+        status = self._descent(self._bijective, guarded=True, near=near)
         assert status is not None
         return status
 
+    def _collapsed(self, status: Status) -> bool:
+        """Whether the descent that has ended so has come to a stand at a map which is far from what there should be."""
+        # What has converged is at a minimum, whatever that is like; only barriers of a boundary without room may feign
+        # it, and then there is a map to compare with.
+        converged = status is Status.POLISHED and self._overlapping is None
+        falling = status is Status.STILL_FALLING and self._steps < _MANY
+        if converged or falling or status is Status.INTERRUPTED:
+            return False
+        assert self._bijective is not None
+        piece, uv = self._piece, self._bijective
+        angles_alone = self._blind_to_scale(uv)
+        return has_collapsed(
+            piece.V, piece.F, piece.loops, piece.area, uv, self._overlapping, angles_alone=angles_alone
+        )
+
+    def _begun_otherwise(self, status: Status) -> Status:
+        """Descend from other starts until there is a map that has not collapsed; else take the best of all."""
+        attempts, first = [self._attempt(status, 0)], len(self._stages)
+        try:
+            while (own := self._next_start()) is not None:
+                found = self._descent(own[0], guarded=False, near=own[1]) if not self._overlaps else None
+                status = found or self._guarded()
+                attempts.append(self._attempt(status, first))
+                if not self._collapsed(status):
+                    return self._chosen(attempts, attempts[-1])
+                if self._agreed(attempts):
+                    return self._chosen(attempts)
+                first = len(self._stages)
+        except KeyboardInterrupt:
+            self._chosen([*attempts, self._attempt(Status.INTERRUPTED, first)])
+            raise
+        self._chosen(attempts)
+        return Status.COLLAPSED
+
+    def _agreed(self, attempts: Sequence[_Attempt]) -> bool:
+        """Whether different starts have led to the same as the last: then that is what the surface asks for."""
+        *others, last = attempts
+        least = min(attempt.energy for attempt in attempts)
+
+        def begun(attempt: _Attempt) -> float:
+            return self._stages[attempt.stages.start].energy[0]
+
+        return last.energy <= (1 + _AGREE) * least and any(
+            other.energy <= (1 + _AGREE) * least and abs(begun(other) - begun(last)) > _AGREE * begun(last)
+            for other in others
+        )
+
+    def _attempt(self, status: Status, first: int) -> _Attempt:
+        """The map at hand, to which the stages from ``first`` on have led."""
+        assert self._bijective is not None
+        energy = self._measure.value(in_units(self._bijective, 0))
+        return _Attempt(energy, self._bijective, status, self._solver, range(first, len(self._stages)))
+
+    def _chosen(self, attempts: Sequence[_Attempt], best: _Attempt | None = None) -> Status:
+        """Take on where one attempt has ended, by default the one of least energy; the others are discarded."""
+        best = best or min(attempts, key=lambda attempt: attempt.energy)
+        for attempt in attempts:
+            for k in attempt.stages if attempt is not best else ():
+                self._stages[k] = replace(self._stages[k], kept=False)
+        self._bijective, self._solver = best.uv, best.solver
+        return best.status
+
     def _own_start(self) -> tuple[FloatArray, bool]:
         """A bijective map, and whether it is near its best already."""
-        began = time.perf_counter()
-        piece, solver = self._piece, self._settings.linear_solver
-        uv = self._as_it_lies()
-        if uv is None and len(piece.F) < COARSE_FROM:
-            uv = disk_start(piece.V, piece.F, piece.loops, solver)
-        if uv is None:
-            uv = coarse_start(piece.V, piece.F, piece.loops, solver)
-        if uv is None:
+        own = self._next_start()
+        if own is None:
             raise ValueError(
                 "no bijective map to start from was found within double precision: the triangles differ too much in "
                 "size; give one by start"
             )
-        uv = self._bijective = self._in_scale(uv)
-        energy = self._measure.value(in_units(uv, 0))
-        self._stages.append(Stage("start", 0, time.perf_counter() - began, (0, 0), (energy, energy)))
-        return uv, energy < _NEAR
+        return own
+
+    def _next_start(self) -> tuple[FloatArray, bool] | None:
+        """The next of the library's own starts that there is, and whether it is near its best already."""
+        began = time.perf_counter()
+        for name, start in self._starts:
+            uv = start()
+            if uv is None:
+                continue
+            uv = self._in_scale(uv)
+            energy = self._measure.value(in_units(uv, 0))
+            if (self._settings.linear_solver, energy) in self._begun:
+                # Of a small surface the coarse mesh is the surface itself.
+                continue
+            self._begun.add((self._settings.linear_solver, energy))
+            self._bijective = uv
+            what = f"start anew, {name}" if self._stages else "start"
+            self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
+            return uv, energy < _NEAR
+        return None
+
+    def _own_starts(self) -> Iterator[tuple[str, Callable[[], FloatArray | None]]]:
+        """Bijective maps to begin with, the best bet first; each is made when it is called for, and may not exist."""
+        piece, solver = self._piece, self._settings.linear_solver
+        surface = piece.V, piece.F, piece.loops
+        disk = "disk", partial(disk_start, *surface, solver)
+        large = len(piece.F) >= COARSE_FROM
+        yield "as it lies", self._as_it_lies
+        if not large:
+            yield disk
+        yield "coarse mesh", partial(coarse_start, *surface, solver)
+        yield "coarse mesh, guarded", partial(coarse_start, *surface, solver, guarded=True)
+        if large:
+            yield disk
+        for other in [name for name in available() if name != self._solver][:1]:
+            self._settings = replace(self._settings, linear_solver=other)
+            yield f"coarse mesh, {other}", partial(coarse_start, *surface, other)
 
     def _as_it_lies(self) -> FloatArray | None:
         """The surface itself, if it is plane and covers no point twice: there is no better map."""
@@ -272,7 +398,10 @@ class Flattening:
             if apart:
                 self._bijective = descent.uv
             else:
+                self._overlaps = True
+                self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
                 self._bijective = self._latest_bijective(recent, _NOT_FAR * last)
+            self._steps = steps
             seconds = time.perf_counter() - began
             name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
             self._stages.append(Stage(name, steps, seconds, (0, 0), (first, last), kept=apart))
@@ -289,6 +418,6 @@ class Flattening:
         settings, number = self._settings, len(self._history)
         self._history.append(Step(number, 0, self._measure.value(descent.w)))
         if settings.record and number % settings.record == 0:
-            self._path.append(Snapshot(number, np.ldexp(descent.uv, self._piece.exponent)))
+            self._path.append(Snapshot(number, in_given_unit(descent.uv, self._piece.exponent)))
         if settings.callback is not None:
             settings.callback(self._history[-1])

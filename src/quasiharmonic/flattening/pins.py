@@ -31,6 +31,7 @@ from quasiharmonic.exact.diagnosis import Diagnosis, Kind
 from quasiharmonic.flattening.air import air_around
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import GuardedDescent, descend
+from quasiharmonic.flattening.layout import in_given_unit
 from quasiharmonic.flattening.piece import Flattening, Piece, Settings
 from quasiharmonic.flattening.pin_obstructions import pin_obstructions
 from quasiharmonic.mesh.refinement import split_edges
@@ -155,6 +156,8 @@ def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray,
 
 # In powers of two: how many times further apart pins may be than the surface is large, or nearer, for energies.
 _APART = 100
+# In powers of two, in its unit: how far away a map may be from the origin.
+_LARGEST = 1000
 # Ends of a search that say no more than that no map was found, of which one may be injective all the same.
 _UNDECIDED = Status.INJECTIVE, Status.SETTLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
@@ -174,8 +177,8 @@ class Pinned:
     status : Status
     exponent : int
         The map is in units of ``2 ** exponent``: in the piece's, unless pins are so much further apart, or nearer, than
-        vertices of the surface that squares of stretches leave the numbers' range. Energies are then measured as if
-        they were less so; what has the least is the same.
+        vertices of the surface that squares of stretches leave the numbers' range, or so far from the origin that they
+        would themselves. Energies are then measured as if they were less so; what has the least is the same.
     """
 
     def __init__(
@@ -186,7 +189,10 @@ class Pinned:
         # A quarter of it, for the difference of the largest numbers is none.
         extent, quarter = np.frexp(np.ptp(np.ldexp(target, -2), axis=0).max())
         apart = int(quarter) + 2 - piece.exponent if extent > 0 else 0
-        self.exponent = piece.exponent + apart - min(max(apart, -_APART), _APART)
+        unit = piece.exponent + apart - min(max(apart, -_APART), _APART)
+        # From the origin they may be still further away; a map there must not leave the numbers' range either.
+        self._larger = max(int(np.frexp(np.abs(target).max())[1]) - _LARGEST - unit, 0)
+        self.exponent = unit + self._larger
         self._target = np.ldexp(target, -self.exponent)
         self._energy = piece.energy(settings.density, weights)
         self._solver = ""
@@ -221,7 +227,7 @@ class Pinned:
         self._solver = flat.linear_solver
         if flat.status is Status.INTERRUPTED:
             self.status = Status.INTERRUPTED
-        moved = moved_onto(flat.uv, self._fixed, self._target)
+        moved = moved_onto(np.ldexp(flat.uv, -self._larger), self._fixed, self._target)
         self.keep(moved)
         return moved
 
@@ -349,7 +355,7 @@ class Pinned:
 
     def _outward(self, uv: FloatArray) -> FloatArray:
         """A map in the target's unit, the vertices where they were given to the last bit."""
-        placed: FloatArray = np.ldexp(uv, self.exponent)
+        placed = in_given_unit(uv, self.exponent)
         placed[self._fixed] = self._given
         return placed
 

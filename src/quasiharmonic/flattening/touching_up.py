@@ -19,13 +19,12 @@ from quasiharmonic.energy.newton_descent import in_units
 from quasiharmonic.energy.reweighted import ReweightedDirichlet
 from quasiharmonic.flattening.contacts import Rim
 from quasiharmonic.flattening.descent import FreeDescent, descend
+from quasiharmonic.flattening.hierarchy import LOWEST
 from quasiharmonic.mesh.coarsening import touching
 from quasiharmonic.mesh.prolongation import positive
 from quasiharmonic.mesh.reference import rest_frames
 from quasiharmonic.mesh.shapes import rest_shapes
 
-#: Triangles of a mesh whose triangles were never there are no lower than this share of their longest side.
-LOWEST = 0.05
 # Towards the weighted middle of its neighbours a vertex goes this share of the way, so often; no weight is below this.
 _SHARE, _SWEEPS, _LEAST_WEIGHT = 0.8, 4, 0.02
 # Triangles are opened up whose density is so many times that of three quarters of all, with so many rings around them,

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, named
 from quasiharmonic.mesh.reference import rest_frames
 
 # As `mesh.reference` corrects angles (§F.1).
@@ -44,6 +44,11 @@ class RestStrain(Strain):
         Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Those in space never are, nor are those of
         a planar surface that is seen from its own side (`mesh.shapes`).
 
+    Raises
+    ------
+    ValueError
+        When areas leave the range of doubles; names the triangles.
+
     Attributes
     ----------
     m : (f,) float64
@@ -57,9 +62,16 @@ class RestStrain(Strain):
         z1, z2 = rest_frames(V, F)
         if not signed:
             z2 = z2.real + 1j * np.abs(z2.imag)
-        self.m: FloatArray = 0.5 * z1 * z2.imag
         self.sides: ComplexArray = np.stack([z1 + 0j, z2 - z1, -z2])
-        self.half: ComplexArray = 0.25j * self.sides[(1, 2, 0), :] / self.m
+        with np.errstate(all="ignore"):
+            self.m: FloatArray = 0.5 * z1 * z2.imag
+            self.half: ComplexArray = 0.25j * self.sides[(1, 2, 0), :] / self.m
+        lost = np.flatnonzero(~(np.isfinite(self.m) & np.isfinite(self.half).all(axis=0)))
+        if lost.size:
+            raise ValueError(
+                f"the areas of {named('triangle', 'triangles', lost)} at rest leave the range of doubles: scale the "
+                "surface to about unit size"
+            )
         # In the triangle's plane, as (d, f): along the first side and across it.
         coordinates = np.ascontiguousarray(V.T)
         start, one, two = (coordinates[:, at] for at in self._corners)

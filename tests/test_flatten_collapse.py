@@ -1,0 +1,162 @@
+"""Maps that have collapsed: bijective, and stretched far more than their surface asks for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic.atlas.working import flatten as flatten_atlas
+from quasiharmonic.cuts.finding import find_cuts
+from quasiharmonic.energy.energies import SymmetricDirichlet
+from quasiharmonic.energy.measures import distortion
+from quasiharmonic.energy.newton_descent import in_units
+from quasiharmonic.exact.certificate import certify
+from quasiharmonic.flattening.cascade import coarse_start
+from quasiharmonic.flattening.collapse import has_collapsed, stretch_of_boundary, worst_stretch
+from quasiharmonic.flattening.contacts import Rim
+from quasiharmonic.flattening.flattened import flatten
+from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.result import Status
+from quasiharmonic.surfaces import cat, disk, starfish
+from shared.closed import TETRAHEDRON
+
+
+def cut_starfish(arms, rings=12, gain=0.1):
+    V, F = starfish(arms, rings)
+    cut = SeamedMesh(V, F).cut(find_cuts(V, F, gain=gain)).opened()
+    return cut.V / np.abs(cut.V).max(), cut.F
+
+
+def worst(V, F, uv):
+    return distortion(V, F, uv).summary("isometric").maximum
+
+
+def pinched(F, uv, loops, *, gap=1e-11, most=10):
+    """A bijective map with some of the narrow places between its boundary closed to nearly nothing."""
+    rim, taken = Rim(loops), np.zeros(0, dtype=int)
+    for _ in range(most):
+        w = in_units(uv, 0)
+        for v, a, b in rim.contacts(w).corners.T:
+            if np.isin([v, a, b], taken).any():
+                continue
+            moved = w.copy()
+            s = np.clip(((w[v] - w[a]) / (w[b] - w[a])).real, 0, 1)
+            nearest = (1 - s) * w[a] + s * w[b]
+            moved[v] = nearest + gap * (w[v] - nearest)
+            closer = moved.view(np.float64).reshape(-1, 2)
+            if certify(F, closer, loops=loops).bijective:
+                uv, taken = closer, np.append(taken, [v, a, b])
+                break
+    assert taken.size == 3 * most
+    return uv
+
+
+@pytest.mark.parametrize("arms", [3, 5])
+def test_a_start_from_which_the_map_collapses_is_left_for_another(arms):
+    V, F = cut_starfish(arms)
+    loops = boundary_loops(F, len(V))
+    start = pinched(F, coarse_start(V, F, loops), loops)
+    result = flatten(V, F, start=start)
+    assert result.certificate.bijective
+    assert result.status is Status.POLISHED
+    assert worst(V, F, result.uv) < 5
+    names = [stage.name for stage in result.stages]
+    assert names[2] == "start anew, disk"
+    # What had collapsed is on record as discarded.
+    assert [stage.kept for stage in result.stages] == [False, False, True, True]
+    assert result.stages[1].energy[1] > 100 * result.stages[3].energy[1]
+
+
+def test_a_far_map_is_left_in_few_steps_where_the_boundary_is_guarded():
+    # A disk of which nearly all is shrunk to 1e-15: steps of Newton's that halve the energy at best took 219.
+    V, F = cut_starfish(5)
+    disk = flatten(V, F, max_iterations=0).uv
+    away = disk - disk.mean(axis=0)
+    size = np.linalg.norm(away, axis=1, keepdims=True)
+    result = flatten(V, F, start=away * (size / size.max()) ** 8)
+    guarded = result.stages[-1]
+    assert guarded.name.startswith("guarded")
+    assert guarded.energy[0] > 1e14
+    assert guarded.iterations < 100
+    assert result.status is Status.POLISHED
+    assert worst(V, F, result.uv) < 5
+
+
+def test_a_descent_without_end_is_left_for_another_start():
+    V, F = cut_starfish(5)
+    disk = flatten(V, F, max_iterations=0).uv
+    away = disk - disk[np.argmax(np.linalg.norm(V, axis=1))]
+    size = np.linalg.norm(away, axis=1, keepdims=True)
+    result = flatten(V, F, start=away * (size / size.max()) ** 8, max_iterations=120)
+    assert result.status is Status.POLISHED
+    assert worst(V, F, result.uv) < 5
+    assert any(stage.name.startswith("start anew") for stage in result.stages)
+
+
+class Stuck(SymmetricDirichlet):
+    """Slopes that point upwards: no step lowers the energy."""
+
+    def slopes(self, d):
+        return tuple(-slope for slope in super().slopes(d))
+
+
+def test_a_collapse_from_every_start_is_the_status(monkeypatch):
+    V, F = cat(8)
+    monkeypatch.setattr("quasiharmonic.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    result = flatten(V, F, energy=Stuck())
+    assert result.status is Status.COLLAPSED
+    assert result.certificate.bijective
+    assert "energy='symmetric-dirichlet'" in result.status.value
+    starts = [stage for stage in result.stages if stage.name.startswith("start")]
+    assert len(starts) > 2
+    # The best of all is what there is.
+    ends = [stage.energy[1] for stage in result.stages if not stage.name.startswith("start")]
+    kept = [stage.energy[1] for stage in result.stages if stage.kept and not stage.name.startswith("start")]
+    assert min(ends) == kept[-1]
+
+
+def test_what_two_starts_agree_on_is_no_collapse(monkeypatch):
+    V, F = cut_starfish(3)
+    monkeypatch.setattr("quasiharmonic.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    result = flatten(V, F)
+    assert result.status is Status.POLISHED
+    assert result.certificate.bijective
+
+
+def test_a_collapsed_island_is_what_is_said_of_an_atlas(monkeypatch):
+    monkeypatch.setattr("quasiharmonic.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    plane, F = disk(3)
+    flat = np.column_stack([plane + 5, np.zeros(len(plane))])
+    V, G = cat(8)
+    both = SeamedMesh(np.concatenate([flat, V]), np.concatenate([F, G + len(flat)]))
+    assert flatten_atlas(both, energy=Stuck()).status is Status.COLLAPSED
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_collapse_is_a_matter_of_the_surface_and_not_of_scale(scale):
+    V, F = cat(12)
+    loops, uv = boundary_loops(F, len(V)), flatten(V, F).uv
+    area = 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1).sum()
+
+    def collapsed(uv, overlapping=None):
+        surface = V * scale, F, loops, area * scale**2
+        return has_collapsed(*surface, uv, overlapping, angles_alone=False)
+
+    squeezed = uv * [1.0, 1e-3]
+    assert not collapsed(uv)
+    assert collapsed(squeezed)
+    # Where the boundary may overlap itself the map is stretched as much.
+    assert not collapsed(squeezed, squeezed)
+    assert worst_stretch(V * scale, F, uv, angles_alone=False) == pytest.approx(worst(V, F, uv))
+
+
+def test_a_short_boundary_asks_for_stretch():
+    V, F = TETRAHEDRON
+    V, F = V * [1, 1, 100], F[1:]
+    (loop,) = boundary_loops(F, len(V))
+    a, b, c = V[F].swapaxes(0, 1)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert stretch_of_boundary(V, [loop], area) == pytest.approx(np.sqrt(4 * np.pi * area) / (2 + np.sqrt(2)))
+    V, F = disk(4)
+    assert stretch_of_boundary(V, boundary_loops(F, len(V)), np.pi) == pytest.approx(1.0, abs=0.05)
