@@ -274,6 +274,25 @@ class TestNoMap:
         assert result.history[-1].energy > 1e-3
         assert not result.diagnosis.obstructions
 
+    def test_tries_in_vain_at_patches_have_an_end(self, monkeypatch):
+        """Next to nothing is inverted, and restarts are of no use however often they are tried."""
+        V, F = disk(2)
+        V[15] = V[8]
+        steps, factor = [], NewtonSystem.factor
+
+        def counted(system, *shift):
+            steps.append(system)
+            assert len(steps) < 15_000, "it does not end"
+            factor(system, *shift)
+
+        monkeypatch.setattr(NewtonSystem, "factor", counted)
+        loop = boundary_of(F)
+        strategy = [VectorAdam(iterations=50), RandomRestarts(resume=True, in_vain=10**6)]
+        result = injective_map(np.c_[V, 0 * V[:, 0]], F, loop, V[loop], strategy=strategy, max_iterations=60)
+        assert result.status is Status.SETTLED
+        assert result.iterations <= 60
+        assert len(steps) > 100
+
     @pytest.mark.parametrize("wrong", [0, -5, 2.5, "many", np.nan])
     def test_wrong_number_of_iterations(self, wrong):
         with pytest.raises(ValueError, match="max_iterations must be a whole number"):

@@ -15,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Combing, Descent, Newton, Patches, Untangling, VectorAdam
-from quasiharmonic.descent.base import FunctionalDescent, Runner, SearchStage, SoFar, Steps
+from quasiharmonic.descent.base import FunctionalDescent, Patience, Runner, SearchStage, SoFar, Steps
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.triangles import triangle_signs
 from quasiharmonic.field.objective import Iterate, Objective
@@ -29,6 +29,8 @@ from quasiharmonic.search.coarse import coarse_mesh
 if TYPE_CHECKING:
     from quasiharmonic.exact.diagnosis import Diagnosis
 
+# Iterations that tries at patches may amount to and be of no use, in all stages together, as a multiple of the search's.
+_IN_VAIN = 16
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
 
@@ -179,6 +181,7 @@ class Search:
         self._spare: tuple[str, ...] | None = None if linear_solver == "auto" else ()
         self.callback = callback
         self.budget = budget
+        self._in_vain = _IN_VAIN * budget
         self.record = record
         self.path: list[Snapshot] = []
         self.history: list[Step] = []
@@ -213,7 +216,7 @@ class Search:
             status = self._descend_by_any(fallback, status)
             stages = on_the_mesh or [fallback]
         for stage in stages:
-            if status is Status.INJECTIVE or self._left <= 0:
+            if status is Status.INJECTIVE or self._left <= 0 or self._in_vain <= 0:
                 break
             # Later stages take long, and are in vain where no injective map exists.
             if self._tried and not stage.quick and self._examine().forbids_injective:
@@ -362,9 +365,16 @@ class Search:
 
     def _follow(self, stage: Descent, objective: Objective, start: Iterate) -> Status:
         """Look at every map of a stage until one is injective or nothing moves any more; why it ended."""
-        patience = _Patience(stage.patience)
+        patience = Patience(stage.patience)
         steps = Steps(stage.iterates(objective, start))
+        last: ComplexArray | None = None
         for here in chain([start], steps):
+            if here.w is last:
+                self._in_vain -= 1
+                if self._in_vain <= 0:
+                    return Status.SETTLED
+                continue
+            last = here.w
             step = self._visit(here, tensors=not stage.moves_vertices)
             if step.flipped == 0:
                 return Status.INJECTIVE
@@ -396,27 +406,6 @@ class Search:
         """How many triangles are not, decided exactly on the coordinates that are handed back."""
         sign, _ = triangle_signs(self.problem.F, self.problem.positions(w))
         return int(np.count_nonzero(sign <= 0))
-
-
-class _Patience:
-    """How long a stage has made no progress."""
-
-    def __init__(self, limits: tuple[int, float] | None) -> None:
-        self._most: float
-        self._most, self._progress = limits or (np.inf, 0.0)
-        self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
-
-    def is_over(self, flipped: int, value: float) -> bool:
-        """Whether too many steps in a row have righted no triangle and lowered the objective by too little."""
-        if flipped < self._flipped or value < self._low_enough:
-            self._flipped, self._value = min(flipped, self._flipped), min(value, self._value)
-            # V₄ may be negative.
-            fraction = self._progress * abs(self._value) if np.isfinite(self._value) else 0.0
-            self._low_enough = self._value - fraction
-            self._in_vain = 0
-        else:
-            self._in_vain += 1
-        return self._in_vain > self._most
 
 
 def _on_coarse(

@@ -140,5 +140,5 @@ def soonest(stages: Stages) -> Stages:
 
 
 def without_restarts(stages: Stages) -> Stages:
-    """A strategy without the stages that start again at random, whose failing tries no budget of iterations counts."""
+    """A strategy without the stages that start again at random, whose failing tries take many times an iteration."""
     return [stage for stage in stages if not isinstance(stage, RandomRestarts)] or stages
