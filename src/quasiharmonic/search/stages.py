@@ -9,13 +9,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Combing, Descent, Newton, Patches, Untangling, VectorAdam
 from quasiharmonic.descent.base import FunctionalDescent, Patience, Runner, SearchStage, SoFar, Steps
+from quasiharmonic.descent.patches import MOST_FLIPS
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.triangles import triangle_signs
 from quasiharmonic.field.objective import Iterate, Objective
@@ -29,8 +30,11 @@ from quasiharmonic.search.coarse import coarse_mesh
 if TYPE_CHECKING:
     from quasiharmonic.exact.diagnosis import Diagnosis
 
-# Iterations that tries at patches may amount to and be of no use, in all stages together, as a multiple of the search's.
+# Iterations that tries at patches may amount to in vain, in all stages together, as a multiple of the search's.
 _IN_VAIN = 16
+# What follows the first stage on a coarse mesh; and on the mesh itself where it left a few triangles inverted.
+_COARSE = Combing(resume=True), Patches(tries=15, resume=True), Untangling(iterations=400, resume=True)
+_CARRIED = Combing(resume=True), Patches(tries=15, resume=True)
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
 
@@ -132,6 +136,16 @@ class Begun(SearchStage):
         return search.take_over(self)
 
 
+class _State(NamedTuple):
+    """What a search knows of the best map, and the map of the lowest V₃; see `Search`."""
+
+    best: tuple[int, float]
+    best_map: ComplexArray
+    best_field: TensorField | None
+    best_reference: Reference
+    deepest: Iterate | None
+
+
 #: Whatever a strategy is made of.
 Stages: TypeAlias = Sequence[SearchStage]
 
@@ -193,6 +207,7 @@ class Search:
         self.best_reference: Reference = "equilateral"
         self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
+        self._aside: _State | None = None
         self._rounded = self._tried = False
 
     def run(self, stages: Stages) -> Status:
@@ -230,6 +245,8 @@ class Search:
         if self._examine().forbids_injective:
             self._towards_least_area()
             return Status.IMPOSSIBLE
+        if self._aside is not None and self._aside.best < self.best:
+            self._state = self._aside
         return Status.ROUNDED if self._rounded else status
 
     def attempt(self, stage: Descent, before: Status) -> Status:
@@ -276,32 +293,60 @@ class Search:
         coarse = None if self.record else coarse_mesh(self.problem)
         if coarse is None:
             return before
-        done, began, best = max(len(self.history), 1), time.perf_counter(), self.best
+        done, began, before_it = max(len(self.history), 1), time.perf_counter(), self._state
         problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
-        status, uv, self.linear_solver = _on_coarse(problem, stage.begins_with, self._asked, self._left, self._note)
-        if status in (Status.INJECTIVE, Status.INTERRUPTED):
+        first, left = stage.begins_with, self._left
+        status, uv, inverted, self.linear_solver = _on_coarse(problem, first, self._asked, left, self._note)
+        settled = status is not Status.IMPOSSIBLE and inverted <= MOST_FLIPS
+        if status in (Status.INJECTIVE, Status.INTERRUPTED) or settled:
             w = coarse.prolong(problem.frame.inward(uv))
-            mesh = self.problem.domain.mesh("equilateral")
-            flipped = self._not_positive(w)
-            self.best = flipped, 0.0 if flipped == 0 else np.inf
-            self.best_map, self.best_reference = w, mesh.kind
-            dw = mesh.derivatives(w)
-            self.best_field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
-            self._rounded |= status is Status.INJECTIVE and flipped > 0
+            self._rounded |= not self._take(w) and status is Status.INJECTIVE
             self._note(Step(0, *self.best))
         self.stages.append(
             Stage(
                 name=f"{stage.name}, {len(problem.F)} triangles",
                 iterations=len(self.history) - done,
                 seconds=time.perf_counter() - began,
-                flipped=(best[0], self.best[0]),
-                energy=(best[1], self.best[1]),
-                kept=self.best != best,
+                flipped=(before_it.best[0], self.best[0]),
+                energy=(before_it.best[1], self.best[1]),
+                kept=self.best != before_it.best,
             )
         )
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
+        if settled and self.best[0]:
+            self._repair_carried(before_it)
         return Status.INJECTIVE if self.best[0] == 0 else before
+
+    def _take(self, w: ComplexArray) -> bool:
+        """Take on a map from elsewhere, at its own tensors; whether it is injective."""
+        flipped = self._not_positive(w)
+        mesh = self.problem.domain.mesh("equilateral")
+        dw = mesh.derivatives(w)
+        field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
+        self._state = _State((flipped, 0.0 if flipped == 0 else np.inf), w, field, mesh.kind, self.deepest)
+        return flipped == 0
+
+    def _repair_carried(self, before_it: _State) -> None:
+        """Right the last inverted triangles of a map from a coarse mesh; where that fails, it is put aside.
+
+        Other stages then begin anew, and not in front of a wall that the coarse mesh may have put up.
+        """
+        for stage in _CARRIED:
+            if self._left > 0 and 0 < self.best[0] <= MOST_FLIPS:
+                self.deepest = stage.objective(self.problem, self._asked).of_map(self.best_map)
+                self._descend(stage)
+        if self.best[0]:
+            self._aside, self._state = self._state, before_it
+
+    @property
+    def _state(self) -> _State:
+        """What is known of the best map."""
+        return _State(self.best, self.best_map, self.best_field, self.best_reference, self.deepest)
+
+    @_state.setter
+    def _state(self, state: _State) -> None:
+        self.best, self.best_map, self.best_field, self.best_reference, self.deepest = state
 
     def _note(self, step: Step) -> None:
         """Write a step down, whatever its number was where it was made."""
@@ -410,13 +455,16 @@ class Search:
 
 def _on_coarse(
     problem: Problem, first: Descent, linear_solver: str, budget: int, callback: Callable[[Step], object]
-) -> tuple[Status, FloatArray, str]:
-    """Solve a coarse problem, and lower the distortion of its map a little: why it ended, the map, the backend."""
+) -> tuple[Status, FloatArray, int, str]:
+    """Solve a coarse problem, and lower the distortion of its map a little.
+
+    Why it ended, the map, its inverted triangles, the backend.
+    """
     search = Search(problem, linear_solver, callback, budget)
-    status = search.run([first, Combing(resume=True), Patches(resume=True), Untangling(resume=True)])
+    status = search.run([first, *_COARSE])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
         # Fine vertices crowd where coarse triangles are thin: a few steps against that pay many times over.
         polish = polish_map(problem.domain, uv, energy="mips", max_iterations=10, linear_solver=linear_solver)
         uv = polish.uv
-    return status, uv, search.linear_solver
+    return status, uv, search.best[0], search.linear_solver
