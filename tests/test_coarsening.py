@@ -344,7 +344,7 @@ class TestSearch:
         monkeypatch.setattr(CoarseMesh, "prolong", displaced)
         monkeypatch.setattr(stages, "_on_coarse", nearly)
         if not repaired:
-            monkeypatch.setattr(stages, "_CARRIED", ())
+            monkeypatch.setattr(stages, "_LOCAL", ())
         result = solve(posed, strategy=[CoarseToFine(VectorAdam()), VectorAdam(iterations=1)])
         first, *others = [s.name.split(",")[0] for s in result.stages]
         left = result.stages[0].flipped[1]

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 # Iterations that tries at patches may amount to in vain, in all stages together, as a multiple of the search's.
 _IN_VAIN = 16
-# What follows the first stage on a coarse mesh; and on the mesh itself where it left a few triangles inverted.
-_COARSE = Combing(resume=True), Patches(tries=15, resume=True), Untangling(iterations=400, resume=True)
-_CARRIED = Combing(resume=True), Patches(tries=15, resume=True)
+# What rights the last few triangles; and what follows the first stage on a coarse mesh.
+_LOCAL = Combing(resume=True), Patches(tries=15, resume=True)
+_COARSE = *_LOCAL, Untangling(resume=True), *_LOCAL
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
 
@@ -332,7 +332,7 @@ class Search:
 
         Other stages then begin anew, and not in front of a wall that the coarse mesh may have put up.
         """
-        for stage in _CARRIED:
+        for stage in _LOCAL:
             if self._left > 0 and 0 < self.best[0] <= MOST_FLIPS:
                 self.deepest = stage.objective(self.problem, self._asked).of_map(self.best_map)
                 self._descend(stage)
