@@ -297,11 +297,14 @@ class Search:
         problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
         first, left = stage.begins_with, self._left
         status, uv, inverted, self.linear_solver = _on_coarse(problem, first, self._asked, left, self._note)
-        settled = status is not Status.IMPOSSIBLE and inverted <= MOST_FLIPS
-        if status in (Status.INJECTIVE, Status.INTERRUPTED) or settled:
+        certain = status in (Status.INJECTIVE, Status.INTERRUPTED)
+        if certain or (status is not Status.IMPOSSIBLE and inverted <= MOST_FLIPS):
             w = coarse.prolong(problem.frame.inward(uv))
-            self._rounded |= not self._take(w) and status is Status.INJECTIVE
-            self._note(Step(0, *self.best))
+            flipped = self._not_positive(w)
+            if certain or flipped <= min(MOST_FLIPS, self.best[0] - 1):
+                self._take(w, flipped)
+                self._rounded |= status is Status.INJECTIVE and flipped > 0
+                self._note(Step(0, *self.best))
         self.stages.append(
             Stage(
                 name=f"{stage.name}, {len(problem.F)} triangles",
@@ -314,18 +317,16 @@ class Search:
         )
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        if settled and self.best[0]:
+        if self.best != before_it.best and self.best[0]:
             self._repair_carried(before_it)
         return Status.INJECTIVE if self.best[0] == 0 else before
 
-    def _take(self, w: ComplexArray) -> bool:
-        """Take on a map from elsewhere, at its own tensors; whether it is injective."""
-        flipped = self._not_positive(w)
+    def _take(self, w: ComplexArray, flipped: int) -> None:
+        """Take on a map from elsewhere, at its own tensors."""
         mesh = self.problem.domain.mesh("equilateral")
         dw = mesh.derivatives(w)
         field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
         self._state = _State((flipped, 0.0 if flipped == 0 else np.inf), w, field, mesh.kind, self.deepest)
-        return flipped == 0
 
     def _repair_carried(self, before_it: _State) -> None:
         """Right the last inverted triangles of a map from a coarse mesh; where that fails, it is put aside.
