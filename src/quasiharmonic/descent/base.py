@@ -55,6 +55,9 @@ class Runner(Protocol):
     def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
         """Descend on the mesh itself; where that finds no map, later stages go on from where this one began."""
 
+    def attempt_where_many(self, stage: Descent, before: Status) -> Status:
+        """Descend on the mesh itself if many triangles are inverted."""
+
     def take_over(self, begun: Any) -> Status:
         """Go on from what was found elsewhere by the stage that the search would begin with."""
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 # Iterations that tries at patches may amount to in vain, in all stages together, as a multiple of the search's.
 _IN_VAIN = 16
+# The share of inverted triangles above which they count as many.
+_MANY = 0.02
 # What rights the last few triangles; and what follows the first stage on a coarse mesh.
 _LOCAL = Combing(resume=True), Patches(tries=15, resume=True)
 _COARSE = *_LOCAL, Untangling(resume=True), *_LOCAL
@@ -92,6 +94,32 @@ class InPassing(SearchStage):
     def run(self, search: Runner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.attempt_in_passing(self.tried, before)
+
+
+@dataclass(frozen=True)
+class WhereMany(SearchStage):
+    """A stage that is run only where so many triangles are inverted that local repair would take longer than it does.
+
+    Attributes
+    ----------
+    tried : Descent
+    """
+
+    tried: Descent
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return self.tried.name
+
+    @property
+    def begins_with(self) -> Descent:
+        """``tried``."""
+        return self.tried
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.attempt_where_many(self.tried, before)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,6 +289,10 @@ class Search:
         if status is not Status.INJECTIVE:
             self.deepest = deepest
         return status
+
+    def attempt_where_many(self, stage: Descent, before: Status) -> Status:
+        """Run a stage on the mesh itself, if many of its triangles are inverted in the best map."""
+        return self.attempt(stage, before) if self.best[0] > _MANY * len(self.problem.F) else before
 
     def take_over(self, begun: Begun) -> Status:
         """Go on from a stage that was run elsewhere, as `attempt` does from its own."""
