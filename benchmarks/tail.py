@@ -3,11 +3,15 @@
     python benchmarks/tail.py --scans FOLDER [-n 700] [-o tail.jsonl]
     python benchmarks/tail.py --summary tail.jsonl [OTHER.jsonl …]
     python benchmarks/tail.py --scans FOLDER --case 17
+    python benchmarks/tail.py --family spirals [-n 20] [-o spirals.jsonl] [--case 17]
+    python benchmarks/tail.py --family pins [-n 20] [-o pins.jsonl] [--case 17]
 
 A number and the folder's files name a pair: a disk of 1,000 to 20,000 triangles around a random place of a scan, its
 boundary laid along a letter, a polygon, a star, a comb or a whirl. Edges across its rim are split, as they may forbid a
-map by themselves. Pairs that the diagnosis proves to have none do not count. Seconds are CPU seconds of one process,
-from arrays to a certified map; for those that can be compared let BLAS have one thread (``OMP_NUM_THREADS=1
+map by themselves. Two families of larger problems need no scans: *spirals*, round meshes of 30,000 triangles onto thin
+bands that are wound up, and *pins*, grids of 17,000 triangles whose boundary stays and 84 of whose inner vertices go
+where a warp takes them. Pairs that the diagnosis proves to have none do not count. Seconds are CPU seconds of one
+process, from arrays to a certified map; for those that can be compared let BLAS have one thread (``OMP_NUM_THREADS=1
 MKL_NUM_THREADS=1``). A campaign may be interrupted and goes on.
 """
 
@@ -17,12 +21,14 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import outlines
+import planar
 from campaign import read
 from pin_problems import patch_of_scan
 from quasiharmonic import Status, injective_map
@@ -30,6 +36,7 @@ from quasiharmonic.arrays import FloatArray, IntArray
 from quasiharmonic.exact.loops import judge_loops
 from quasiharmonic.mesh.refinement import split_edges
 from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.surfaces import disk, grid
 from quasiharmonic.targets import arc_length, filled
 
 Generator = np.random.Generator
@@ -87,6 +94,33 @@ def make(number: int, scans: Sequence[Path]) -> Pair:
         return Pair(V, F, loop, target, path.parent.name if path.stem == "input" else path.stem, word)
 
 
+def spirals(number: int) -> Pair:
+    """A round mesh, and a thin band wound up one to four times."""
+    rng = np.random.default_rng([11, number])
+    V, F = disk(71)
+    (loop,) = boundary_loops(F, len(V))
+    turns, half = rng.uniform(1, 4), np.pi * rng.uniform(0.1, 0.4)
+    angle = 2 * np.pi * np.linspace(0, turns, 40 + int(40 * turns))
+    radius, turn = angle + rng.uniform(1.1, 2) * np.pi, np.exp(1j * angle)
+    contour = filled([planar.points(np.concatenate([(radius + half) * turn, ((radius - half) * turn)[::-1]]))])[0]
+    return Pair(V, F, loop, arc_length(V[loop], contour), "disk", "spiral")
+
+
+def pins(number: int) -> Pair:
+    """A grid, its boundary where it was, and pins where a warp takes them that leaves every triangle positive."""
+    rng = np.random.default_rng([13, number])
+    V, F = grid(93, 93)
+    z = np.ascontiguousarray(V[:, :2]).view(np.complex128).ravel()
+    rim = np.concatenate(boundary_loops(F, len(V)))
+    image = planar.flow(rng, z, F, 5, 0.9, rim)
+    inside = np.setdiff1d(np.arange(len(V)), rim)
+    fixed = np.append(rim, rng.choice(inside, 84, replace=False))
+    return Pair(V, F, fixed, planar.points(image)[fixed], "grid", "pins")
+
+
+FAMILIES: dict[str, Callable[[int], Pair]] = {"spirals": spirals, "pins": pins}
+
+
 def _without_chords(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
     """Split interior edges that join two boundary vertices."""
     found = edges(F, len(V))
@@ -96,9 +130,9 @@ def _without_chords(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
     return refined.V, refined.F
 
 
-def run(number: int, scans: Sequence[Path]) -> Record:
+def run(number: int, pose: Callable[[int], Pair]) -> Record:
     """Make and solve a pair."""
-    pair = make(number, scans)
+    pair = pose(number)
     record: Record = {"name": str(number), "surface": pair.surface, "outline": pair.outline, "triangles": len(pair.F)}
     began = time.process_time()
     result = injective_map(pair.V, pair.F, pair.fixed, pair.target)
@@ -145,6 +179,7 @@ def main() -> None:
     """Run, summarise or repeat."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=Path, help="a folder with OBJ files, in folders of it too")
+    parser.add_argument("--family", choices=FAMILIES, help="problems that need no scans")
     parser.add_argument("-n", "--count", type=int, default=700, help="pairs (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("tail.jsonl"), help="records (%(default)s)")
     parser.add_argument("--summary", type=Path, nargs="+", metavar="RESULTS", help="summarise records and end")
@@ -155,16 +190,17 @@ def main() -> None:
             print(f"{path}\n\n{summary(read(path))}\n")
         return
     scans = sorted(options.scans.rglob("*.obj")) if options.scans else []
-    if not scans:
-        parser.error("name a folder with OBJ files: --scans FOLDER")
+    if not scans and not options.family:
+        parser.error("name a folder with OBJ files or a family: --scans FOLDER, --family NAME")
+    pose = FAMILIES[options.family] if options.family else partial(make, scans=scans)
     if options.case:
-        print(*(_story(run(number, scans)) for number in options.case), sep="\n")
+        print(*(_story(run(number, pose)) for number in options.case), sep="\n")
         return
     done = {record["name"] for record in read(options.output)}
     with options.output.open("a", encoding="utf-8") as file:
         for number in range(options.count):
             if str(number) not in done:
-                file.write(json.dumps(run(number, scans)) + "\n")
+                file.write(json.dumps(run(number, pose)) + "\n")
                 file.flush()
     print(summary(read(options.output)))
 

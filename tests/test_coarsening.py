@@ -18,7 +18,7 @@ from quasiharmonic.mesh.removal import by_degree, remove_vertices, room_for_roun
 from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.problem import Domain
 from quasiharmonic.search import stages
-from quasiharmonic.search.coarse import coarse_mesh
+from quasiharmonic.search.coarse import CoarseMesh, coarse_mesh
 from quasiharmonic.search.stages import CoarseToFine
 from quasiharmonic.search.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
@@ -324,6 +324,39 @@ class TestSearch:
         assert not result.stages[0].kept
         assert result.iterations == len(result.history) - 1
         assert not np.array_equal(result.uv, found.uv)
+
+    @pytest.mark.parametrize("repaired", [True, False])
+    def test_what_a_coarse_search_leaves_inverted_is_repaired_on_the_mesh(self, posed, monkeypatch, repaired):
+        """A search of the whole mesh for a triangle or two took many times as long."""
+        solved = stages._on_coarse
+
+        def nearly(coarse, *further):
+            _, uv, _, solver = solved(coarse, *further)
+            return Status.SETTLED, uv, 1, solver
+
+        def displaced(coarse, w):
+            fine = prolonged(coarse, w)
+            inside = posed.F[~np.isin(posed.F, posed.fixed).any(axis=1)]
+            fine[inside[0, 0]] += 1.5 * (fine[inside[0, 1]] - fine[inside[0, 0]])
+            return fine
+
+        prolonged = CoarseMesh.prolong
+        monkeypatch.setattr(CoarseMesh, "prolong", displaced)
+        monkeypatch.setattr(stages, "_on_coarse", nearly)
+        if not repaired:
+            monkeypatch.setattr(stages, "_LOCAL", ())
+        result = solve(posed, strategy=[CoarseToFine(VectorAdam()), VectorAdam(iterations=1)])
+        first, *others = [s.name.split(",")[0] for s in result.stages]
+        left = result.stages[0].flipped[1]
+        assert first == "coarse-to-fine"
+        assert 0 < left <= 50
+        assert result.injective is repaired
+        if repaired:
+            assert set(others) <= {"combing", "patches"}
+        else:
+            # It begins anew, and what it comes to is worse than what was put aside.
+            assert others == ["vector-adam"]
+            assert result.stages[1].flipped[1] > left == len(result.certificate.flipped)
 
     def test_is_left_out_where_it_does_not_serve(self, posed):
         small = Problem(*on_letter("C", rings=12))

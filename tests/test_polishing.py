@@ -242,6 +242,32 @@ def test_an_energy_of_ones_own():
     assert distortion(V, F, areas.uv).area_ratio.std() < 0.5 * distortion(V, F, uv).area_ratio.std()
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "words"),
+    [("density", "the energy is"), ("slopes", "the first derivative is"), ("bends", "the second derivative is")],
+)
+def test_an_energy_of_ones_own_that_is_no_number_is_named(spoilt, words):
+    class Spoilt(MIPS):
+        def density(self, d):
+            return self.at_some("density", super().density(d))
+
+        def slopes(self, d):
+            return tuple(self.at_some("slopes", part) for part in super().slopes(d))
+
+        def bends(self, d):
+            return tuple(self.at_some("bends", part) for part in super().bends(d))
+
+        def at_some(self, what, values):
+            values = np.array(values)
+            if what == spoilt:
+                values[[3, 50]] = np.nan
+            return values
+
+    V, F, uv, fixed = bowl()
+    with pytest.raises(ValueError, match=rf"Spoilt: {words} no number \(NaN\) at triangles 3, 50, where \|p\| = "):
+        polish(V, F, uv, fixed=fixed, energy=Spoilt())
+
+
 def test_for_a_problem_at_hand():
     V, F, uv, fixed = bowl()
     expected = polish(V, F, uv, fixed=fixed, energy="mips")

@@ -18,7 +18,9 @@ from quasiharmonic.descent.untangling import untangled
 from quasiharmonic.energy.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.stages import CoarseToFine
+from quasiharmonic.search import stages
+from quasiharmonic.search.stages import CoarseToFine, WhereMany
+from quasiharmonic.search.strategy import soonest, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from shared.exact import inverted
 from shared.meshes import bend, boundary_of, lift, signed_areas
@@ -274,6 +276,25 @@ class TestNoMap:
         assert result.history[-1].energy > 1e-3
         assert not result.diagnosis.obstructions
 
+    def test_tries_in_vain_at_patches_have_an_end(self, monkeypatch):
+        """Next to nothing is inverted, and restarts are of no use however often they are tried."""
+        V, F = disk(2)
+        V[15] = V[8]
+        steps, factor = [], NewtonSystem.factor
+
+        def counted(system, *shift):
+            steps.append(system)
+            assert len(steps) < 15_000, "it does not end"
+            factor(system, *shift)
+
+        monkeypatch.setattr(NewtonSystem, "factor", counted)
+        loop = boundary_of(F)
+        strategy = [VectorAdam(iterations=50), RandomRestarts(resume=True, in_vain=10**6)]
+        result = injective_map(np.c_[V, 0 * V[:, 0]], F, loop, V[loop], strategy=strategy, max_iterations=60)
+        assert result.status is Status.SETTLED
+        assert result.iterations <= 60
+        assert len(steps) > 100
+
     @pytest.mark.parametrize("wrong", [0, -5, 2.5, "many", np.nan])
     def test_wrong_number_of_iterations(self, wrong):
         with pytest.raises(ValueError, match="max_iterations must be a whole number"):
@@ -345,6 +366,28 @@ class TestNoMap:
     def test_untangling_that_is_cut_short_has_not_settled(self):
         result = injective_map(*turned_ring(180), strategy=[Untangling(iterations=2)])
         assert result.status is Status.OUT_OF_ITERATIONS
+
+    @pytest.mark.parametrize("many", [True, False])
+    def test_a_stage_for_where_many_are_inverted_is_left_out_where_few_are(self, many, monkeypatch):
+        problem = Problem(*turned_ring(180))
+        if not many:
+            monkeypatch.setattr(stages, "_MANY", 1.0)
+        strategy = [VectorAdam(iterations=1), WhereMany(Newton(iterations=2, resume=True))]
+        result = solve(problem, strategy=strategy)
+        assert result.stages[0].flipped[1] > 0.02 * len(problem.F)
+        assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + many * ["newton, tanh"]
+
+    def test_newton_comes_before_repair_on_large_meshes_with_many_inverted(self):
+        V, F = disk(45)
+        stages = speed(Problem(V, F, boundary_of(F), V[boundary_of(F)]))
+        words = [type(stage).__name__ for stage in stages]
+        assert words[:4] == ["CoarseToFine", "Composite", "WhereMany", "Combing"]
+        assert [type(stage).__name__ for stage in soonest(stages)] == [
+            "CoarseToFine",
+            "Composite",
+            "Combing",
+            "Patches",
+        ]
 
     def test_stages_for_a_coarse_mesh_alone_solve_a_small_one_as_it_is(self):
         result = injective_map(*star_problem(n=80), strategy=[CoarseToFine(VectorAdam())])

@@ -97,7 +97,8 @@ def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[C
     for repair in _REPAIRS:
         try:
             for step in repair.iterates(objective, here):
-                here = step
-                yield here.w
+                again, here = step.w is here.w, step
+                if not again:
+                    yield here.w
         except NotPositiveDefinite:
             return

@@ -55,6 +55,9 @@ class Runner(Protocol):
     def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
         """Descend on the mesh itself; where that finds no map, later stages go on from where this one began."""
 
+    def attempt_where_many(self, stage: Descent, before: Status) -> Status:
+        """Descend on the mesh itself if many triangles are inverted."""
+
     def take_over(self, begun: Any) -> Status:
         """Go on from what was found elsewhere by the stage that the search would begin with."""
 
@@ -152,7 +155,8 @@ class Descent(SearchStage):
         Yields
         ------
         Iterate
-            Every map on the way, ``start`` excepted.
+            Every map on the way, ``start`` excepted. One of the same ``w`` as the last says that what took as long as
+            an iteration was of no use: a search counts these apart.
 
         Returns
         -------
@@ -164,6 +168,33 @@ class Descent(SearchStage):
         quasiharmonic.linsolve.NotPositiveDefinite
             When even short steps leave no positive definite Laplacian.
         """
+
+
+class Patience:
+    """How long a stage has made no progress.
+
+    Parameters
+    ----------
+    limits : (int, float) or None
+        As of `Descent.patience`.
+    """
+
+    def __init__(self, limits: tuple[int, float] | None) -> None:
+        self._most: float
+        self._most, self._progress = limits or (np.inf, 0.0)
+        self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
+
+    def is_over(self, flipped: int, value: float) -> bool:
+        """Whether too many steps in a row have righted no triangle and lowered the objective by too little."""
+        if flipped < self._flipped or value < self._low_enough:
+            self._flipped, self._value = min(flipped, self._flipped), min(value, self._value)
+            # V₄ may be negative.
+            fraction = self._progress * abs(self._value) if np.isfinite(self._value) else 0.0
+            self._low_enough = self._value - fraction
+            self._in_vain = 0
+        else:
+            self._in_vain += 1
+        return self._in_vain > self._most
 
 
 class Steps:

@@ -25,7 +25,7 @@ import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
 from quasiharmonic.descent.base import Iterates, VertexDescent
-from quasiharmonic.descent.patches import Patch, patch_around, remapped
+from quasiharmonic.descent.patches import Effort, Patch, patch_around, remapped
 from quasiharmonic.exact.certificate import flipped_triangles
 from quasiharmonic.field.objective import Iterate, Objective
 from quasiharmonic.hearing import still_at_it
@@ -43,6 +43,8 @@ _KEPT, _ENOUGH, _RIGHTED = 0.1, 1.0, 1e-3
 _REACH = 20.0
 # Steps of the simplex method at most, each of which takes time like the triangles: a tenth of a second or two in all.
 _PIVOTS_TIMES_TRIANGLES = 4_000_000
+# A programme takes about as long as so many steps of untangling the patch.
+_STEPS_A_PROGRAMME = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,17 +69,20 @@ class Combing(VertexDescent):
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a map after every programme that left fewer inverted triangles."""
-        problem = objective.problem
+        problem, effort = objective.problem, Effort(len(objective.problem.F))
         rng = np.random.default_rng(0)
 
         def other(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
             triangle, rings = int(rng.choice(left)), int(rng.choice(_RINGS))
             patch = patch_around(problem, triangle, rings, _MOST_TRIANGLES)
             patch = patch or patch_around(problem, triangle, _RINGS[0], _MOST_NEAR)
-            return None if patch is None else (patch, combed(rng, patch.F, w[patch.vertices], patch.held))
+            if patch is None:
+                return None
+            effort.count(len(patch.F), _STEPS_A_PROGRAMME)
+            return patch, combed(rng, patch.F, w[patch.vertices], patch.held)
 
         left = flipped_triangles(problem.F, problem.positions(start.w))
-        yield from remapped(objective, start.w, left, other, patience=self.in_vain)
+        yield from remapped(objective, start.w, left, other, patience=self.in_vain, effort=effort)
         return True
 
 

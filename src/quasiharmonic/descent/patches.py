@@ -29,6 +29,9 @@ MOST_TRIANGLES = 1000
 _MOST_SHARE = 0.25
 # Rings of triangles around an inverted one, tried in turn.
 _RINGS = 2, 4, 8, 16
+# To how many triangles the time amounts that a step on a patch takes besides, and that an iteration on a mesh does;
+# and the most triangles that a mesh's iteration is counted with: patches do not grow with the mesh.
+_BESIDES, _BESIDES_AN_ITERATION, _LARGE = 400, 200, 4 * MOST_TRIANGLES
 
 
 class Patch(NamedTuple):
@@ -47,6 +50,32 @@ class Patch(NamedTuple):
     F: IntArray
     vertices: IntArray
     held: BoolArray
+
+
+class Effort:
+    """What tries at patches cost, in iterations on the whole mesh.
+
+    It is counted in steps and triangles and not in seconds, so that a search ends at the same map every time.
+
+    Parameters
+    ----------
+    triangles : int
+        Of the whole mesh.
+    """
+
+    def __init__(self, triangles: int) -> None:
+        self._iteration = min(triangles, _LARGE) + _BESIDES_AN_ITERATION
+        self._spent = 0.0
+
+    def count(self, triangles: int, steps: int = 1) -> None:
+        """Count steps on a patch of so many triangles."""
+        self._spent += steps * (triangles + _BESIDES) / self._iteration
+
+    def due(self) -> int:
+        """Whole iterations that were spent and not yet asked for."""
+        whole = int(self._spent)
+        self._spent -= whole
+        return whole
 
 
 #: From a map and its inverted triangles to a patch and another map of it.
@@ -120,6 +149,7 @@ def remapped(
     patience: int,
     most: int | None = None,
     tries: int | None = None,
+    effort: Effort | None = None,
 ) -> Iterator[Iterate]:
     """Take other maps of patches, one after the other, as long as they leave no more inverted triangles.
 
@@ -138,28 +168,34 @@ def remapped(
         Inverted triangles at most for it to be worth a try.
     tries : int, optional
         Patches at most.
+    effort : Effort, optional
+        What ``other`` counts its steps in.
 
     Yields
     ------
     Iterate
-        A map after every patch that left fewer inverted triangles.
+        A map after every patch that left fewer inverted triangles, and the last of them (or else that of ``w``) again
+        for every iteration that the tries amount to.
     """
-    problem = objective.problem
+    problem, effort = objective.problem, effort or Effort(len(objective.problem.F))
+    first, here = w, None
     in_vain, done = 0, 0
     while left.size and (most is None or left.size <= most) and in_vain < patience and done != tries:
         in_vain, done = in_vain + 1, done + 1
         found = other(w, left)
-        if found is None:
-            continue
-        patch, there = found
-        moved = w.copy()
-        moved[patch.vertices] = there
-        now = flipped_triangles(problem.F, problem.positions(moved))
-        if now.size <= left.size:
-            fewer, w, left = now.size < left.size, moved, now
-            if fewer:
-                in_vain = 0
-                yield objective.of_map(w)
+        if found is not None:
+            patch, there = found
+            moved = w.copy()
+            moved[patch.vertices] = there
+            now = flipped_triangles(problem.F, problem.positions(moved))
+            if now.size <= left.size:
+                fewer, w, left = now.size < left.size, moved, now
+                if fewer:
+                    in_vain, here = 0, objective.of_map(w)
+                    yield here
+        for _ in range(effort.due()):
+            here = here or objective.of_map(first)
+            yield here
 
 
 def last_untangled(
@@ -169,9 +205,14 @@ def last_untangled(
     grading: float,
     linear_solver: str,
     weights: FloatArray | None = None,
+    effort: Effort | None = None,
 ) -> ComplexArray:
     """Where untangling a map of a patch (v,) complex128 ends, some vertices (v,) bool held, triangles weighed (p,)."""
-    last, stay = w, np.flatnonzero(held)
+    last, stay, steps = w, np.flatnonzero(held), 1
     for step in untangled(patch.F, w, stay, grading=grading, linear_solver=linear_solver, weights=weights):
         last = step
+        steps += 1
+    if effort is not None:
+        # To begin takes as long as a step.
+        effort.count(len(patch.F), steps)
     return last

@@ -18,8 +18,16 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from quasiharmonic.arrays import BoolArray, ComplexArray, IntArray, whole_number
-from quasiharmonic.descent.base import Iterates, VertexDescent
-from quasiharmonic.descent.patches import MOST_FLIPS, MOST_TRIANGLES, Patch, last_untangled, patch_around, remapped
+from quasiharmonic.descent.base import Iterates, Patience, VertexDescent
+from quasiharmonic.descent.patches import (
+    MOST_FLIPS,
+    MOST_TRIANGLES,
+    Effort,
+    Patch,
+    last_untangled,
+    patch_around,
+    remapped,
+)
 from quasiharmonic.descent.reweighting import reweighted
 from quasiharmonic.descent.untangling import GRADINGS, untangled
 from quasiharmonic.energy.deformation import signed_areas
@@ -70,11 +78,6 @@ class RandomRestarts(VertexDescent):
         if self.tries is not None:
             whole_number("tries", self.tries, least=1)
 
-    @property
-    def patience(self) -> tuple[int, float] | None:
-        """Untangling all of the mesh is cut short where it gets nowhere."""
-        return self.in_vain, 0.0
-
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a map after every patch that left fewer inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
@@ -82,30 +85,41 @@ class RandomRestarts(VertexDescent):
         w = start.w
         left = flipped_triangles(problem.F, problem.positions(w))
         if left.size > MOST_FLIPS:
+            # Untangling all of the mesh is cut short where it gets nowhere.
+            whole = Patience((self.in_vain, 0.0))
+            whole.is_over(start.flipped, start.value)
             for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
-                yield objective.of_map(w)
+                here = objective.of_map(w)
+                yield here
+                if whole.is_over(here.flipped, here.value):
+                    return True
             left = flipped_triangles(problem.F, problem.positions(w))
-        patience = self.in_vain
+        patience, effort = self.in_vain, Effort(len(problem.F))
         if 0 < left.size <= MOST_FLIPS and objective.of_map(w).energy < _NEXT_TO_NOTHING:
             patience *= _DILIGENCE
 
         def other(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
+            effort.count(0)
             patch = patch_around(problem, int(rng.choice(left)), int(rng.choice(_RINGS)), MOST_TRIANGLES)
             if patch is None:
                 return None
             try:
-                return patch, _restarted(rng, problem, patch, w[patch.vertices], solver)
+                return patch, _restarted(rng, problem, patch, w[patch.vertices], solver, effort)
             except NotPositiveDefinite:
                 return None
 
-        yield from remapped(objective, w, left, other, patience=patience, most=MOST_FLIPS, tries=self.tries)
+        yield from remapped(
+            objective, w, left, other, patience=patience, most=MOST_FLIPS, tries=self.tries, effort=effort
+        )
         return True
 
 
-def _restarted(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str) -> ComplexArray:
+def _restarted(
+    rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str, effort: Effort
+) -> ComplexArray:
     """Another map of a patch."""
     if rng.random() < _REWEIGHTED:
-        return reweighted(rng, patch, w, solver)
+        return reweighted(rng, patch, w, solver, effort)
     grading = float(rng.choice(GRADINGS))
     place = _place(rng, problem, patch, w) if rng.random() < 0.5 else None
     held = patch.held.copy()
@@ -113,9 +127,9 @@ def _restarted(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, 
         vertex, there = place
         w, held[vertex] = w.copy(), True
         w[vertex] = there
-    w = last_untangled(patch, _random_map(rng, patch, w, held, solver), held, grading, solver)
+    w = last_untangled(patch, _random_map(rng, patch, w, held, solver), held, grading, solver, None, effort)
     if place is not None and signed_areas(patch.F, w).min() <= 0:
-        w = last_untangled(patch, w, patch.held, grading, solver)
+        w = last_untangled(patch, w, patch.held, grading, solver, None, effort)
     return w
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray
-from quasiharmonic.descent.patches import Patch, last_untangled
+from quasiharmonic.descent.patches import Effort, Patch, last_untangled
 from quasiharmonic.descent.untangling import GRADINGS
 from quasiharmonic.energy.deformation import signed_areas
 
@@ -25,7 +25,9 @@ _ROUNDS = 15
 _WILD = 15
 
 
-def reweighted(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str) -> ComplexArray:
+def reweighted(
+    rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: Effort | None = None
+) -> ComplexArray:
     """Another map of a patch, by weighing its inverted triangles.
 
     Parameters
@@ -37,6 +39,8 @@ def reweighted(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str
         Its map.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
+    effort : Effort, optional
+        What steps are counted in.
 
     Returns
     -------
@@ -49,7 +53,7 @@ def reweighted(rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str
     first, last = inverted.sum(), w
     for _ in range(_ROUNDS):
         weights[inverted] *= factor
-        w = last_untangled(patch, w, patch.held, float(rng.choice(GRADINGS)), linear_solver, weights)
+        w = last_untangled(patch, w, patch.held, float(rng.choice(GRADINGS)), linear_solver, weights, effort)
         inverted = signed_areas(patch.F, w) <= 0
         if inverted.sum() <= first:
             last = w

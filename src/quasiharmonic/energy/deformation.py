@@ -16,6 +16,9 @@ from quasiharmonic.kernels import compiled
 from quasiharmonic.mesh.reference import blocks
 from quasiharmonic.mesh.shapes import rest_shapes
 
+# Singular values between this and its inverse are out of the reach of overflow, in whatever an energy makes of them.
+_ORDINARY = 1e20
+
 
 class DeformationEnergy:
     """An energy on a mesh.
@@ -136,6 +139,36 @@ class DeformationEnergy:
         if mixture is None:
             return self.energy.curvature(d, negative=negative).scaled(self.share)
         return curvature_of_mixture(mixture, d, self.share, negative)
+
+    def check_numbers(self, d: Deformation) -> None:
+        """Raise a ValueError if the energy or its derivatives are NaN where no overflow can be the reason.
+
+        Raises
+        ------
+        ValueError
+            Which of them, and at which triangles.
+        """
+        larger = np.abs(d.p) + np.abs(d.q)
+        ordinary = (larger < _ORDINARY) & (d.det > larger / _ORDINARY)
+        with np.errstate(all="ignore"):
+            form = self.energy.curvature(d, negative=1.0)
+            found = {
+                "energy": (self.energy.density(d),),
+                "first derivative": self.energy.gradient(d),
+                "second derivative": (form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc),
+            }
+        for what, parts in found.items():
+            wrong = np.zeros(len(self.F), dtype=bool)
+            for part in parts:
+                wrong |= np.isnan(part)
+            bad = np.flatnonzero(wrong & ordinary)
+            if bad.size:
+                where = named("triangle", "triangles", bad)
+                raise ValueError(
+                    f"{type(self.energy).__name__}: the {what} is no number (NaN) at {where}, "
+                    f"where |p| = {abs(d.p[bad[0]]):.6g} and |q| = {abs(d.q[bad[0]]):.6g} at the first; "
+                    "quasiharmonic.energy.derivatives.check_energy tries an energy"
+                )
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
         """How far along a direction each triangle's area first vanishes.

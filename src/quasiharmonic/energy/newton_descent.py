@@ -21,6 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, work
+from quasiharmonic.energy.deformation import DeformationEnergy
 from quasiharmonic.energy.energies import QuadraticForm
 from quasiharmonic.energy.line_search import backtrack, extend
 from quasiharmonic.energy.newton_system import NewtonSystem
@@ -178,7 +179,13 @@ class NewtonDescent:
             if moved:
                 self._idle = 0 if before - self.value > _IDLE * tolerance * before else self._idle + 1
                 return Status.EXHAUSTED if self._idle >= _PATIENCE else None
+        self._check_numbers()
         return Status.EXHAUSTED
+
+    def _check_numbers(self) -> None:
+        """Raise a ValueError where there is no step to take, or no factorisation, as an energy has no numbers."""
+        if isinstance(self.energy, DeformationEnergy):
+            self.energy.check_numbers(self._deformation)
 
     def lower(self, energy: Lowered) -> None:
         """Go on with another energy on the same triangles."""
@@ -210,6 +217,7 @@ class NewtonDescent:
             direction, promise, tried = found
             self._shift = skipped + tried
             return direction, promise, True
+        self._check_numbers()
         if shifts is SHIFTS:
             self._shift = len(SHIFTS) - 1
         direction = self.system.solve_diagonal(-gradient)

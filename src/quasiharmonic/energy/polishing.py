@@ -119,7 +119,8 @@ def polish(
         When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
         the message names the triangles. When the boundary is not on the curves that it is to slide along (see `Rails`),
         or triangles are inverted once it is on them. When the energy is not known, not a barrier or without second
-        derivatives, or another option has no such value.
+        derivatives, or another option has no such value. When there is no step to take as an energy of one's own, or a
+        derivative of it, is NaN: the message names which, and the triangles.
 
     Examples
     --------

@@ -62,7 +62,7 @@ def injective_map(
         its tensors, and afresh where that leads nowhere.
     max_iterations : int
         Iterations to spend at most on finding the map: one linear solve each on the whole mesh. Tries at repairing a
-        small patch are counted where they succeed.
+        small patch are counted where they succeed; those in vain may together take as long as 16 times so many.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional

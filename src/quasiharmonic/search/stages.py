@@ -9,13 +9,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from quasiharmonic.arrays import ComplexArray, FloatArray
 from quasiharmonic.descent import Combing, Descent, Newton, Patches, Untangling, VectorAdam
-from quasiharmonic.descent.base import FunctionalDescent, Runner, SearchStage, SoFar, Steps
+from quasiharmonic.descent.base import FunctionalDescent, Patience, Runner, SearchStage, SoFar, Steps
+from quasiharmonic.descent.patches import MOST_FLIPS
 from quasiharmonic.energy.polishing import polish_map
 from quasiharmonic.exact.triangles import triangle_signs
 from quasiharmonic.field.objective import Iterate, Objective
@@ -29,6 +30,13 @@ from quasiharmonic.search.coarse import coarse_mesh
 if TYPE_CHECKING:
     from quasiharmonic.exact.diagnosis import Diagnosis
 
+# Iterations that tries at patches may amount to in vain, in all stages together, as a multiple of the search's.
+_IN_VAIN = 16
+# The share of inverted triangles above which they count as many.
+_MANY = 0.02
+# What rights the last few triangles; and what follows the first stage on a coarse mesh.
+_LOCAL = Combing(resume=True), Patches(tries=15, resume=True)
+_COARSE = *_LOCAL, Untangling(resume=True), *_LOCAL
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
 
@@ -88,6 +96,32 @@ class InPassing(SearchStage):
         return search.attempt_in_passing(self.tried, before)
 
 
+@dataclass(frozen=True)
+class WhereMany(SearchStage):
+    """A stage that is run only where so many triangles are inverted that local repair would take longer than it does.
+
+    Attributes
+    ----------
+    tried : Descent
+    """
+
+    tried: Descent
+
+    @property
+    def name(self) -> str:
+        """How reports call this stage."""
+        return self.tried.name
+
+    @property
+    def begins_with(self) -> Descent:
+        """``tried``."""
+        return self.tried
+
+    def run(self, search: Runner, before: Status) -> Status:
+        """As of `SearchStage`."""
+        return search.attempt_where_many(self.tried, before)
+
+
 @dataclass(frozen=True, eq=False)
 class Begun(SearchStage):
     """A stage that has been run elsewhere and has found no map, as a search is to go on from it.
@@ -128,6 +162,16 @@ class Begun(SearchStage):
     def run(self, search: Runner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.take_over(self)
+
+
+class _State(NamedTuple):
+    """What a search knows of the best map, and the map of the lowest V₃; see `Search`."""
+
+    best: tuple[int, float]
+    best_map: ComplexArray
+    best_field: TensorField | None
+    best_reference: Reference
+    deepest: Iterate | None
 
 
 #: Whatever a strategy is made of.
@@ -179,6 +223,7 @@ class Search:
         self._spare: tuple[str, ...] | None = None if linear_solver == "auto" else ()
         self.callback = callback
         self.budget = budget
+        self._in_vain = _IN_VAIN * budget
         self.record = record
         self.path: list[Snapshot] = []
         self.history: list[Step] = []
@@ -190,6 +235,7 @@ class Search:
         self.best_reference: Reference = "equilateral"
         self.deepest: Iterate | None = None
         self.best = len(problem.F), np.inf
+        self._aside: _State | None = None
         self._rounded = self._tried = False
 
     def run(self, stages: Stages) -> Status:
@@ -213,7 +259,7 @@ class Search:
             status = self._descend_by_any(fallback, status)
             stages = on_the_mesh or [fallback]
         for stage in stages:
-            if status is Status.INJECTIVE or self._left <= 0:
+            if status is Status.INJECTIVE or self._left <= 0 or self._in_vain <= 0:
                 break
             # Later stages take long, and are in vain where no injective map exists.
             if self._tried and not stage.quick and self._examine().forbids_injective:
@@ -227,6 +273,8 @@ class Search:
         if self._examine().forbids_injective:
             self._towards_least_area()
             return Status.IMPOSSIBLE
+        if self._aside is not None and self._aside.best < self.best:
+            self._state = self._aside
         return Status.ROUNDED if self._rounded else status
 
     def attempt(self, stage: Descent, before: Status) -> Status:
@@ -241,6 +289,10 @@ class Search:
         if status is not Status.INJECTIVE:
             self.deepest = deepest
         return status
+
+    def attempt_where_many(self, stage: Descent, before: Status) -> Status:
+        """Run a stage on the mesh itself, if many of its triangles are inverted in the best map."""
+        return self.attempt(stage, before) if self.best[0] > _MANY * len(self.problem.F) else before
 
     def take_over(self, begun: Begun) -> Status:
         """Go on from a stage that was run elsewhere, as `attempt` does from its own."""
@@ -273,32 +325,61 @@ class Search:
         coarse = None if self.record else coarse_mesh(self.problem)
         if coarse is None:
             return before
-        done, began, best = max(len(self.history), 1), time.perf_counter(), self.best
+        done, began, before_it = max(len(self.history), 1), time.perf_counter(), self._state
         problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
-        status, uv, self.linear_solver = _on_coarse(problem, stage.begins_with, self._asked, self._left, self._note)
-        if status in (Status.INJECTIVE, Status.INTERRUPTED):
+        first, left = stage.begins_with, self._left
+        status, uv, inverted, self.linear_solver = _on_coarse(problem, first, self._asked, left, self._note)
+        certain = status in (Status.INJECTIVE, Status.INTERRUPTED)
+        if certain or (status is not Status.IMPOSSIBLE and inverted <= MOST_FLIPS):
             w = coarse.prolong(problem.frame.inward(uv))
-            mesh = self.problem.domain.mesh("equilateral")
             flipped = self._not_positive(w)
-            self.best = flipped, 0.0 if flipped == 0 else np.inf
-            self.best_map, self.best_reference = w, mesh.kind
-            dw = mesh.derivatives(w)
-            self.best_field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
-            self._rounded |= status is Status.INJECTIVE and flipped > 0
-            self._note(Step(0, *self.best))
+            if certain or flipped <= min(MOST_FLIPS, self.best[0] - 1):
+                self._take(w, flipped)
+                self._rounded |= status is Status.INJECTIVE and flipped > 0
+                self._note(Step(0, *self.best))
         self.stages.append(
             Stage(
                 name=f"{stage.name}, {len(problem.F)} triangles",
                 iterations=len(self.history) - done,
                 seconds=time.perf_counter() - began,
-                flipped=(best[0], self.best[0]),
-                energy=(best[1], self.best[1]),
-                kept=self.best != best,
+                flipped=(before_it.best[0], self.best[0]),
+                energy=(before_it.best[1], self.best[1]),
+                kept=self.best != before_it.best,
             )
         )
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
+        if self.best != before_it.best and self.best[0]:
+            self._repair_carried(before_it)
         return Status.INJECTIVE if self.best[0] == 0 else before
+
+    def _take(self, w: ComplexArray, flipped: int) -> None:
+        """Take on a map from elsewhere, at its own tensors."""
+        mesh = self.problem.domain.mesh("equilateral")
+        dw = mesh.derivatives(w)
+        field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
+        self._state = _State((flipped, 0.0 if flipped == 0 else np.inf), w, field, mesh.kind, self.deepest)
+
+    def _repair_carried(self, before_it: _State) -> None:
+        """Right the last inverted triangles of a map from a coarse mesh; where that fails, it is put aside.
+
+        Other stages then begin anew, and not in front of a wall that the coarse mesh may have put up.
+        """
+        for stage in _LOCAL:
+            if self._left > 0 and 0 < self.best[0] <= MOST_FLIPS:
+                self.deepest = stage.objective(self.problem, self._asked).of_map(self.best_map)
+                self._descend(stage)
+        if self.best[0]:
+            self._aside, self._state = self._state, before_it
+
+    @property
+    def _state(self) -> _State:
+        """What is known of the best map."""
+        return _State(self.best, self.best_map, self.best_field, self.best_reference, self.deepest)
+
+    @_state.setter
+    def _state(self, state: _State) -> None:
+        self.best, self.best_map, self.best_field, self.best_reference, self.deepest = state
 
     def _note(self, step: Step) -> None:
         """Write a step down, whatever its number was where it was made."""
@@ -362,9 +443,16 @@ class Search:
 
     def _follow(self, stage: Descent, objective: Objective, start: Iterate) -> Status:
         """Look at every map of a stage until one is injective or nothing moves any more; why it ended."""
-        patience = _Patience(stage.patience)
+        patience = Patience(stage.patience)
         steps = Steps(stage.iterates(objective, start))
+        last: ComplexArray | None = None
         for here in chain([start], steps):
+            if here.w is last:
+                self._in_vain -= 1
+                if self._in_vain <= 0:
+                    return Status.SETTLED
+                continue
+            last = here.w
             step = self._visit(here, tensors=not stage.moves_vertices)
             if step.flipped == 0:
                 return Status.INJECTIVE
@@ -398,36 +486,18 @@ class Search:
         return int(np.count_nonzero(sign <= 0))
 
 
-class _Patience:
-    """How long a stage has made no progress."""
-
-    def __init__(self, limits: tuple[int, float] | None) -> None:
-        self._most: float
-        self._most, self._progress = limits or (np.inf, 0.0)
-        self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
-
-    def is_over(self, flipped: int, value: float) -> bool:
-        """Whether too many steps in a row have righted no triangle and lowered the objective by too little."""
-        if flipped < self._flipped or value < self._low_enough:
-            self._flipped, self._value = min(flipped, self._flipped), min(value, self._value)
-            # V₄ may be negative.
-            fraction = self._progress * abs(self._value) if np.isfinite(self._value) else 0.0
-            self._low_enough = self._value - fraction
-            self._in_vain = 0
-        else:
-            self._in_vain += 1
-        return self._in_vain > self._most
-
-
 def _on_coarse(
     problem: Problem, first: Descent, linear_solver: str, budget: int, callback: Callable[[Step], object]
-) -> tuple[Status, FloatArray, str]:
-    """Solve a coarse problem, and lower the distortion of its map a little: why it ended, the map, the backend."""
+) -> tuple[Status, FloatArray, int, str]:
+    """Solve a coarse problem, and lower the distortion of its map a little.
+
+    Why it ended, the map, its inverted triangles, the backend.
+    """
     search = Search(problem, linear_solver, callback, budget)
-    status = search.run([first, Combing(resume=True), Patches(resume=True), Untangling(resume=True)])
+    status = search.run([first, *_COARSE])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
         # Fine vertices crowd where coarse triangles are thin: a few steps against that pay many times over.
         polish = polish_map(problem.domain, uv, energy="mips", max_iterations=10, linear_solver=linear_solver)
         uv = polish.uv
-    return status, uv, search.linear_solver
+    return status, uv, search.best[0], search.linear_solver

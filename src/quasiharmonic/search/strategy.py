@@ -20,7 +20,7 @@ from quasiharmonic.descent import (
 )
 from quasiharmonic.descent.base import SearchStage
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.stages import CoarseToFine, InPassing, Stages
+from quasiharmonic.search.stages import CoarseToFine, InPassing, Stages, WhereMany
 
 # Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
 # than ten iterations on the mesh.
@@ -73,7 +73,10 @@ def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
         first, second = (composite, first) if composed else (first, composite)
         other = (second, *repair)
     coarse = CoarseToFine(first)
-    soon: Stages = (coarse, first, *repair) if large else (first, *repair, coarse)
+    soon: Stages = (first, *repair, coarse)
+    if large:
+        # Newton's steps right by the thousand what repair takes patch by patch.
+        soon = (coarse, first, *((WhereMany(newton),) if alone else ()), *repair)
     return (
         *soon,
         Untangling(iterations=400, resume=True),
@@ -138,10 +141,11 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
 def soonest(stages: Stages) -> Stages:
     """The first stages of a strategy: up to the first descent on the mesh itself, and what is quick right after it."""
     before = list(takewhile(lambda stage: stage.coarse, stages))
-    first, rest = stages[len(before) : len(before) + 1], stages[len(before) + 1 :]
+    first = stages[len(before) : len(before) + 1]
+    rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, WhereMany)]
     return [*before, *first, *takewhile(lambda stage: stage.quick, rest)]
 
 
 def without_restarts(stages: Stages) -> Stages:
-    """A strategy without the stages that start again at random, whose failing tries no budget of iterations counts."""
+    """A strategy without the stages that start again at random, whose failing tries take many times an iteration."""
     return [stage for stage in stages if not isinstance(stage, RandomRestarts)] or stages
