@@ -10,7 +10,7 @@ from pathlib import Path
 
 from setuptools import Extension, setup
 
-KERNELS = Path("src/quasiharmonic/kernels")
+KERNELS = Path("src/quasiharmonic/util/kernels/c")
 # A product and a sum rounded as one, where the processor can, would make results differ from machine to machine.
 # The rest changes no result: nobody asks for errno or for the processor's flags, so choices need no jumps.
 PRECISE = "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"
@@ -24,7 +24,7 @@ else:
     setup(
         ext_modules=[
             Extension(
-                "quasiharmonic.kernels._compiled",
+                "quasiharmonic.util.kernels._compiled",
                 sorted(str(path) for path in KERNELS.glob("*.c")),
                 depends=sorted(str(path) for path in KERNELS.glob("*.h")),
                 define_macros=[("Py_LIMITED_API", "0x030B0000")] if STABLE else [],

@@ -22,11 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import Problem, __version__, animate, io, solve
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, __version__, animate, boundary_loops, io, solve
 from quasiharmonic.surfaces import annulus, cat, grid
 from quasiharmonic.targets import boundary_to, letter
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 FRAMES = 100
 ENERGY = "symmetric-dirichlet"

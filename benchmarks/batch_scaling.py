@@ -20,8 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import batch, io
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import batch, boundary_loops, io
 from quasiharmonic.surfaces import disk
 
 

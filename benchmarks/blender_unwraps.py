@@ -22,9 +22,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from quasiharmonic import certify, flatten, io, surfaces
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops, certify, flatten, io, surfaces
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Surface = tuple[str, FloatArray, IntArray]
 

@@ -34,9 +34,9 @@ import numpy as np
 
 from problems import ADVERSARIAL, FAMILIES, make, parse
 from quasiharmonic import Problem, Status, solve
-from quasiharmonic.construction.simplicity import is_simple
-from quasiharmonic.ladder.climbing import climb
-from quasiharmonic.search.strategy import STRATEGIES
+from quasiharmonic.solver.construction.simplicity import is_simple
+from quasiharmonic.solver.refine.solve_refining import climb
+from quasiharmonic.solver.search.strategy import STRATEGIES
 
 Record = dict[str, Any]
 

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from quasiharmonic import MapResult, Problem, distortion, harmonise, io, polish, solve
-from quasiharmonic.descent import LBFGS, Alternating, Descent, Newton, Untangling, VectorAdam
-from quasiharmonic.search.strategy import STRATEGIES
+from quasiharmonic.solver.methods import LBFGS, Alternating, Descent, Newton, Untangling, VectorAdam
+from quasiharmonic.solver.search.strategy import STRATEGIES
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
 from sculptures import seven

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from quasiharmonic import Problem, io, solve
-from quasiharmonic.descent import LBFGS, Descent, Newton, VectorAdam
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.field.functionals import FUNCTIONALS
-from quasiharmonic.field.tensor import PARAMETERISATIONS
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.solver.field.functionals import FUNCTIONALS
+from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
+from quasiharmonic.solver.methods import LBFGS, Descent, Newton, VectorAdam
 
 METHODS = {"vector-adam": VectorAdam, "l-bfgs": LBFGS}
 

@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import injective_map, kernels, polish
+from quasiharmonic import injective_map, polish
+from quasiharmonic.util import kernels
 from speed import LETTERS, machine, problems
 
 _STEPS = 10

@@ -32,13 +32,13 @@ from pathlib import Path
 import numpy as np
 
 from quasiharmonic import flatten, io, surfaces
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.cuts.finding import find_cuts
-from quasiharmonic.cuts.graph import edge_graph
-from quasiharmonic.cuts.shrinking import Shrinking
-from quasiharmonic.mesh.opening import opened_along
-from quasiharmonic.mesh.topology import boundary_edges, edges
-from quasiharmonic.plot.shading import lit
+from quasiharmonic.geometry.mesh.opening import opened_along
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edges
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.targets.cuts.graph import edge_graph
+from quasiharmonic.targets.cuts.shrinking import Shrinking
+from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Surface = tuple[str, FloatArray, IntArray]
 

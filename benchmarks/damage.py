@@ -35,12 +35,12 @@ from typing import NamedTuple
 import numpy as np
 
 import quasiharmonic
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.cli import main as qhm
+from quasiharmonic.geometry.mesh.elements import covering_triangles
 from quasiharmonic.io import MeshData, read_mesh, write_map
-from quasiharmonic.io.fem import read_fem
-from quasiharmonic.mesh.elements import covering_triangles
+from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.surfaces import disk
+from quasiharmonic.ui.cli import main as qhm
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 SECONDS, GIGABYTES = 150.0, 1.5
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic import Problem
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.exact.certificate import flipped_triangles
-from quasiharmonic.field.functionals import beltrami_gradient, twist
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.tensor import TensorField
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.solver.field.functionals import beltrami_gradient, twist
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.tensor import TensorField
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 # |s| is kept below this, so that factors stay within e^±12 of each other.
 FARTHEST = 6.0

@@ -23,12 +23,11 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import Problem, distortion, io, solve, surfaces, targets
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.energy.polishing import ENERGIES, polish_map
-from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.harmonising import harmonise_map
+from quasiharmonic import Problem, boundary_loops, distortion, io, solve, surfaces, targets
+from quasiharmonic.energies.polishing import ENERGIES, polish_map
+from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.solver.search.harmonising import harmonise_map
+from quasiharmonic.util.arrays import FloatArray
 
 Found = tuple[FloatArray, float]
 

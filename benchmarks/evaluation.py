@@ -26,9 +26,9 @@ import numpy as np
 
 from problems import make, parse
 from quasiharmonic import MapResult, Problem, distortion, solve, targets
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.result import Step
+from quasiharmonic.problem.result import Step
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.util.arrays import FloatArray
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
 from sculptures import sculpture

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.registration.nearest import fold_free, nearest_invertible
+from quasiharmonic.apps.displacement_fields.nearest import fold_free, nearest_invertible
+from quasiharmonic.util.arrays import FloatArray
 
 # Lattice of the bumps, in pixels, and how many each field has.
 CELL, COUNTS = 12, (1, 50, 5000)

@@ -33,13 +33,12 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import certify, distortion, io, surfaces
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.start import fans
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops, certify, distortion, io, surfaces
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.start import fans
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Surface = tuple[str, FloatArray, IntArray]
 

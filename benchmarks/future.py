@@ -22,11 +22,10 @@ import determinants
 import positive_weights
 import problems
 from hyperbolic import HyperbolicAdam
-from quasiharmonic import Problem, solve, targets
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.exact.certificate import flipped_triangles
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, solve, targets
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.util.arrays import FloatArray
 
 sys.path.append(str(Path(__file__).parent.parent / "examples"))
 from common import ring

@@ -24,6 +24,7 @@ import numpy as np
 
 from quasiharmonic import (
     Problem,
+    boundary_loops,
     flatten,
     flatten_derivative,
     injective_map,
@@ -31,10 +32,9 @@ from quasiharmonic import (
     quasi_harmonic_derivative,
     quasi_harmonic_map,
 )
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import cat
 from quasiharmonic.targets import boundary_to, filled, letter
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 T = TypeVar("T")
 # Of the heavy ball that is recorded: the longest step that does not leap out of the map, by a few tries.

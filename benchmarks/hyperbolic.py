@@ -13,11 +13,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, FloatArray
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.descent.base import Iterates
-from quasiharmonic.field.objective import Iterate, Objective
-from quasiharmonic.field.tensor import TANH
+from quasiharmonic.solver.field.objective import Iterate, Objective
+from quasiharmonic.solver.field.tensor import TANH
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.methods.base import Iterates
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 
 def exponential(mu: ComplexArray, step: ComplexArray) -> ComplexArray:

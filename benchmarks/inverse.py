@@ -20,11 +20,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic import InverseMap, SurfacePoints, injective_map, io
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import InverseMap, SurfacePoints, boundary_loops, injective_map, io
 from quasiharmonic.surfaces import cat, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
+from quasiharmonic.util.arrays import FloatArray
 
 Map = tuple[str, FloatArray, NDArray[np.int64], FloatArray]
 

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from quasiharmonic import Problem, io, solve, targets
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.descent import LBFGS
-from quasiharmonic.energy.measures import distortion
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.solver.methods import LBFGS
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 RECORDS = Path(__file__).parent / "records" / "letters_alone.csv"
 LETTERS = "GSRAPH"

@@ -26,10 +26,9 @@ from pathlib import Path
 import numpy as np
 
 import problems
-from quasiharmonic import batch, certify, injective_map, injective_maps, io
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import batch, boundary_loops, certify, injective_map, injective_maps, io
 from quasiharmonic.surfaces import disk, random_delaunay
+from quasiharmonic.util.arrays import FloatArray, IntArray
 from speed import machine
 
 Arrays = tuple[FloatArray, IntArray, IntArray, FloatArray]

@@ -29,8 +29,8 @@ from scipy.sparse.csgraph import dijkstra
 from mesh_movers import Extended, Kratos, Morphed, Mover, Ours, compact, elasticity, harmonic, thin_plate
 from moving_scenes import SCENES, Scene
 from quasiharmonic import __version__, flipped_triangles
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.util.arrays import FloatArray
 
 OURS, MORPH = "ours", "morph"
 #: By name and by what each step begins with. Kratos' solvers have one way only.

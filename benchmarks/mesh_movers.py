@@ -14,7 +14,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import cdist
 
 from moving_scenes import Scene
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 #: From vertices (n, 2), triangles, the vertices whose x and whose y is given, and how far all go where they are given
 #: (n, 2): how far all go.

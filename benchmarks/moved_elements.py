@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from quasiharmonic import morph
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.elements import joined, rim
+from quasiharmonic.geometry.mesh.elements import joined, rim
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 #: Gmsh's order, whether it recombines, and its number of the algorithm.
 KINDS = {"triangles": (1, False, 6), "quadrilaterals": (1, True, 8), "six-node triangles": (2, False, 6)}

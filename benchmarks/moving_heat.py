@@ -30,8 +30,8 @@ from skfem.models.poisson import laplace, mass
 from mesh_movers import Extended, Mover, Ours, elasticity, harmonic
 from moving_scenes import Scene, travelling_hole
 from quasiharmonic import flipped_triangles
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 CONDUCTIVITY, LAPS, PERIOD = 0.02, 2.5, 10.0
 MOVERS = {

@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.path import Path as Outline
 from scipy.spatial import Delaunay, cKDTree
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 #: Where vertices go (k, 2) at a time from 0 to 1.
 Places = Callable[[float], FloatArray]

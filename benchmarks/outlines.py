@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from planar import points, span
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
 from quasiharmonic.targets import arc_length, letter, star
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator
 

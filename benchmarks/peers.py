@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def igl_harmonic(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:

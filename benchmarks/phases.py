@@ -9,12 +9,12 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
-from quasiharmonic.field.objective import Iterate, Objective
-from quasiharmonic.ladder import mapping
+from quasiharmonic.geometry.mesh import reference
 from quasiharmonic.linsolve import base, laplacian
-from quasiharmonic.mesh import reference
 from quasiharmonic.problem import domain
-from quasiharmonic.search import coarse, solving, stages
+from quasiharmonic.solver.field.objective import Iterate, Objective
+from quasiharmonic.solver.refine import mapping
+from quasiharmonic.solver.search import coarse, solving, stages
 
 # What is read: seconds of wall time, or of the processor.
 clock = time.perf_counter

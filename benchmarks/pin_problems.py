@@ -20,11 +20,11 @@ import numpy as np
 import planar
 import problems
 from quasiharmonic import certify
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.io.obj import read_obj
-from quasiharmonic.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.io.formats.obj import read_obj
 from quasiharmonic.surfaces import cat
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator
 

@@ -29,7 +29,7 @@ import numpy as np
 from campaign import read
 from pin_problems import FAMILIES, make
 from quasiharmonic import certify
-from quasiharmonic.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.flattened import flatten
 
 Record = dict[str, Any]
 

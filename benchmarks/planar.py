@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from quasiharmonic import surfaces
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.ladder.refining import refine
-from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, components, edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, components, edges
+from quasiharmonic.solver.refine.refining import refine
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator
 Plane = tuple[ComplexArray, IntArray]

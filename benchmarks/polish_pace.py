@@ -19,12 +19,13 @@ from typing import NamedTuple
 
 import phases
 from quasiharmonic import Problem, io, solve
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.energy import newton_descent, polishing
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic.energies import polishing
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.newton import newton_descent
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import available, base
-from quasiharmonic.result import Step
+from quasiharmonic.problem.result import Step
+from quasiharmonic.util.arrays import FloatArray
 from speed import cat, machine
 
 SIZES = 4_000, 16_000, 64_000

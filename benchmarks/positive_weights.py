@@ -16,10 +16,10 @@ from scipy.sparse import csc_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
 from quasiharmonic import Problem
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.energy.deformation import signed_areas
-from quasiharmonic.exact.certificate import flipped_triangles
-from quasiharmonic.mesh.topology import edges
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.mesh.topology import edges
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 SHARPENING = (1.0, 0.1, 0.01, 0.001)
 

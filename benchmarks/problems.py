@@ -24,9 +24,8 @@ import outlines
 import planar
 from adversarial import ADVERSARIAL
 from planar import Draft, Mover, blank, flow, roughen, strongest
-from quasiharmonic import certify
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops, certify
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator
 

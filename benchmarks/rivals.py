@@ -23,9 +23,9 @@ import numpy as np
 
 import problems
 from quasiharmonic import Problem, distortion, polish, solve
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import Untangling
-from quasiharmonic.search.strategy import STRATEGIES
+from quasiharmonic.solver.methods import Untangling
+from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.util.arrays import FloatArray
 
 RECORDS = Path(__file__).parent / "records"
 #: The programs in the order of the tables; those that ran every problem of the first 68.

@@ -29,9 +29,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic import injective_map
+from quasiharmonic import boundary_loops, injective_map
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_map
-from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import cat, disk
 
 # What is interrupted: arguments, and what they write.

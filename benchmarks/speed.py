@@ -37,14 +37,13 @@ import numpy as np
 
 import phases
 from peers import PEERS
-from quasiharmonic import Problem, io, is_injective, solve, surfaces
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.descent import Descent, VectorAdam
-from quasiharmonic.ladder import mapping
+from quasiharmonic import Problem, boundary_loops, io, is_injective, solve, surfaces
 from quasiharmonic.linsolve import available
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.strategy import STRATEGIES
+from quasiharmonic.solver.methods import Descent, VectorAdam
+from quasiharmonic.solver.refine import mapping
+from quasiharmonic.solver.search.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Arrays = tuple[FloatArray, IntArray, IntArray, FloatArray]
 Strategy = str | list[Descent]

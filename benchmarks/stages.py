@@ -20,8 +20,8 @@ import campaign
 import problems
 from evaluation import FEASIBLE
 from quasiharmonic import MapResult, Problem, distortion, solve
-from quasiharmonic.result import Stage
-from quasiharmonic.search.strategy import STRATEGIES
+from quasiharmonic.problem.result import Stage
+from quasiharmonic.solver.search.strategy import STRATEGIES
 
 
 class Outcome(NamedTuple):

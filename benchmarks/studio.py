@@ -99,10 +99,10 @@ def write(path, rings):
 def session_of(rings):
     """A session with a cat's head, whose messages go nowhere."""
     from quasiharmonic.io import MeshData
-    from quasiharmonic.studio.protocol import encode
-    from quasiharmonic.studio.session import Session
-    from quasiharmonic.studio.sheets import sheet_of
     from quasiharmonic.surfaces import cat
+    from quasiharmonic.ui.studio.protocol import encode
+    from quasiharmonic.ui.studio.session import Session
+    from quasiharmonic.ui.studio.surface import sheet_of
 
     session = Session(encode)
     session.open(sheet_of(MeshData(*cat(rings), source="cat.obj"), "cat.obj"))
@@ -111,8 +111,8 @@ def session_of(rings):
 
 def following(rings):
     """CPU seconds of one map that follows, verdict included."""
-    from quasiharmonic.studio.following import Follower
-    from quasiharmonic.studio.grips import grip
+    from quasiharmonic.ui.studio.falloff import grip
+    from quasiharmonic.ui.studio.following import Follower
 
     moment = session_of(rings).moment
     problem, corner = moment.problem, moment.corners[2]
@@ -123,7 +123,7 @@ def following(rings):
 
 def told(rings):
     """CPU seconds of one movement, with the numbers about the map and the frame that tells it."""
-    from quasiharmonic.studio.protocol import Frame
+    from quasiharmonic.ui.studio.protocol import Frame
 
     session = session_of(rings)
     corner = session.moment.corners[2]

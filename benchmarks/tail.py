@@ -32,12 +32,12 @@ import planar
 from campaign import read
 from pin_problems import patch_of_scan
 from quasiharmonic import Status, injective_map
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.exact.loops import judge_loops
-from quasiharmonic.mesh.refinement import split_edges
-from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.geometry.exact.loops import judge_loops
+from quasiharmonic.geometry.mesh.refinement import split_edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.surfaces import disk, grid
 from quasiharmonic.targets import arc_length, filled
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Generator = np.random.Generator
 Record = dict[str, Any]

@@ -24,8 +24,8 @@ from pathlib import Path
 
 from quasiharmonic.io import MeshData, write_obj
 from quasiharmonic.linsolve import available
-from quasiharmonic.studio.protocol import decode, encode
 from quasiharmonic.surfaces import cat
+from quasiharmonic.ui.studio.protocol import decode, encode
 
 # Seconds until a process that has not ended counts as one that never will.
 _PATIENCE = 120
@@ -97,7 +97,7 @@ if find_spec(sys.argv[2]):
 for _ in range(4): in_threads(1)
 """,
 }
-_SERVE = "import sys; from quasiharmonic.studio.worker import serve; serve(sys.argv[1])"
+_SERVE = "import sys; from quasiharmonic.ui.studio.worker import serve; serve(sys.argv[1])"
 _BLENDER = """
 import os, sys
 os.environ["BLENDER_USER_RESOURCES"] = sys.argv[2]

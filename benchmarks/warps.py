@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic import distortion, warp_by_landmarks
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray
 
 RESOLUTIONS = (16, 32, 64, 128, 256)
 SIDE = 257

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from common import INK, panels, run, save, show
-from quasiharmonic import Problem, distortion, morph
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, distortion, morph
 
 DEGREES = (30, 60, 90)
 LENGTH, HEIGHT, RADIUS = 4.0, 2.0, 0.7

@@ -18,11 +18,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from quasiharmonic import MapResult, Problem, flipped_triangles, solve, surfaces, targets
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import MapResult, Problem, boundary_loops, flipped_triangles, solve, surfaces, targets
 from quasiharmonic.plot import plot_map
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.util.arrays import FloatArray
 
 BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 RED, INK = (0.89, 0.07, 0.17), (0.06, 0.12, 0.29)

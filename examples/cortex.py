@@ -43,12 +43,12 @@ from numpy.typing import NDArray
 
 from common import INK, RED, FloatArray, colorbar, panels, run, save
 from quasiharmonic import certify, distortion
-from quasiharmonic.arrays import IntArray
-from quasiharmonic.energy.distances import SurfaceDistances, surface_distances
-from quasiharmonic.flattening.distance_descent import keep_distances
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.plot.shading import lit
+from quasiharmonic.apps.flattening.distances.descent import keep_distances
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.energies.distances import SurfaceDistances, surface_distances
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.util.arrays import IntArray
 
 # From the crowns of the gyri to the depths of the sulci.
 DEPTH = LinearSegmentedColormap.from_list("depth", [(0.98, 0.86, 0.55), (0.93, 0.93, 0.90), (0.16, 0.30, 0.55)])

@@ -22,10 +22,10 @@ from matplotlib.colors import LogNorm
 
 from common import INK, FloatArray, colorbar, panels, run, save
 from quasiharmonic import cut_open, distortion, flatten
-from quasiharmonic.arrays import IntArray
-from quasiharmonic.cuts.finding import find_cuts
-from quasiharmonic.mesh.topology import boundary_edges, edge_keys
-from quasiharmonic.plot.shading import lit
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.util.arrays import IntArray
 from sculptures import creature
 
 # By how many degrees a creature is turned and seen from above.

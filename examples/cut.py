@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from common import RED, FloatArray, panels, run, save
 from quasiharmonic import io
-from quasiharmonic.cli import main as qhm
 from quasiharmonic.plot import plot_map, plot_surface
-from quasiharmonic.plot.shading import view
+from quasiharmonic.ui.cli import main as qhm
+from quasiharmonic.ui.plot.shading import view
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 

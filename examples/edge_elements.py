@@ -29,10 +29,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from common import panels, ring, run, save, show
-from quasiharmonic import Problem, solve, surfaces
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, solve, surfaces
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods import VectorAdam
 
 CURVES = {"V₃": ("dirichlet", "-"), "V₄": ("poisson", "-"), "V₄ by edges": ("edge-poisson", "--")}
 

@@ -20,8 +20,8 @@ from typing import Any
 
 from common import mips, panels, run, save, show
 from quasiharmonic import Problem, injective_map, quasi_harmonic_map, solve
-from quasiharmonic.descent import Untangling, VectorAdam
 from quasiharmonic.plot import plot_surface
+from quasiharmonic.solver.methods import Untangling, VectorAdam
 from sculptures import seven
 
 

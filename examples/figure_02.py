@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from common import COLORS, colorbar, first_map, flips, mips, panels, ratios, run, save, show_ratios
-from quasiharmonic.search.harmonising import harmonise_map
+from quasiharmonic.solver.search.harmonising import harmonise_map
 from sculptures import seven
 
 

@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 
 from common import panels, ring, run, save, show
 from quasiharmonic import MapResult, Problem, Status, solve
-from quasiharmonic.descent import Newton, VectorAdam
+from quasiharmonic.solver.methods import Newton, VectorAdam
 
 Hole = tuple[float, float, float, float]
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from common import COLORS, GREEN, first_map, frames, mips, panels, run, save, show
 from quasiharmonic import solve
-from quasiharmonic.descent import Untangling
+from quasiharmonic.solver.methods import Untangling
 from sculptures import seven
 
 SHOTS = 5

@@ -24,8 +24,8 @@ import numpy as np
 
 from common import frames, inverted_area, panels, ring, run, save, show
 from quasiharmonic import Problem, solve
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.field.objective import Objective
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods import VectorAdam
 
 HOLE = (-0.25, -0.25, 0.25, 0.25)
 NAMES = {"dirichlet": "V₃", "neumann": "V₁", "sobolev": "V₂", "poisson": "V₄"}

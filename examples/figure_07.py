@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from common import COLORS, panels, run, save
-from quasiharmonic.field.tensor import PARAMETERISATIONS
+from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
 
 
 def main(output: Path) -> dict[str, Any]:

@@ -19,9 +19,9 @@ import numpy as np
 from matplotlib.collections import LineCollection
 
 from common import RED, panels, run, save
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_surface
-from quasiharmonic.plot.shading import view
+from quasiharmonic.ui.plot.shading import view
 from sculptures import SCULPTURES, sculpture
 
 

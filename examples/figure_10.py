@@ -40,7 +40,7 @@ from typing import Any
 
 from common import BENCHMARKS, mips, panels, run, save, show
 from quasiharmonic import Problem, solve, targets
-from quasiharmonic.descent import LBFGS
+from quasiharmonic.solver.methods import LBFGS
 from sculptures import sculpture
 
 sys.path.append(str(BENCHMARKS))

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from common import colorbar, first_map, flips, mips, panels, ratios, run, save, show, show_ratios
-from quasiharmonic import Problem, quasi_harmonic_map, surfaces
-from quasiharmonic.energy.polishing import polish_map
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, quasi_harmonic_map, surfaces
+from quasiharmonic.energies.polishing import polish_map
 
 MOVE = 0.5
 

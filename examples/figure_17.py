@@ -22,8 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
 from common import FloatArray, panels, ratios, run, save, show
-from quasiharmonic import Problem, quasi_harmonic_map, solve, surfaces
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, quasi_harmonic_map, solve, surfaces
 
 PLACES = np.array([(1 / 3, 0.5), (2 / 3, 0.5)])
 RADIUS = 0.055

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from common import first_map, panels, ring, run, save, show
-from quasiharmonic import Problem, surfaces
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, surfaces
 
 
 def problems(size: int) -> dict[str, Problem]:

@@ -17,9 +17,9 @@ import numpy as np
 
 from common import flips, panels, run, save, show
 from quasiharmonic import solve
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.search.harmonising import ENERGIES, harmonise_map
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.search.harmonising import ENERGIES, harmonise_map
 from sculptures import seven
 
 NAMES = {

@@ -42,12 +42,12 @@ from shapely import LineString, Point, Polygon, contains_xy, union_all
 
 from common import INK, panels, run, save
 from quasiharmonic import AirMesh, certify, harmonise, injective_map
-from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import ARAP, AreaBarrier, Combination, UnsignedARAP
-from quasiharmonic.energy.newton_descent import NewtonDescent
-from quasiharmonic.exact.certificate import Certificate
-from quasiharmonic.exact.constrained_delaunay import constrained_delaunay
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import ARAP, AreaBarrier, Combination, UnsignedARAP
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent
+from quasiharmonic.geometry.exact.certificate import Certificate
+from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 #: Half the width and height of the box that each figure rests in, and points along its lower, right, upper, left side.
 BOX, COUNTS = (1.5, 2.0), (24, 32, 24, 32)

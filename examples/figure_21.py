@@ -16,7 +16,7 @@ import numpy as np
 
 from common import first_map, flips, mips, onto, panels, run, save, show
 from quasiharmonic import distortion, solve, surfaces, targets
-from quasiharmonic.search.harmonising import harmonise_map
+from quasiharmonic.solver.search.harmonising import harmonise_map
 from sculptures import sculpture
 
 SURFACES = "cat", "angel", "gargoyle", "rabbit", "bust", "hand"
@@ -27,7 +27,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for column, name in zip(zip(*axes, strict=True), SURFACES, strict=True):
         V, F = surfaces.cat(size // 2) if name == "cat" else sculpture(name, size)
-        problem = onto(V, F, targets.outlines.disk())
+        problem = onto(V, F, targets.disk())
         first = solve(problem).uv
         maps = {
             "area-preserving": harmonise_map(problem.domain, first, energy="area", conformal=0).uv,

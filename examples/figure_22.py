@@ -21,10 +21,10 @@ from matplotlib.collections import PolyCollection
 
 from common import INK, flips, onto, panels, run, save, show
 from quasiharmonic import Problem, solve, targets
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.mesh.reference import Reference
+from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.plot import plot_surface
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.util.arrays import FloatArray, IntArray
 from sculptures import cone, join, standing
 
 
@@ -90,7 +90,7 @@ def main(output: Path, size: int = 44) -> dict[str, Any]:
         if name == "G":
             problem = Problem(V, F, *targets.boundary_to(V, F, targets.letter("G")))
         else:
-            problem = onto(V, F, targets.outlines.disk())
+            problem = onto(V, F, targets.disk())
         result = solve(problem)
         show(ax, problem, result.uv, f"onto {name}: iterations {result.iterations}")
         numbers[name] = {

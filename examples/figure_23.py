@@ -22,10 +22,10 @@ from scipy.optimize import minimize
 
 from common import flips, panels, run, save, show
 from quasiharmonic import Problem, solve
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.search.harmonising import ENERGIES, harmonise_map
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.search.harmonising import ENERGIES, harmonise_map
+from quasiharmonic.util.arrays import FloatArray
 from sculptures import seven
 
 COLUMNS = "rabbit onto R", "bust onto A", "hand onto P", "gargoyle onto H"

@@ -31,11 +31,11 @@ from matplotlib.colors import LogNorm
 
 from common import INK, RED, colorbar, first_map, flips, mips, panels, run, save
 from quasiharmonic import Problem, distortion, solve
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.descent import Untangling, VectorAdam
-from quasiharmonic.energy.energies import conformal_area_blend
-from quasiharmonic.energy.polishing import polish_map
-from quasiharmonic.search.harmonising import harmonise_map
+from quasiharmonic.energies.energies import conformal_area_blend
+from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.solver.methods import Untangling, VectorAdam
+from quasiharmonic.solver.search.harmonising import harmonise_map
+from quasiharmonic.util.arrays import FloatArray
 from sculptures import seven
 
 COLUMNS = "bust onto A", "rabbit onto R", "gargoyle onto H"

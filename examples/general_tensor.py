@@ -46,12 +46,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array, csr_array, diags
 
 from common import panels, run, save, show
-from quasiharmonic import Problem, quasi_harmonic_map, solve
-from quasiharmonic.arrays import ComplexArray, FloatArray, named
-from quasiharmonic.mesh.operators import operators
-from quasiharmonic.mesh.reference import Reference, ReferenceMesh
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, quasi_harmonic_map, solve
+from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.surfaces import disk
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, named
 
 
 def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:

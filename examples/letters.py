@@ -22,10 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import FloatArray, flips, panels, run, save, show
-from quasiharmonic import Problem, io, quasi_harmonic_map, surfaces
-from quasiharmonic.cli import main as qhm
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, io, quasi_harmonic_map, surfaces
 from quasiharmonic.plot import plot_surface
+from quasiharmonic.ui.cli import main as qhm
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 

@@ -19,7 +19,7 @@ from PIL import Image
 from common import run
 from quasiharmonic import distortion, injective_map, surfaces, targets
 from quasiharmonic.plot import save_animation, save_distortion_figure, save_texture_figure
-from quasiharmonic.plot.interactive import show
+from quasiharmonic.ui.plot.interactive import show
 
 
 def main(output: Path, size: int = 24, window: bool = False) -> dict[str, Any]:

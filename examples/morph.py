@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from common import flips, panels, run, save, show
-from quasiharmonic import Problem, morph, quasi_harmonic_map, surfaces
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, morph, quasi_harmonic_map, surfaces
 
 DEGREES = (25, 50, 75)
 

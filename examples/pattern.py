@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from common import INK, FloatArray, colorbar, panels, run, save
 from quasiharmonic import distortion, surfaces
-from quasiharmonic.arrays import IntArray
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.patterns import pattern, write_pattern
-from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.plot.shading import lit
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.patterns import pattern, write_pattern
+from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
+from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.util.arrays import IntArray
 
 LENGTH, ALLOWANCE, GAP = 300.0, 7.0, 20.0
 BACK, BELLY = (0.95, 0.55, 0.25), (1.00, 0.85, 0.60)

@@ -24,8 +24,8 @@ from scipy.spatial import Delaunay
 
 from common import panels, run, save
 from quasiharmonic import AirMesh, Moment
-from quasiharmonic.arrays import FloatArray
 from quasiharmonic.plot import save_figures
+from quasiharmonic.util.arrays import FloatArray
 
 HOLES = np.array([(0.0, 0.35, 0.2), (-0.42, 0.08, 0.17), (0.4, 0.02, 0.19), (-0.12, -0.42, 0.21), (0.3, -0.55, 0.1)])
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from common import INK, RED, FloatArray, onto, panels, run, save
 from quasiharmonic import flipped_triangles, repair, solve, surfaces, targets
-from quasiharmonic.arrays import IntArray
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_map, plot_surface
+from quasiharmonic.util.arrays import IntArray
 
 
 def halves(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:

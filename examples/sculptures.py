@@ -17,8 +17,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from quasiharmonic import Problem, refine, targets
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.mesh.topology import boundary_edges, boundary_loops, edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, edges
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Field = Callable[[FloatArray], FloatArray]
 

@@ -25,8 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import INK, flips, panels, run, save, show
-from quasiharmonic import Problem, polish_derivative, solve, surfaces
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, polish_derivative, solve, surfaces
 
 Array = NDArray[np.float64]
 # Centre, and the logarithm of the radius around it as a Fourier series: mean, then cosines and sines in turn.

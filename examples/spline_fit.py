@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from common import FloatArray, panels, run, save
 from quasiharmonic import InverseMap, injective_map, surfaces, targets
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_map, plot_surface
 
 

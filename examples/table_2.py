@@ -47,8 +47,8 @@ from typing import Any
 
 from common import colorbar, first_map, flips, mips, panels, run, save, show_ratios
 from quasiharmonic import distortion, solve
-from quasiharmonic.energy.polishing import polish_map
-from quasiharmonic.search.harmonising import harmonise_map
+from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.solver.search.harmonising import harmonise_map
 from sculptures import seven
 
 COLUMNS = ("SBP's energy", "si-log", "tanh + MIPS")

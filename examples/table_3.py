@@ -21,7 +21,7 @@ import numpy as np
 
 from common import COLORS, panels, run, save
 from quasiharmonic import Problem, quasi_harmonic_map, solve
-from quasiharmonic.descent import VectorAdam
+from quasiharmonic.solver.methods import VectorAdam
 from sculptures import seven
 
 STAGES = {

@@ -24,7 +24,7 @@ import numpy as np
 
 from common import COLORS, first_map, flips, mips, panels, run, save
 from quasiharmonic import distortion
-from quasiharmonic.energy.polishing import polish_map
+from quasiharmonic.energies.polishing import polish_map
 from sculptures import seven
 
 COLUMNS = {

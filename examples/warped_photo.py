@@ -24,7 +24,7 @@ from matplotlib.image import imread
 
 from common import panels, save
 from quasiharmonic import warp_by_landmarks
-from quasiharmonic.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray
 
 SMILE = np.array(
     [

@@ -51,7 +51,7 @@ def rng():
 @pytest.fixture
 def troubled(monkeypatch):
     """Problems of a data set are solved by a process to which what their names say happens."""
-    from quasiharmonic.batch import supervisor
+    from quasiharmonic.ui.batch import supervisor
     from shared.commands import TROUBLED
 
     monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)

@@ -8,9 +8,8 @@ import pytest
 import campaign
 import outlines
 import problems
-from quasiharmonic import Problem, certify
-from quasiharmonic.exact.loops import judge_loops
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, certify
+from quasiharmonic.geometry.exact.loops import judge_loops
 
 pytestmark = pytest.mark.slow
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.exact import constrained_delaunay as triangulating
-from quasiharmonic.exact.certificate import certify, is_injective
-from quasiharmonic.exact.constrained_delaunay import BlockedError, Triangulation, constrained_delaunay
-from quasiharmonic.flattening.air import air_around
-from quasiharmonic.flattening.graded_points import Quadtree
-from quasiharmonic.mesh.topology import boundary_loops, edge_keys, edges
+from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
+from quasiharmonic.apps.flattening.scaffold.triangulation import air_around
+from quasiharmonic.geometry.exact import constrained_delaunay as triangulating
+from quasiharmonic.geometry.exact.certificate import certify, is_injective
+from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, Triangulation, constrained_delaunay
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, edges
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 
 

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("shapely", minversion="2.1")
 
 from quasiharmonic import AirMesh, surfaces
-from quasiharmonic.apply.airmesh import air_between, thickened
-from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.apps.air_mesh.airmesh import air_between, thickened
+from quasiharmonic.energies.measures import mean_ratio
 
 
 def square(side, x=0.0, y=0.0, count=8):
@@ -44,7 +44,7 @@ def test_air_in_holes_within_holes():
     V, F = surfaces.annulus(4)
     small, large = V * 0.2, V * 1.0
     points = np.concatenate([large, small, square(6), square(0.1)])
-    from quasiharmonic.mesh.topology import boundary_loops
+    from quasiharmonic import boundary_loops
 
     both = np.concatenate([F, F + len(V)])
     loops = boundary_loops(both, 2 * len(V))

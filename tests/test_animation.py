@@ -8,12 +8,11 @@ import sys
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, Status, animate, certify, io, polish
-from quasiharmonic.animation.frames import FrameStep
-from quasiharmonic.cli import main
-from quasiharmonic.energy.nearness import Nearness
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, Status, animate, boundary_loops, certify, io, polish
+from quasiharmonic.apps.animation.frames import FrameStep
+from quasiharmonic.energies.newton.proximal import Nearness
 from quasiharmonic.surfaces import cat, disk
+from quasiharmonic.ui.cli import main
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +226,7 @@ def test_interrupted_before_the_first_frame(head, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("quasiharmonic.animation.following.solve", interrupted)
+    monkeypatch.setattr("quasiharmonic.apps.animation.following.solve", interrupted)
     targets = turning_stars(len(loop), 3)
     animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips", bridge=True)
     assert animation.interrupted

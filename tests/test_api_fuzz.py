@@ -19,6 +19,7 @@ from hypothesis.extra import numpy as arrays
 
 from quasiharmonic import (
     Problem,
+    boundary_loops,
     certify,
     diagnose,
     distortion,
@@ -29,10 +30,9 @@ from quasiharmonic import (
     refine,
     refine_problem,
 )
-from quasiharmonic.cli import main
-from quasiharmonic.exact.predicates import orientation
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from quasiharmonic.ui.cli import main
 from shared.damaged import VALID, damaged
 from shared.meshes import boundary_of, signed_areas
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.energy import approach
-from quasiharmonic.energy.approach import REACH, RelativeDirichlet, relative
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import MIPS, SymmetricDirichlet
-from quasiharmonic.energy.newton_descent import NewtonDescent, in_units
-from quasiharmonic.energy.polishing import polish
-from quasiharmonic.exact.certificate import is_injective
-from quasiharmonic.result import Status
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import MIPS, SymmetricDirichlet
+from quasiharmonic.energies.newton import progressive_reference as approach
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent, in_units
+from quasiharmonic.energies.newton.progressive_reference import REACH, RelativeDirichlet, relative
+from quasiharmonic.energies.polishing import polish
+from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import disk
 
 RINGS = 12

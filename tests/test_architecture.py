@@ -1,10 +1,9 @@
-"""The house keeps its plan: the table of rooms in docs/architecture.md is what the imports are."""
+"""The imports of the packages are those of the table in docs/architecture.md."""
 
 from __future__ import annotations
 
 import ast
 import re
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -15,89 +14,128 @@ ROOT = Path(quasiharmonic.__file__).parent
 PAGE = (Path(__file__).parent.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
 PLAN = {
     name: {other.strip() for other in others.split(",") if other.strip()}
-    for name, others in re.findall(r"^\| `([\w/]+)` \|.*\| ([\w/, ]*)\|$", PAGE, re.MULTILINE)
+    for name, others in re.findall(r"^\| `(\w+)` \|.*\| ([\w, ]*)\|$", PAGE, re.MULTILINE)
 }
-# The public names are gathered from everywhere; the command is started from one place.
-FACE = {"__init__", "__main__"}
+# These modules export names of packages: the public names, the command, and the short public paths.
+FACADE = {"__init__", "__main__", "atlas", "batch", "jax", "plot", "surfaces", "torch"}
 
 
-def room(parts):
-    """The room of a module, given the parts of its dotted name after the package's."""
-    nested = "/".join(parts[:2])
-    return nested if nested in PLAN else parts[0]
+def is_module(parts):
+    """Whether there is a module or a package of this dotted name, given as parts after the library's name."""
+    path = ROOT.joinpath(*parts)
+    return all(parts) and bool(parts) and (path.with_suffix(".py").exists() or (path / "__init__.py").exists())
 
 
-def named(tree):
-    """The package's own modules that a file imports from, as parts of their dotted names after the package's.
+def docstrings(tree):
+    """Identities of the constants that are docstrings."""
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            yield id(body[0].value)
 
-    Public names of the package itself are an error, since each stands for a module that `quasiharmonic` imports late.
+
+def imported(tree):
+    """Modules of the library that a file imports, as parts of their dotted names, imports by string included.
+
+    Public names of the library itself are an error, since each stands for a module that `quasiharmonic` imports late.
     """
+    documentation = set(docstrings(tree))
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             dotted = [(alias.name.split("."), None) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "a relative import"
             dotted = [((node.module or "").split("."), alias.name) for alias in node.names]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documentation:
+            parts = node.value.split(".")
+            dotted = [(parts, None)] if parts[0] == "quasiharmonic" and is_module(parts[1:]) else []
         else:
             continue
         for (package, *of), name in dotted:
             if package != "quasiharmonic":
                 continue
-            # What is imported may itself be a module or a folder.
-            deeper = ROOT.joinpath(*of, name or "")
-            whole = (*of, name) if name and (deeper.is_dir() or deeper.with_suffix(".py").exists()) else tuple(of)
-            assert whole or name == "__version__", f"{name or 'all'} from the package's face: import from its module"
+            # What is imported may itself be a module or a package.
+            whole = (*of, name) if name and is_module((*of, name)) else tuple(of)
+            assert whole or name == "__version__", f"{name or 'all'} from the library itself: import from its module"
             if whole:
                 yield whole
 
 
-@cache
 def imports():
-    """(room, other room, file) for every import of the package's own modules, wherever in a file it stands."""
-    found = []
+    """(package, other package, file) for every import across packages, wherever in a file it is."""
+    for path in sorted(ROOT.rglob("*.py")):
+        package = path.relative_to(ROOT).with_suffix("").parts[0]
+        if package not in FACADE:
+            for whole in imported(ast.parse(path.read_text(encoding="utf-8"), path)):
+                if whole[0] != package:
+                    yield package, whole[0], str(path.relative_to(ROOT))
+
+
+ARROWS = {(one, other) for one, other, _ in imports()}
+
+
+def test_the_plan_names_every_package():
+    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    assert packages == set(PLAN)
+    assert len(packages) <= 10
+
+
+def test_no_other_modules_stand_beside_the_packages():
+    modules = {path.stem for path in ROOT.glob("*.py")}
+    assert modules == FACADE
+    assert len(modules - {"__init__", "__main__"}) <= 6
+
+
+def test_no_import_but_those_of_the_plan():
+    assert [f"{file} imports from {other}" for one, other, file in imports() if other not in PLAN[one]] == []
+
+
+def test_the_plan_names_no_import_that_is_not_there():
+    assert {(one, other) for one, others in PLAN.items() for other in others} - ARROWS == set()
+
+
+def test_packages_import_only_from_packages_above_them():
+    order = list(PLAN)
+    assert [(one, other) for one, other in ARROWS if order.index(other) >= order.index(one)] == []
+
+
+def test_no_cycle_between_subpackages():
+    """Subpackages of one package import each other in one direction."""
+    graph = {}
     for path in sorted(ROOT.rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
-        for whole in named(ast.parse(path.read_text(encoding="utf-8"), path)):
-            if room(whole) != room(parts):
-                found.append((room(parts), room(whole), str(path.relative_to(ROOT))))
-    return found
+        if len(parts) > 2:
+            for whole in imported(ast.parse(path.read_text(encoding="utf-8"), path)):
+                if whole[0] == parts[0] and whole[1:2] != parts[1:2] and (ROOT / "/".join(whole[:2])).is_dir():
+                    graph.setdefault(parts[:2], set()).add(whole[:2])
+    while graph:
+        leaves = {other for others in graph.values() for other in others} - set(graph)
+        free = {one for one, others in graph.items() if others <= leaves}
+        assert free, f"a cycle among {sorted('.'.join(one) for one in graph)}"
+        graph = {one: others - free - leaves for one, others in graph.items() if one not in free}
+        leaves |= free
 
 
-def arrows():
-    """(room, other room) for every pair of which one imports from the other."""
-    return {(one, other) for one, other, _ in imports() if one not in FACE}
-
-
-def test_every_room_is_in_the_plan():
-    modules = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert modules - FACE <= set(PLAN)
-    assert {name.split("/")[0] for name in PLAN} <= modules
-    assert len([path for path in ROOT.iterdir() if path.suffix == ".py"]) <= 6
-
-
-def test_no_arrow_but_those_of_the_plan():
-    unplanned = [f"{file} imports from {other}" for one, other, file in imports() if one not in FACE | {other}
-                 and other not in PLAN[one]]  # fmt: skip
-    assert unplanned == []
-
-
-def test_no_arrow_of_the_plan_is_idle():
-    assert {(one, other) for one, others in PLAN.items() for other in others} - arrows() == set()
-
-
-def test_no_circle_and_nothing_upwards():
-    """The rooms stand in an order in which each imports only from those before it."""
-    order = list(PLAN)
-    assert [(one, other) for one, other in arrows() if order.index(other) >= order.index(one)] == []
+def test_every_package_says_where_to_start_reading():
+    silent = [
+        str(path.relative_to(ROOT))
+        for path in ROOT.rglob("__init__.py")
+        if "Start reading" not in (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "")
+        and path.parent != ROOT
+        and "c" not in path.relative_to(ROOT).parts
+    ]
+    assert silent == []
 
 
 def test_every_kind_of_import_is_seen():
-    code = "import numpy, quasiharmonic.io.off as o\ndef f():\n    from quasiharmonic.plot import maps, texture_map"
-    assert list(named(ast.parse(code))) == [("io", "off"), ("plot", "maps"), ("plot",)]
-    assert list(named(ast.parse("from quasiharmonic import __version__, mesh"))) == [("mesh",)]
+    code = "import numpy, quasiharmonic.io.errors as o\ndef f():\n    from quasiharmonic.ui import plot, nothing"
+    assert list(imported(ast.parse(code))) == [("io", "errors"), ("ui", "plot"), ("ui",)]
+    assert list(imported(ast.parse("load('quasiharmonic.ui.display')"))) == [("ui", "display")]
+    assert list(imported(ast.parse('"quasiharmonic.ui"'))) == []
+    assert list(imported(ast.parse("from quasiharmonic import __version__, geometry"))) == [("geometry",)]
 
 
 @pytest.mark.parametrize("code", ["from quasiharmonic import solve", "import quasiharmonic", "from . import io"])
-def test_what_says_no_room_is_refused(code):
+def test_imports_that_name_no_module_are_errors(code):
     with pytest.raises(AssertionError):
-        list(named(ast.parse(code)))
+        list(imported(ast.parse(code)))

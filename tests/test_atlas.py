@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import atlas, io
-from quasiharmonic.exact.convexity import not_convex
-from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.exact.convexity import not_convex
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.surfaces import grid, starfish
 from shared.commands import run
 from shared.meshes import lift

@@ -16,15 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic import batch, certify, distortion, flatten, io
-from quasiharmonic.batch import driver, records, supervisor
-from quasiharmonic.batch import settings as settings_module
-from quasiharmonic.batch.supervisor import Finished
-from quasiharmonic.cli import main
-from quasiharmonic.curves import Curve
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import batch, boundary_loops, certify, distortion, flatten, io
+from quasiharmonic.geometry.curves import Curve
 from quasiharmonic.surfaces import annulus, cat, disk, grid, refine
 from quasiharmonic.targets import outline, outline_curves, signed_area
+from quasiharmonic.ui.batch import driver, records, supervisor
+from quasiharmonic.ui.batch import settings as settings_module
+from quasiharmonic.ui.batch.supervisor import Finished
+from quasiharmonic.ui.cli import main
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
 pytestmark = pytest.mark.slow
@@ -645,7 +644,7 @@ class TestCommand:
             asked.append(memory_limit)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(batch, "run", run)
+        monkeypatch.setattr("quasiharmonic.ui.batch.run", run)
         assert main(["batch", "set", "-o", "out", "--memory-limit", text]) == 2
         assert asked == [value]
 
@@ -660,7 +659,10 @@ class TestCommand:
         pty = pytest.importorskip("pty")
         leader, follower = pty.openpty()
         # Told of every problem, however soon the next one is done.
-        often = "import sys; from quasiharmonic.cli import batch, main; batch.LIVE = batch.LOG = 0; main(sys.argv[1:])"
+        often = (
+            "import sys; from quasiharmonic.ui.cli import main; from quasiharmonic.ui.cli.commands import batch; "
+            "batch.LIVE = batch.LOG = 0; main(sys.argv[1:])"
+        )
         command = [sys.executable, "-c", often, "batch", str(stars), "-j", "1", "-o"]
         run = subprocess.Popen([*command, str(tmp_path / "1")], stdout=subprocess.DEVNULL, stderr=follower)
         os.close(follower)

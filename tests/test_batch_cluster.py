@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from quasiharmonic import batch
-from quasiharmonic.batch.cluster import attend
-from quasiharmonic.batch.settings import Orders
-from quasiharmonic.cli import main
+from quasiharmonic.ui.batch.cluster import attend
+from quasiharmonic.ui.batch.settings import Orders
+from quasiharmonic.ui.cli import main
 from shared.datasets import lasting, record_of, write_stars
 
 pytestmark = pytest.mark.slow

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import batch, io
-from quasiharmonic.batch import records
-from quasiharmonic.cli import main
-from quasiharmonic.report import figures, numbers, page, write_report
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.report import figures, numbers, page, write_report
 from shared.datasets import star_of, write_problem, write_stars
 
 pytestmark = pytest.mark.slow

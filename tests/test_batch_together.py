@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import batch, io
-from quasiharmonic.batch import supervisor, together, worker
-from quasiharmonic.batch.problems import GROUP_OF_FILES, SMALL_FILE, ProblemFiles, small_together
-from quasiharmonic.batch.settings import Orders
 from quasiharmonic.linsolve import available
+from quasiharmonic.ui.batch import batched as together
+from quasiharmonic.ui.batch import supervisor, worker
+from quasiharmonic.ui.batch.problems import GROUP_OF_FILES, SMALL_FILE, ProblemFiles, small_together
+from quasiharmonic.ui.batch.settings import Orders
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
 pytestmark = [
@@ -165,7 +166,7 @@ def test_a_run_that_is_stopped_within_a_group_goes_on_from_there(tmp_path):
 
 def test_a_run_has_small_problems_solved_together(tmp_path, monkeypatch):
     """By a process that cannot solve any by itself."""
-    code = "from quasiharmonic.batch import worker; worker.solve_files = None; worker.serve()"
+    code = "from quasiharmonic.ui.batch import worker; worker.solve_files = None; worker.serve()"
     monkeypatch.setattr(supervisor, "COMMAND", [sys.executable, "-P", "-c", code])
     source = write_stars(tmp_path / "set", ["a", "b", "c"])
     assert batch.run(source, tmp_path / "out", jobs=1).outcomes == {"injective": 3}

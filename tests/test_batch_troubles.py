@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from quasiharmonic import batch
-from quasiharmonic.batch import supervisor
-from quasiharmonic.batch.settings import Orders
+from quasiharmonic.ui.batch import supervisor
+from quasiharmonic.ui.batch.settings import Orders
 from shared.commands import TROUBLED, linux
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
@@ -167,7 +167,7 @@ def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
     command = [sys.executable, "-m", "quasiharmonic", "batch", str(source), "-j", "2", "-o"]
     out, straight = tmp_path / "killed", tmp_path / "straight"
     run = (
-        "from quasiharmonic import batch; from quasiharmonic.batch import supervisor; "
+        "from quasiharmonic import batch; from quasiharmonic.ui.batch import supervisor; "
         f"supervisor.COMMAND, supervisor.TOGETHER = {TROUBLED!r}, 1.0; batch.run({str(source)!r}, {str(out)!r}, jobs=2)"
     )
     driver = subprocess.Popen([sys.executable, "-c", run])
@@ -203,9 +203,9 @@ def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
 def test_an_orphan_that_hangs_ends_by_itself(tmp_path, monkeypatch):
     """With the interpreter's lock held no thread sees that the driver is gone; the system ends the process."""
     write_stars(tmp_path / "set", ["spin"])
-    script = f"import sys, quasiharmonic.batch.worker as w; w.GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
+    script = f"import sys, quasiharmonic.ui.batch.worker as w; w.GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
     run = (
-        "import sys; from quasiharmonic import batch; from quasiharmonic.batch import supervisor; "
+        "import sys; from quasiharmonic import batch; from quasiharmonic.ui.batch import supervisor; "
         f"supervisor.COMMAND = [sys.executable, '-c', {script!r}]; "
         f"batch.run({str(tmp_path / 'set')!r}, {str(tmp_path / 'out')!r}, jobs=1, time_limit=1.5)"
     )

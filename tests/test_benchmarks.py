@@ -14,9 +14,9 @@ import letters_alone
 import many
 import problems
 import speed
-from quasiharmonic import Problem, certify, kernels, solve
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.strategy import stages_of
+from quasiharmonic import Problem, boundary_loops, certify, solve
+from quasiharmonic.solver.search.strategy import stages_of
+from quasiharmonic.util import kernels
 
 pytestmark = pytest.mark.slow
 

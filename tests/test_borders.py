@@ -27,23 +27,23 @@ from quasiharmonic import (
     refine,
     warp_by_landmarks,
 )
+from quasiharmonic.apps.atlas.packing import packed
+from quasiharmonic.apps.mesh_motion.quality import element_quality
 from quasiharmonic.atlas import SeamedMesh
-from quasiharmonic.atlas.packing import packed
-from quasiharmonic.cli import main
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import ARAP
-from quasiharmonic.energy.measures import mean_ratio
-from quasiharmonic.exact.elements import inverted_elements
-from quasiharmonic.exact.loops import contacts
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import ARAP
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+from quasiharmonic.geometry.exact.loops import contacts
+from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.operators import operators
-from quasiharmonic.mesh.reference import ReferenceMesh
-from quasiharmonic.mesh.topology import boundary_loops, components
 from quasiharmonic.plot import plot_map
 from quasiharmonic.problem import Domain
-from quasiharmonic.simulation.quality import element_quality
 from quasiharmonic.surfaces import disk
 from quasiharmonic.targets import boundary_to, flattened_edges
+from quasiharmonic.ui.cli import main
 
 V, F = disk(2)
 UV = V[:, :2].copy()
@@ -58,10 +58,10 @@ import sys, threading, time
 import numpy as np
 from quasiharmonic import certify, distortion, flatten, flipped_triangles, injective_map, is_injective
 from quasiharmonic import InverseMap, polish
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import ARAP
-from quasiharmonic.mesh.reference import ReferenceMesh
-from quasiharmonic.mesh.topology import boundary_loops, components
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import ARAP
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from quasiharmonic.surfaces import disk
 
 V, good = disk({rings})
@@ -123,15 +123,15 @@ def test_triangles_that_another_thread_rewrites(name):
 
 # Where kernels are called that rely on indices.
 KERNELS = {
-    "exact.triangles": ["sure_signs", "count_turns"],
-    "exact.loops": ["doubtful_pairs"],
-    "mesh.topology": ["sort_edges", "link_nodes", "follow_loops"],
-    "mesh.reference": ["lay_flat", "wirtinger"],
-    "energy.deformation": ["jacobians", "pulls", "collapses"],
+    "geometry.exact.triangles": ["sure_signs", "count_turns"],
+    "geometry.exact.loops": ["doubtful_pairs"],
+    "geometry.mesh.topology": ["sort_edges", "link_nodes", "follow_loops"],
+    "geometry.mesh.reference": ["lay_flat", "wirtinger"],
+    "energies.deformation": ["jacobians", "pulls", "collapses"],
     "linsolve.pattern": ["find_pattern"],
     "linsolve.laplacian": ["assemble", "boundary_load", "put_at"],
-    "exact.point_location": ["sure_hits"],
-    "exact.nested_grid": ["find_cells", "divide_cells"],
+    "geometry.exact.point_location": ["sure_hits"],
+    "geometry.exact.nested_grid": ["find_cells", "divide_cells"],
 }
 # What is called with the arrays V, F, uv and the boundary, each of which stays the caller's.
 FUNCTIONS = {

@@ -8,6 +8,7 @@ import pytest
 from quasiharmonic import (
     Problem,
     batch,
+    boundary_loops,
     flatten,
     harmonise,
     injective_map,
@@ -18,9 +19,8 @@ from quasiharmonic import (
     repair,
     solve,
 )
-from quasiharmonic.flattening import piece
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search import stages
+from quasiharmonic.apps.flattening import piece
+from quasiharmonic.solver.search import stages
 from quasiharmonic.surfaces import disk
 
 V, F = disk(3)

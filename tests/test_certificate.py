@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.exact.certificate import Obstacle, certify, flipped_triangles, is_injective
-from quasiharmonic.exact.predicates import SegmentRelation
-from quasiharmonic.ladder.mapping import injective_map
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.geometry.exact.certificate import Obstacle, certify, flipped_triangles, is_injective
+from quasiharmonic.geometry.exact.predicates import SegmentRelation
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.solver.refine.mapping import injective_map
 from quasiharmonic.surfaces import annulus
 from shared.exact import exact_orientation, exact_relation
 
@@ -137,7 +137,7 @@ def test_the_three_verdicts_on_a_triangle():
 
 
 def test_predicate_and_locator_agree_with_the_certificate(rng, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.exact.triangles.TRIANGLE_CHUNK", 7)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.triangles.TRIANGLE_CHUNK", 7)
     F = strip(6, rows=5)
     flat = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0), indexing="ij"), axis=-1).reshape(-1, 2)
     for noise in (0.0, 0.1, 0.4, 1.0):

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import __version__, cli, io
-from quasiharmonic.energy.measures import distortion
+from quasiharmonic import __version__, io
+from quasiharmonic.energies.measures import distortion
 from quasiharmonic.linsolve import available
 from quasiharmonic.surfaces import random_delaunay
+from quasiharmonic.ui import cli
 from shared.commands import run
 from shared.meshes import boundary_of, lift, signed_areas
 from shared.solvable import star_problem, turned_ring
@@ -241,7 +242,7 @@ class TestReportFails:
         def interrupt(*arguments, **more):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("quasiharmonic.plot.save_map_figure", interrupt)
+        monkeypatch.setattr("quasiharmonic.ui.plot.save_map_figure", interrupt)
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 3
         assert "o.obj is written; interrupted" in capsys.readouterr().err
 
@@ -258,7 +259,7 @@ class TestReportFails:
         def interrupt(self, xi):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("quasiharmonic.field.objective.Objective.evaluate", interrupt)
+        monkeypatch.setattr("quasiharmonic.solver.field.objective.Objective.evaluate", interrupt)
         assert run("map", star, "-o", tmp_path / "o.obj") == 2
         assert "nothing was written" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
@@ -290,7 +291,7 @@ class TestReportFails:
         def fail(*arguments, **more):
             raise NotPositiveDefinite("as asked")
 
-        monkeypatch.setattr("quasiharmonic.search.solving.quasi_harmonic_map", fail)
+        monkeypatch.setattr("quasiharmonic.solver.search.solving.quasi_harmonic_map", fail)
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 0
         assert (tmp_path / "p.png").exists()
 
@@ -329,7 +330,7 @@ class TestPolish:
         worst = {name: distortion(V, F, uv).summary("isometric").maximum for name, uv in maps.items()}
         assert worst["unasked"] < 0.9 * worst["none"]
         # On large meshes the first map is what one gets.
-        monkeypatch.setattr("quasiharmonic.energy.smoothing.LARGEST", 100)
+        monkeypatch.setattr("quasiharmonic.energies.smoothing.LARGEST", 100)
         assert run("map", star, "-o", tmp_path / "large.obj") == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "large.obj")), maps["none"])
 
@@ -368,9 +369,9 @@ class TestPolish:
 
     def test_names_are_those_of_the_library(self):
         from quasiharmonic import linsolve
-        from quasiharmonic.cli import arguments
-        from quasiharmonic.energy.polishing import ENERGIES
-        from quasiharmonic.search import harmonising, strategy
+        from quasiharmonic.energies.polishing import ENERGIES
+        from quasiharmonic.solver.search import harmonising, strategy
+        from quasiharmonic.ui.cli import arguments
 
         assert tuple(strategy.STRATEGIES) == arguments.STRATEGIES
         assert set(arguments.ENERGIES) == set(ENERGIES)
@@ -464,7 +465,7 @@ class TestDemo:
 def test_help_imports_no_numerics():
     """`qhm --help` must not pay for NumPy."""
     code = (
-        "import sys; from quasiharmonic.cli import main\n"
+        "import sys; from quasiharmonic.ui.cli import main\n"
         "try: main(['map', '--help'])\n"
         "except SystemExit: pass\n"
         "import quasiharmonic; assert not {'numpy', 'scipy', 'matplotlib'} & set(sys.modules)"
@@ -477,7 +478,7 @@ def test_every_subcommand_explains_itself(command):
     """Its page in the documentation is made from this and nothing else."""
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
-    import_module(f"quasiharmonic.cli.{cli.COMMANDS[command]}").add_parser(commands)
+    import_module(f"quasiharmonic.ui.cli.commands.{command}").add_parser(commands)
     ((name, subparser),) = commands.choices.items()
     assert name == command
     assert re.search(rf"^ +{name} +\w+", parser.format_help(), re.MULTILINE)
@@ -502,7 +503,7 @@ def test_the_version_says_what_it_runs_on(pure):
     if pure:
         assert loops == "loops: in NumPy, as QUASIHARMONIC_PURE has it"
     else:
-        built = find_spec("quasiharmonic.kernels._compiled") is not None
+        built = find_spec("quasiharmonic.util.kernels._compiled") is not None
         assert loops.startswith("loops: compiled" if built else "loops: in NumPy: ")
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import flatten, io, polish
+from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
-from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk
 from shared.commands import run
 from shared.gltf_files import square

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import inverse_field, nearest_invertible
-from quasiharmonic.cli import main
+from quasiharmonic.ui.cli import main
 
 
 @pytest.fixture

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, distortion, flipped_triangles, is_injective, solve
-from quasiharmonic.descent import VectorAdam
+from quasiharmonic.geometry.coarsening.levels import coarsen, touching
+from quasiharmonic.geometry.coarsening.prolongation import places, prolong, smooth
+from quasiharmonic.geometry.coarsening.removal import by_degree, remove_vertices, room_for_round
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.coarsening import coarsen, touching
-from quasiharmonic.mesh.prolongation import places, prolong, smooth
-from quasiharmonic.mesh.removal import by_degree, remove_vertices, room_for_round
-from quasiharmonic.mesh.topology import boundary_loops, edges
 from quasiharmonic.problem import Domain
-from quasiharmonic.search import stages
-from quasiharmonic.search.coarse import CoarseMesh, coarse_mesh
-from quasiharmonic.search.stages import CoarseToFine
-from quasiharmonic.search.strategy import speed
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.search import stages
+from quasiharmonic.solver.search.coarse import CoarseMesh, coarse_mesh
+from quasiharmonic.solver.search.stages import CoarseToFine
+from quasiharmonic.solver.search.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
 from shared.meshes import boundary_of, lift, random_annulus, signed_areas, tangled

@@ -7,9 +7,9 @@ import pytest
 
 import problems
 from quasiharmonic import Problem, solve
-from quasiharmonic.descent import Combing, Composite, Patches, Untangling
-from quasiharmonic.descent.combing import best_shift, combed, frame_along
-from quasiharmonic.energy.deformation import signed_areas
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.solver.methods import Combing, Composite, Patches, Untangling
+from quasiharmonic.solver.methods.line_shift import best_shift, combed, frame_along
 from quasiharmonic.surfaces import disk, random_delaunay
 
 

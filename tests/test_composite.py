@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, solve
-from quasiharmonic.descent import Composite, VectorAdam
-from quasiharmonic.descent.composite import composite_map, polygon_triangles
-from quasiharmonic.energy.deformation import signed_areas
-from quasiharmonic.exact.constrained_delaunay import delaunay_of_polygon
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, solve
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.constrained_delaunay import delaunay_of_polygon
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods import Composite, VectorAdam
+from quasiharmonic.solver.methods.composite import composite_map, polygon_triangles
 from quasiharmonic.surfaces import annulus, disk
 from shared.solvable import star_problem
 

@@ -10,22 +10,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import Problem, certify
-from quasiharmonic.construction.constructing import construct
-from quasiharmonic.construction.cutting import Cutting
-from quasiharmonic.construction.halfedges import HalfEdges
-from quasiharmonic.construction.opening import thinned
-from quasiharmonic.construction.regions import Regions
-from quasiharmonic.construction.sheet import Sheet
-from quasiharmonic.construction.simplicity import is_simple
-from quasiharmonic.construction.thinning import best_triangles, shape
-from quasiharmonic.construction.walks import walk
-from quasiharmonic.descent.patches import remapped
-from quasiharmonic.descent.untangling import untangled
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.mesh.refinement import split_edges
-from quasiharmonic.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.geometry.mesh.refinement import split_edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.solver.construction.constructing import construct
+from quasiharmonic.solver.construction.cutting import Cutting
+from quasiharmonic.solver.construction.halfedges import HalfEdges
+from quasiharmonic.solver.construction.opening import thinned
+from quasiharmonic.solver.construction.regions import Regions
+from quasiharmonic.solver.construction.sheet import Sheet
+from quasiharmonic.solver.construction.simplicity import is_simple
+from quasiharmonic.solver.construction.thinning import best_triangles, shape
+from quasiharmonic.solver.construction.walks import walk
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods.local_repair import remapped
+from quasiharmonic.solver.methods.untangling import untangled
 from quasiharmonic.surfaces import disk, grid
-from quasiharmonic.targets.chords import flattened_edges
+from quasiharmonic.targets.boundary.chords import flattened_edges
 from shared.outlined import onto_polygon, polygon, turned_ring, with_holes, without_inner_vertices
 from shared.polygons import circle, random_polygon, spread
 from shared.small_meshes import handle, wheel

@@ -10,9 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic import io, surfaces
-from quasiharmonic.cli import main
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops, io, surfaces
 from quasiharmonic.targets import (
     BoundaryLoop,
     boundary_corners,
@@ -23,7 +21,8 @@ from quasiharmonic.targets import (
     rectangle,
     ring,
 )
-from quasiharmonic.targets.asked_corners import read_corners
+from quasiharmonic.targets.boundary.corner_spec import read_corners
+from quasiharmonic.ui.cli import main
 from shared.commands import run
 from shared.meshes import lift, random_annulus
 

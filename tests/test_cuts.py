@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from quasiharmonic import flatten, surfaces
-from quasiharmonic.cuts.finding import find_cuts
-from quasiharmonic.cuts.graph import edge_graph
-from quasiharmonic.cuts.shortening import shortened, stretches
-from quasiharmonic.cuts.shrinking import Shrinking
-from quasiharmonic.cuts.topological import opening_cuts, without_loose_ends
-from quasiharmonic.mesh.opening import opened_along
-from quasiharmonic.mesh.topology import boundary_loops, components, edge_keys, edges
+from quasiharmonic.geometry.mesh.opening import opened_along
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edge_keys, edges
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.targets.cuts.graph import edge_graph
+from quasiharmonic.targets.cuts.shortening import shortened, stretches
+from quasiharmonic.targets.cuts.shrinking import Shrinking
+from quasiharmonic.targets.cuts.topological import opening_cuts, without_loose_ends
 from shared.closed import TETRAHEDRON, blocks, double_torus, torus
 from shared.meshes import lift
 

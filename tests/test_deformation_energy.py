@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.energy.derivatives import derivative_error
-from quasiharmonic.energy.energies import (
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.derivatives import derivative_error
+from quasiharmonic.energies.energies import (
     ARAP,
     MIPS,
     AreaPreserving,
@@ -19,10 +19,10 @@ from quasiharmonic.energy.energies import (
     UnsignedARAP,
     conformal_area_blend,
 )
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.energy.newton_system import NewtonSystem
-from quasiharmonic.energy.polishing import ENERGIES
-from quasiharmonic.energy.springs import MassSpring
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.energies.polishing import ENERGIES
+from quasiharmonic.energies.springs import MassSpring
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.surfaces import grid, random_delaunay
 from shared.meshes import bend, boundary_of, lift, surfaces

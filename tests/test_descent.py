@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import Problem, descent, solve
-from quasiharmonic.descent import (
+from quasiharmonic import Problem, solve
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.energies.derivatives import check_energy, random_deformation
+from quasiharmonic.energies.energies import Deformation
+from quasiharmonic.solver import methods as descent
+from quasiharmonic.solver.field.functionals import beltrami_energy
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.tensor import PARAMETERISATIONS, TANH, own_tensor
+from quasiharmonic.solver.methods import (
     LBFGS,
     Alternating,
     Descent,
@@ -22,20 +29,14 @@ from quasiharmonic.descent import (
     VectorAdam,
     reweighting,
 )
-from quasiharmonic.descent.base import FunctionalDescent, SearchStage, SoFar, Steps
-from quasiharmonic.descent.newton import SecondOrderModel
-from quasiharmonic.descent.patches import Patch, last_untangled
-from quasiharmonic.descent.random_restarts import left_of, nearest
-from quasiharmonic.descent.reweighting import reweighted
-from quasiharmonic.descent.untangling import GRADINGS, Regularised, untangled
-from quasiharmonic.energy.deformation import signed_areas
-from quasiharmonic.energy.derivatives import check_energy, random_deformation
-from quasiharmonic.energy.energies import Deformation
-from quasiharmonic.field.functionals import beltrami_energy
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.tensor import PARAMETERISATIONS, TANH, own_tensor
-from quasiharmonic.search.stages import InPassing
-from quasiharmonic.search.strategy import STRATEGIES, stages_of
+from quasiharmonic.solver.methods.base import FunctionalDescent, SearchStage, SoFar, Steps
+from quasiharmonic.solver.methods.local_repair import Patch, last_untangled
+from quasiharmonic.solver.methods.newton import SecondOrderModel
+from quasiharmonic.solver.methods.random_restarts import left_of, nearest
+from quasiharmonic.solver.methods.reweighting import reweighted
+from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangled
+from quasiharmonic.solver.search.stages import InPassing
+from quasiharmonic.solver.search.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
 from shared.meshes import bend, boundary_of, lift, random_xi
 from shared.solvable import star_problem, turned_ring

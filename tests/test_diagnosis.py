@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
-from quasiharmonic.ladder.mapping import injective_map
-from quasiharmonic.ladder.refining import refine
 from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.solver.refine.mapping import injective_map
+from quasiharmonic.solver.refine.refining import refine
 from quasiharmonic.surfaces import disk
 from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto
 from shared.polygons import circle

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from quasiharmonic.exact.diagnosis import Forbids, Kind, diagnose
-from quasiharmonic.exact.predicates import orientation
-from quasiharmonic.mesh.topology import edges
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import bend, boundary_of
 from shared.obstructed import OBSTRUCTED, moved, onto

@@ -11,15 +11,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from quasiharmonic.exact.diagnosis import Kind, diagnose, examine, shortcuts
-from quasiharmonic.exact.diagnosis.clearance import clear
-from quasiharmonic.exact.diagnosis.clipping import Lattice
-from quasiharmonic.exact.diagnosis.effort import Effort
-from quasiharmonic.exact.diagnosis.views import Views
-from quasiharmonic.exact.loops import contacts, winding
-from quasiharmonic.exact.predicates import SegmentRelation, orientation, segment_relation
-from quasiharmonic.exact.triangulation import triangulate
+from quasiharmonic.geometry.exact.loops import contacts, winding
+from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation, segment_relation
+from quasiharmonic.geometry.exact.triangulation import triangulate
 from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import Kind, diagnose, examine, shortcuts
+from quasiharmonic.problem.diagnosis.clearance import clear
+from quasiharmonic.problem.diagnosis.clipping import Lattice
+from quasiharmonic.problem.diagnosis.effort import Effort
+from quasiharmonic.problem.diagnosis.views import Views
 from quasiharmonic.surfaces import annulus, disk, grid
 from shared.meshes import boundary_of
 from shared.obstructed import OBSTRUCTED, onto
@@ -162,7 +162,7 @@ def winding_number(x, corners):
 
 @pytest.mark.parametrize("chunk", [1, 1 << 18])
 def test_winding_numbers(rng, monkeypatch, chunk):
-    monkeypatch.setattr("quasiharmonic.exact.loops.PAIR_CHUNK", chunk)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.loops.PAIR_CHUNK", chunk)
     for n in (3, 8, 30):
         corners = rng.integers(0, 9, (n, 2)).astype(float)
         points = np.concatenate([rng.integers(0, 9, (40, 2)), rng.integers(0, 18, (40, 2)) / 2, corners])

@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from quasiharmonic import surfaces
-from quasiharmonic.linsolve import laplacian, mkl, takes_order
+from quasiharmonic import boundary_loops, surfaces
+from quasiharmonic.linsolve import dissection, laplacian, mkl, takes_order
+from quasiharmonic.linsolve.dissection import nested_dissection
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh import dissection
-from quasiharmonic.mesh.dissection import nested_dissection
-from quasiharmonic.mesh.topology import boundary_loops
 
 
 def edges_of(F, n):

@@ -12,17 +12,17 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from quasiharmonic import distortion, surfaces
-from quasiharmonic.energy.distances import surface_distances
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.contacts import Rim
-from quasiharmonic.flattening.distance_cascade import kept_by_coarse
-from quasiharmonic.flattening.distance_descent import DistanceDescent, keep_distances, kept
-from quasiharmonic.flattening.distance_energy import DistanceEnergy
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.piece import Piece, Settings
-from quasiharmonic.mesh.geodesics import straight_segments
-from quasiharmonic.result import Status
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.distances.descent import DistanceDescent, keep_distances, kept
+from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
+from quasiharmonic.apps.flattening.distances.multilevel import kept_by_coarse
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.energies.distances import surface_distances
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.geodesics import straight_segments
+from quasiharmonic.problem.result import Status
 from shared.told import Told
 
 
@@ -586,7 +586,7 @@ def test_ctrl_c_ends_flattening_by_distances_with_a_map(dome, stage):
 
 
 def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkeypatch):
-    from quasiharmonic.flattening import distance_descent
+    from quasiharmonic.apps.flattening.distances import descent as distance_descent
 
     def cut_short(*arguments, **options):
         raise KeyboardInterrupt

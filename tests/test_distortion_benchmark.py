@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import distortion as benchmark
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
 from quasiharmonic.surfaces import grid
 from shared.datasets import star_of, write_problem
 

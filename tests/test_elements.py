@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import surfaces
-from quasiharmonic.energy.measures import mean_ratio
-from quasiharmonic.exact.convexity import not_convex
-from quasiharmonic.exact.elements import inverted_elements
-from quasiharmonic.mesh.elements import (
+from quasiharmonic.apps.mesh_motion.quality import element_quality
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.geometry.exact.convexity import not_convex
+from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+from quasiharmonic.geometry.mesh.elements import (
     corner_triangles,
     covering_triangles,
     element_array,
@@ -17,9 +18,8 @@ from quasiharmonic.mesh.elements import (
     rim,
     turned_over,
 )
-from quasiharmonic.mesh.polygons import Polygons
-from quasiharmonic.mesh.second_order import jacobian_coefficients
-from quasiharmonic.simulation.quality import element_quality
+from quasiharmonic.geometry.mesh.polygons import Polygons
+from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
 from shared.meshes import boundary_of
 from shared.simulation import least_jacobian, quadrilaterals, second_order
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.derivatives import check_energy, derivative_error, random_deformation
-from quasiharmonic.energy.energies import (
+from quasiharmonic.energies.derivatives import check_energy, derivative_error, random_deformation
+from quasiharmonic.energies.energies import (
     ARAP,
     MIPS,
     AreaBarrier,
@@ -17,9 +17,9 @@ from quasiharmonic.energy.energies import (
     SymmetricDirichlet,
     conformal_area_blend,
 )
-from quasiharmonic.energy.springs import MassSpring
-from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import edges
+from quasiharmonic.energies.springs import MassSpring
+from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import lift
 

@@ -13,7 +13,7 @@ import pytest
 from matplotlib.image import imread
 from PIL import Image
 
-from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 
 pytestmark = pytest.mark.slow
 

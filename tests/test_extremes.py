@@ -23,10 +23,10 @@ from quasiharmonic import (
     polish_derivative,
     refine_problem,
 )
-from quasiharmonic.cli import main
-from quasiharmonic.exact.diagnosis import Kind
+from quasiharmonic.problem.diagnosis import Kind
 from quasiharmonic.surfaces import cat, disk, grid, random_delaunay
 from quasiharmonic.targets import boundary_to
+from quasiharmonic.ui.cli import main
 from shared.meshes import boundary_of, signed_areas
 from shared.obstructed import OBSTRUCTED, moved, onto
 from shared.polygons import circle

@@ -13,9 +13,9 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
-from quasiharmonic.cli import main
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io.fem import read_fem, write_fem
+from quasiharmonic.io.fem.files import read_fem, write_fem
+from quasiharmonic.ui.cli import main
 from shared import gmsh_files, vtk_files
 
 

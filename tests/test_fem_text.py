@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import surfaces
-from quasiharmonic.cli import main
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io.fem import read_fem, write_fem
+from quasiharmonic.io.fem.files import read_fem, write_fem
+from quasiharmonic.ui.cli import main
 from shared.meshes import boundary_of
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.derivatives import check_energy
-from quasiharmonic.energy.energies import Deformation, Isotropic, SymmetricDirichlet
-from quasiharmonic.energy.newton_descent import in_units
-from quasiharmonic.energy.reweighted import ReweightedDirichlet
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.contacts import Rim
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.layout import laid_along_axis
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.result import Status
+from quasiharmonic import boundary_loops
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.layout import laid_along_axis
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.derivatives import check_energy
+from quasiharmonic.energies.energies import Deformation, Isotropic, SymmetricDirichlet
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid
 from shared.told import Told
 
@@ -66,7 +66,7 @@ def test_energies_fall_and_maps_stay_bijective(energy):
 
 
 def _mips():
-    from quasiharmonic.energy.energies import MIPS
+    from quasiharmonic.energies.energies import MIPS
 
     return MIPS()
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io
-from quasiharmonic.cli import main
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.surfaces import disk
+from quasiharmonic.ui.cli import main
 
 FLAT, F = disk(5)
 V = np.column_stack([FLAT, np.zeros(len(FLAT))])

@@ -7,21 +7,21 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from quasiharmonic.cuts.finding import find_cuts
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.energy.newton_descent import in_units
-from quasiharmonic.exact.certificate import certify, is_injective
-from quasiharmonic.flattening.cascade import coarse_start
-from quasiharmonic.flattening.contacts import Rim
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.hierarchy import Hierarchy
-from quasiharmonic.flattening.start import disk_start
-from quasiharmonic.flattening.touching_up import thick_energy, touched_up
-from quasiharmonic.mesh.seams import SeamedMesh
-from quasiharmonic.mesh.topology import boundary_loops, edges
-from quasiharmonic.result import Status
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy
+from quasiharmonic.apps.flattening.multilevel.smoothing import thick_energy, touched_up
+from quasiharmonic.apps.flattening.multilevel.start import coarse_start
+from quasiharmonic.apps.flattening.start import disk_start
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.geometry.exact.certificate import certify, is_injective
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, grid, random_delaunay, starfish
+from quasiharmonic.targets.cuts.find import find_cuts
 
 
 def in_space(V):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import atlas, distortion, io
-from quasiharmonic.cli import main
-from quasiharmonic.exact.certificate import certify
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.surfaces import cat, grid
+from quasiharmonic.ui.cli import main
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_nothing_to_cut_is_no_error(head, tmp_path):
 
 
 def test_interrupted_writes_the_best_map(head, tmp_path, monkeypatch):
-    from quasiharmonic.flattening import piece
+    from quasiharmonic.apps.flattening import piece
 
     def cut_short(*arguments):
         raise KeyboardInterrupt

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.atlas.working import flatten as flatten_atlas
-from quasiharmonic.cuts.finding import find_cuts
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.energy.newton_descent import in_units
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.cascade import coarse_start
-from quasiharmonic.flattening.collapse import has_collapsed, stretch_of_boundary, worst_stretch
-from quasiharmonic.flattening.contacts import Rim
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.mesh.seams import SeamedMesh
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.result import Status
+from quasiharmonic.apps.atlas.working import flatten as flatten_atlas
+from quasiharmonic.apps.flattening.collapse import has_collapsed, stretch_of_boundary, worst_stretch
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.multilevel.start import coarse_start
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import cat, disk, starfish
+from quasiharmonic.targets.cuts.find import find_cuts
 from shared.closed import TETRAHEDRON
 
 
@@ -103,7 +103,7 @@ class Stuck(SymmetricDirichlet):
 
 def test_a_collapse_from_every_start_is_the_status(monkeypatch):
     V, F = cat(8)
-    monkeypatch.setattr("quasiharmonic.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
     result = flatten(V, F, energy=Stuck())
     assert result.status is Status.COLLAPSED
     assert result.certificate.bijective
@@ -118,14 +118,14 @@ def test_a_collapse_from_every_start_is_the_status(monkeypatch):
 
 def test_what_two_starts_agree_on_is_no_collapse(monkeypatch):
     V, F = cut_starfish(3)
-    monkeypatch.setattr("quasiharmonic.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
     result = flatten(V, F)
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
 
 
 def test_a_collapsed_island_is_what_is_said_of_an_atlas(monkeypatch):
-    monkeypatch.setattr("quasiharmonic.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
     plane, F = disk(3)
     flat = np.column_stack([plane + 5, np.zeros(len(plane))])
     V, G = cat(8)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.energy.newton_descent import in_units
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.flattening.contacts import HATS, Contacts, Rim
-from quasiharmonic.flattening.descent import GuardedDescent, descend
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
+from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.apps.flattening.descent import GuardedDescent, descend
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.surfaces import annulus, grid
 
 

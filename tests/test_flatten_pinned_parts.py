@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.cli import main
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.exact.diagnosis import Forbids, Kind
-from quasiharmonic.flattening.flattened import flatten
+from quasiharmonic import boundary_loops
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_obj
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.result import Status
+from quasiharmonic.problem.diagnosis import Forbids, Kind
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, disk
+from quasiharmonic.ui.cli import main
 
 
 def several(*surfaces):

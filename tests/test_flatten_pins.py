@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.exact.diagnosis import Forbids, Kind
-from quasiharmonic.flattening.flattened import flatten
-from quasiharmonic.flattening.piece import Piece, Settings
-from quasiharmonic.flattening.pin_obstructions import pin_obstructions
-from quasiharmonic.flattening.pins import Pinned, moved_onto
-from quasiharmonic.mesh.topology import boundary_loops, edges
-from quasiharmonic.result import Status
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
+from quasiharmonic.apps.flattening.pins.pins import Pinned, moved_onto
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
+from quasiharmonic.problem.diagnosis import Forbids, Kind
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"

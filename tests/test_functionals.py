@@ -7,15 +7,15 @@ import pytest
 from scipy.optimize import brentq
 
 from quasiharmonic import certify, solve
-from quasiharmonic.descent import LBFGS, Newton, VectorAdam
-from quasiharmonic.field.functionals import FUNCTIONALS, neumann_target
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.passes import own_sweep
-from quasiharmonic.field.tensor import TANH
-from quasiharmonic.mesh.operators import operators
-from quasiharmonic.mesh.reference import ReferenceMesh
-from quasiharmonic.mesh.topology import boundary_edges, boundary_loops
+from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.problem import Problem
+from quasiharmonic.solver.field.functionals import FUNCTIONALS, neumann_target
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.passes import own_sweep
+from quasiharmonic.solver.field.tensor import TANH
+from quasiharmonic.solver.methods import LBFGS, Newton, VectorAdam
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
 from shared.meshes import bend, boundary_of, random_xi, signed_areas, surfaces
 

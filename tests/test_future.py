@@ -8,10 +8,9 @@ import pytest
 import determinants
 import hyperbolic
 import positive_weights
-from quasiharmonic import Problem, certify, solve
-from quasiharmonic.energy.deformation import signed_areas
-from quasiharmonic.field.tensor import TANH
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, certify, solve
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import disk
 from shared.meshes import random_xi
 

@@ -16,6 +16,7 @@ from quasiharmonic import (
     InverseMap,
     Problem,
     atlas,
+    boundary_loops,
     certify,
     cut_open,
     distortion,
@@ -34,12 +35,11 @@ from quasiharmonic import (
     repair,
     targets,
 )
-from quasiharmonic.energy.distances import surface_distances
-from quasiharmonic.flattening.patterns import pattern
-from quasiharmonic.given.objects import mesh_arrays
+from quasiharmonic.apps.flattening.patterns import pattern
+from quasiharmonic.energies.distances import surface_distances
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.mesh.seams import SeamedMesh
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.io.adapters.objects import mesh_arrays
 from quasiharmonic.surfaces import annulus, disk, grid
 
 Pair = namedtuple("Pair", ["V", "F"])

@@ -10,17 +10,16 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, certify, io, solve
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.kernels import extension
+from quasiharmonic import Problem, boundary_loops, certify, io, solve
+from quasiharmonic.geometry.coarsening.levels import coarsen
+from quasiharmonic.geometry.coarsening.prolongation import prolong
 from quasiharmonic.linsolve import available
 from quasiharmonic.linsolve.base import LinearSolver
-from quasiharmonic.mesh.coarsening import coarsen
-from quasiharmonic.mesh.prolongation import prolong
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.surfaces import disk
 from quasiharmonic.targets import arc_length, letter, rectangle
+from quasiharmonic.util.kernels import extension
 from shared.meshes import lift
 
 
@@ -188,12 +187,12 @@ class TestImports:
 
     def test_the_library_imports_nothing_before_it_is_used(self):
         found = self.modules("import quasiharmonic")
-        assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.search.solving"}
+        assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
         assert len(found - self.modules("pass")) < 60
 
     def test_neither_does_the_help(self):
-        found = self.modules("from quasiharmonic.cli import COMMANDS, parser_of; parser_of(COMMANDS).format_help()")
-        assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.search.solving"}
+        found = self.modules("from quasiharmonic.ui.cli import COMMANDS, parser_of; parser_of(COMMANDS).format_help()")
+        assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
         assert len(found - self.modules("pass")) < 140
 
     def test_a_solve_imports_what_it_needs_and_no_more(self):
@@ -210,9 +209,9 @@ class TestImports:
         io.write_obj(tmp_path / "mesh.obj", io.MeshData(V, F).with_map(uv))
         to = [] if letter is None else ["--to", f"letter:{letter}"]
         words = ["map", str(tmp_path / "mesh.obj"), *to, "-o", str(tmp_path / "map.obj"), "--json", str(tmp_path / "j")]
-        found = self.modules(f"from quasiharmonic.cli import main; assert main({words!r}) == 0")
+        found = self.modules(f"from quasiharmonic.ui.cli import main; assert main({words!r}) == 0")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
-        assert not found & {"scipy.sparse.linalg", "quasiharmonic.cli.flatten", "quasiharmonic.plot"}
+        assert not found & {"scipy.sparse.linalg", "quasiharmonic.ui.cli.commands.flatten", "quasiharmonic.plot"}
         if available()[0] == "pardiso" and extension is not None:
             # The other solvers take SciPy's matrices.
             assert "scipy" not in found

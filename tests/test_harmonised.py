@@ -5,19 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, Status, certify, harmonise, polish, quasi_harmonic_map
-from quasiharmonic.descent import LBFGS
-from quasiharmonic.descent.base import Steps
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.energy.derivatives import check_energy, derivative_error
-from quasiharmonic.energy.energies import MIPS, AreaPreserving, Combination, Energy
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.regularisers import Conformal
+from quasiharmonic import Problem, Status, boundary_loops, certify, harmonise, polish, quasi_harmonic_map
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.derivatives import check_energy, derivative_error
+from quasiharmonic.energies.energies import MIPS, AreaPreserving, Combination, Energy
+from quasiharmonic.energies.measures import distortion
 from quasiharmonic.linsolve import available
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.harmonised import Harmonised
-from quasiharmonic.search.harmonising import ENERGIES, ETA, harmonise_map
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.regularisers import Conformal
+from quasiharmonic.solver.methods import LBFGS
+from quasiharmonic.solver.methods.base import Steps
+from quasiharmonic.solver.search.harmonised import Harmonised
+from quasiharmonic.solver.search.harmonising import ENERGIES, ETA, harmonise_map
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length
 from shared.meshes import bend, boundary_of, lift, random_xi
@@ -310,8 +309,8 @@ class TestHarmonise:
     def test_what_cannot_be_improved(self, monkeypatch):
         """Where all that is found is inverted, the given map comes back, and the status says so."""
         V, F, uv, fixed = bowl()
-        monkeypatch.setattr("quasiharmonic.search.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
-        monkeypatch.setattr("quasiharmonic.search.harmonic_descent.RIGHTING", 1)
+        monkeypatch.setattr("quasiharmonic.solver.search.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
+        monkeypatch.setattr("quasiharmonic.solver.search.harmonic_descent.RIGHTING", 1)
         result = harmonise(V, F, uv, fixed=fixed, energy="arap", max_iterations=5)
         assert result.injective
         assert result.status is not Status.POLISHED

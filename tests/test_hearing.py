@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import Problem, flatten, hearing, injective_map, polish, solve
-from quasiharmonic.hearing import heard, still_at_it
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, flatten, injective_map, polish, solve
 from quasiharmonic.surfaces import cat
 from quasiharmonic.targets import arc_length, letter
+from quasiharmonic.util import progress as hearing
+from quasiharmonic.util.progress import heard, still_at_it
 from shared.solvable import star_problem
 from shared.told import Told
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 import quasiharmonic
-from quasiharmonic.cli import main, measure
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.cli.commands import measure
 
 # Calls the command in a process whose imports are interrupted at a module's name.
 INTERRUPTED = """
@@ -40,13 +41,15 @@ def interrupted(at, *arguments):
     )
 
 
-@pytest.mark.parametrize("at", ["argparse", "quasiharmonic.cli", "quasiharmonic.cli.map", "quasiharmonic.cli.sliding"])
+@pytest.mark.parametrize(
+    "at", ["argparse", "quasiharmonic.ui.cli", "quasiharmonic.ui.cli.commands.map", "quasiharmonic.ui.cli.sliding"]
+)
 def test_while_the_command_itself_is_loaded(at):
     done = interrupted(at, "map", "in.obj", "-o", "out.obj")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "qhm: interrupted, nothing was written\n")
 
 
-@pytest.mark.parametrize("at", ["quasiharmonic.io", "numpy", "numpy.linalg", "quasiharmonic.arrays"])
+@pytest.mark.parametrize("at", ["quasiharmonic.io", "numpy", "numpy.linalg", "quasiharmonic.util.arrays"])
 def test_while_what_it_needs_is_loaded(tmp_path, at):
     path = tmp_path / "grid.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")

@@ -7,10 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints, distortion
-from quasiharmonic.exact.nested_grid import NestedGrid
-from quasiharmonic.exact.predicates import twice_area
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints, boundary_loops, distortion
+from quasiharmonic.geometry.exact.nested_grid import NestedGrid
+from quasiharmonic.geometry.exact.predicates import twice_area
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import bend, lift, random_annulus, signed_areas, surfaces
 

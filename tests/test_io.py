@@ -18,10 +18,10 @@ from hypothesis.extra.numpy import arrays
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
+from quasiharmonic.io.formats.obj import read_regular
+from quasiharmonic.io.formats.objlines import read_obj_lines
 from quasiharmonic.io.meshdata import is_planar
 from quasiharmonic.io.numbers import read_rows
-from quasiharmonic.io.obj import read_regular
-from quasiharmonic.io.objlines import read_obj_lines
 from quasiharmonic.io.textual import read_text
 from shared.datasets import write_problem
 from shared.solvable import star_problem

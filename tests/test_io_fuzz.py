@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io import obj as obj_module
-from quasiharmonic.io import off as off_module
-from quasiharmonic.io.objlines import read_obj_lines
+from quasiharmonic.io.formats import obj as obj_module
+from quasiharmonic.io.formats import off as off_module
+from quasiharmonic.io.formats.objlines import read_obj_lines
 from shared.damaged import VALID, damaged
 from shared.gltf_files import SQUARE, square
 

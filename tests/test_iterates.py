@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, solve
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import MIPS
-from quasiharmonic.field.functionals import FUNCTIONALS
-from quasiharmonic.field.objective import Objective
-from quasiharmonic.field.regularisers import Conformal
-from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.search.harmonised import Harmonised
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import MIPS
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.solver.field.functionals import FUNCTIONALS
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.regularisers import Conformal
+from quasiharmonic.solver.search.harmonised import Harmonised
 from shared.meshes import bend, lift, random_annulus, random_xi
 
 

@@ -14,20 +14,21 @@ import numpy as np
 import pytest
 
 import quasiharmonic
-from quasiharmonic import certify, kernels
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import ARAP
+from quasiharmonic import certify
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import ARAP
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh, rest_frames
+from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.reference import ReferenceMesh, rest_frames
-from quasiharmonic.mesh.shapes import rest_shapes
-from quasiharmonic.mesh.topology import boundary_loops, components
 from quasiharmonic.surfaces import disk
+from quasiharmonic.util import kernels
 from shared.kernels import ARGUMENTS
 
-# Rooms that need what not everybody has installed, and that have no kernels.
+# Packages that need extras, and that have no kernels.
 _WITHOUT = "torch", "jax", "notebook", "studio", "batch", "report"
 for module in pkgutil.walk_packages(quasiharmonic.__path__, "quasiharmonic."):
-    if module.name.split(".")[1] not in (*_WITHOUT, "__main__"):
+    if not {*_WITHOUT, "__main__"} & {*module.name.split(".")}:
         import_module(module.name)
 
 needs_extension = pytest.mark.skipif(kernels.extension is None, reason="the extension is not built, or switched off")
@@ -216,7 +217,7 @@ def test_an_extension_of_before_is_told(monkeypatch):
 
 @pytest.mark.parametrize(("value", "switched"), [("1", True), ("", False), ("0", False)])
 def test_the_environment_switches_them_off(value, switched):
-    code = "from quasiharmonic import kernels; print(kernels.extension is None)"
+    code = "from quasiharmonic.util import kernels; print(kernels.extension is None)"
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"QUASIHARMONIC_PURE": value},
                           capture_output=True, text=True, check=True)  # fmt: skip
     assert (done.stdout.strip() == "True") >= switched

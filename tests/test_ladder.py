@@ -7,13 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, Status, certify, injective_map, io
-from quasiharmonic.construction import constructing, cutting
-from quasiharmonic.descent import Newton, RandomRestarts, VectorAdam
-from quasiharmonic.ladder import climbing
-from quasiharmonic.ladder.climbing import climb
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.strategy import soonest, speed, without_restarts
+from quasiharmonic import Problem, Status, boundary_loops, certify, injective_map, io
+from quasiharmonic.solver.construction import constructing, cutting
+from quasiharmonic.solver.methods import Newton, RandomRestarts, VectorAdam
+from quasiharmonic.solver.refine import solve_refining as climbing
+from quasiharmonic.solver.refine.solve_refining import climb
+from quasiharmonic.solver.search.strategy import soonest, speed, without_restarts
 from quasiharmonic.surfaces import disk
 from shared.commands import run
 from shared.outlined import onto_polygon, with_holes

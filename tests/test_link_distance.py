@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.exact.diagnosis.clipping import Lattice
-from quasiharmonic.exact.diagnosis.links import Polygon
-from quasiharmonic.exact.predicates import orientation
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.problem.diagnosis.clipping import Lattice
+from quasiharmonic.problem.diagnosis.links import Polygon
 from shared.polygons import U, circle, spiral
 
 

@@ -28,7 +28,7 @@ from quasiharmonic.linsolve import (
     qdldl,
     rslab,
 )
-from quasiharmonic.mesh.dissection import nested_dissection
+from quasiharmonic.linsolve.dissection import nested_dissection
 
 ALL = tuple(BACKENDS)
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.exact.certificate import certify
-from quasiharmonic.exact.loops import contacts, simple_loops
-from quasiharmonic.exact.predicates import SegmentRelation
-from quasiharmonic.exact.triangles import triangle_signs
-from quasiharmonic.mesh.topology import boundary_loops, components
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.exact.loops import contacts, simple_loops
+from quasiharmonic.geometry.exact.predicates import SegmentRelation
+from quasiharmonic.geometry.exact.triangles import triangle_signs
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from shared.exact import exact_orientation, exact_relation
 
 lattice = st.integers(-2, 2).map(float)

@@ -7,15 +7,15 @@ from itertools import count, islice
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, Status, certify, injective_map, injective_maps, solve
-from quasiharmonic.descent import Newton, VectorAdam
-from quasiharmonic.exact.side_by_side import certify_each
+from quasiharmonic import Problem, Status, boundary_loops, certify, injective_map, injective_maps, solve
+from quasiharmonic.geometry.exact.batched_loops import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.problem.side_by_side import posed_each
-from quasiharmonic.search import many, together
-from quasiharmonic.search.together import Patterns, first_stage
+from quasiharmonic.problem.batched import posed_each
+from quasiharmonic.solver.methods import Newton, VectorAdam
+from quasiharmonic.solver.search import batched as together
+from quasiharmonic.solver.search import many
+from quasiharmonic.solver.search.batched import Patterns, first_stage
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.exact import inverted
 from shared.meshes import boundary_of, random_annulus

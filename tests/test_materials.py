@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_texture, save_texture_figure
 from quasiharmonic.surfaces import cat, grid
 from shared.commands import run

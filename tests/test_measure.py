@@ -10,9 +10,9 @@ import pytest
 from matplotlib.image import imread
 
 from quasiharmonic import distortion, io, surfaces
-from quasiharmonic.cli import main
-from quasiharmonic.cli.arguments import MEASURES as OFFERED
-from quasiharmonic.energy.measures import MEASURES
+from quasiharmonic.energies.measures import MEASURES
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.cli.arguments import MEASURES as OFFERED
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.measures import MEASURES, distortion
-from quasiharmonic.exact.certificate import flipped_triangles
+from quasiharmonic.energies.measures import MEASURES, distortion
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
 from quasiharmonic.surfaces import grid, random_delaunay
 from shared.meshes import bend, lift, surfaces
 

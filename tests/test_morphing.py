@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, morph, surfaces
-from quasiharmonic.cli import main
-from quasiharmonic.energy.measures import mean_ratio
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io.fem import read_fem, write_fem
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.io.fem.files import read_fem, write_fem
+from quasiharmonic.ui.cli import main
 
 
 def dented(points, depth):

@@ -7,15 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from quasiharmonic import MovingMesh, certify
-from quasiharmonic.curves.rails import Rails
-from quasiharmonic.energy import sliding
-from quasiharmonic.energy.carrying import CarryingDescent
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.energy.measures import mean_ratio
-from quasiharmonic.energy.polishing import at_own_scale
+from quasiharmonic import MovingMesh, Rails, boundary_loops, certify
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.energies.newton import sliding
+from quasiharmonic.energies.newton.boundary_continuation import CarryingDescent
+from quasiharmonic.energies.polishing import at_own_scale
 from quasiharmonic.io import MeshData, write_obj
-from quasiharmonic.mesh.topology import boundary_loops
 from quasiharmonic.problem import Domain
 from quasiharmonic.surfaces import annulus, disk
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.field.tensor import TANH
+from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.operators import operators
-from quasiharmonic.mesh.reference import ReferenceMesh
+from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import annulus, random_delaunay
 from shared.meshes import bend, lift, random_xi, signed_areas, surfaces
 

@@ -3,7 +3,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.exact.overlapping import lying_on_others
+from quasiharmonic.geometry.exact.overlapping import lying_on_others
 from quasiharmonic.surfaces import disk, grid
 
 

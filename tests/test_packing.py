@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import is_injective, surfaces
-from quasiharmonic.atlas.packing import packed
-from quasiharmonic.atlas.skyline import laid
+from quasiharmonic.apps.atlas.packing import packed
+from quasiharmonic.apps.atlas.skyline import laid
 from shared.exact import exact_orientation
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import surfaces
-from quasiharmonic.flattening.patterns import UNITS, pattern, write_pattern
+from quasiharmonic.apps.flattening.patterns import UNITS, pattern, write_pattern
 from quasiharmonic.io import OutputError
 
 SVG = "{http://www.w3.org/2000/svg}"

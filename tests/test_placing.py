@@ -7,12 +7,11 @@ import pytest
 from scipy.optimize import linprog
 
 import problems
-from quasiharmonic import Problem, injective_maps, quasi_harmonic_map, solve
-from quasiharmonic.descent import VectorAdam
-from quasiharmonic.descent.placing import Tries, placed, placed_each, roomiest
-from quasiharmonic.energy.deformation import signed_areas
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search.strategy import paper, speed
+from quasiharmonic import Problem, boundary_loops, injective_maps, quasi_harmonic_map, solve
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.methods.relocation import Tries, placed, placed_each, roomiest
+from quasiharmonic.solver.search.strategy import paper, speed
 from quasiharmonic.surfaces import random_delaunay
 
 

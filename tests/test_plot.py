@@ -15,10 +15,8 @@ from PIL import Image
 
 from quasiharmonic import flipped_triangles, surfaces
 from quasiharmonic import io as files
-from quasiharmonic.cli import main
-from quasiharmonic.energy.measures import MEASURES
+from quasiharmonic.energies.measures import MEASURES
 from quasiharmonic.plot import (
-    interactive,
     plot_before_after,
     plot_distortion,
     plot_map,
@@ -28,10 +26,12 @@ from quasiharmonic.plot import (
     save_map_figure,
     save_texture_figure,
 )
-from quasiharmonic.plot.canvas import RED, new_figure
-from quasiharmonic.plot.distortion import LABELS
-from quasiharmonic.plot.shading import view
-from quasiharmonic.targets.correspondence import upright
+from quasiharmonic.targets.boundary.correspondence import upright
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.plot import interactive
+from quasiharmonic.ui.plot.canvas import RED, new_figure
+from quasiharmonic.ui.plot.distortion import LABELS
+from quasiharmonic.ui.plot.shading import view
 
 
 def pixels(figure):

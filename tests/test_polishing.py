@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.energy import newton_descent
-from quasiharmonic.energy.deformation import signed_areas
-from quasiharmonic.energy.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.energy.newton_system import NewtonSystem
-from quasiharmonic.energy.polishing import ENERGIES, polish, polish_map
-from quasiharmonic.energy.springs import MassSpring
-from quasiharmonic.exact.certificate import is_injective
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.newton import newton_descent
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.energies.polishing import ENERGIES, polish, polish_map
+from quasiharmonic.energies.springs import MassSpring
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain
-from quasiharmonic.result import Status
+from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import bend, boundary_of, lift
 from shared.polygons import circle

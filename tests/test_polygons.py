@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import io
+from quasiharmonic.geometry.mesh.polygons import triangulated
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.ladder.refining import refine
-from quasiharmonic.mesh.polygons import triangulated
+from quasiharmonic.solver.refine.refining import refine
 
 
 def rings(polygons):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.exact import predicates
-from quasiharmonic.exact.predicates import (
+from quasiharmonic.geometry.exact import predicates
+from quasiharmonic.geometry.exact.predicates import (
     SegmentRelation,
     box_pairs,
     box_pairs_between,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem
-from quasiharmonic.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.surfaces import annulus, grid, random_delaunay
 from shared.meshes import boundary_of
 

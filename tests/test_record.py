@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, injective_map, solve
-from quasiharmonic.descent import Newton, VectorAdam
+from quasiharmonic.solver.methods import Newton, VectorAdam
 from quasiharmonic.surfaces import annulus
 from shared.meshes import boundary_of, signed_areas
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem
-from quasiharmonic.exact.diagnosis import diagnose
-from quasiharmonic.ladder.refining import refine, refine_problem
-from quasiharmonic.mesh.topology import edges
+from quasiharmonic.geometry.mesh.topology import edges
+from quasiharmonic.problem.diagnosis import diagnose
+from quasiharmonic.solver.refine.refining import refine, refine_problem
 from shared.meshes import boundary_of, signed_areas, surfaces
 from shared.obstructed import OBSTRUCTED
 

@@ -8,9 +8,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize
 
 from quasiharmonic import certify, inverse_field, nearest_invertible
-from quasiharmonic.energy.derivatives import check_energy
-from quasiharmonic.registration.approach import ThinBarrier
-from quasiharmonic.registration.nearest import fold_free
+from quasiharmonic.apps.displacement_fields.approach import ThinBarrier
+from quasiharmonic.apps.displacement_fields.nearest import fold_free
+from quasiharmonic.energies.derivatives import check_energy
 
 
 def pixels(h, w):

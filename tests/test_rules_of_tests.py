@@ -66,10 +66,10 @@ def test_rules(path):
 @pytest.mark.parametrize(
     "code",
     [
-        "from quasiharmonic.search.solving import _hidden",
+        "from quasiharmonic.solver.search.solving import _hidden",
         "import quasiharmonic._hidden",
         "result._hidden()",
-        "monkeypatch.setattr('quasiharmonic.search.solving._hidden', 1)",
+        "monkeypatch.setattr('quasiharmonic.solver.search.solving._hidden', 1)",
         "patch.setattr(solving, '_hidden', 1)",
     ],
 )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify
-from quasiharmonic.mesh.fans import fans
-from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import lift
 from shared.seamed import islands, strips

@@ -18,6 +18,7 @@ from PIL import Image
 import quasiharmonic
 from quasiharmonic import (
     Problem,
+    boundary_loops,
     certify,
     diagnose,
     distortion,
@@ -28,12 +29,11 @@ from quasiharmonic import (
     polish,
     solve,
 )
-from quasiharmonic.cli import main
-from quasiharmonic.display.page import MOST_TRIANGLES, page
-from quasiharmonic.exact.diagnosis import Diagnosis
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.result import MapResult, Status, Step
+from quasiharmonic.problem.diagnosis import Diagnosis
+from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.surfaces import disk
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.display.page import MOST_TRIANGLES, html
 
 PLANE, F = disk(4)
 V = np.column_stack([PLANE, PLANE[:, 0] * PLANE[:, 1]])
@@ -89,7 +89,7 @@ def test_a_line_a_summary_and_a_picture(shown):
     assert re.fullmatch(r"<\w+: [^\n]+>", repr(shown))
     assert len(repr(shown)) < 200
     assert 30 < len(shown.summary()) < 3000
-    text = page(shown)
+    text = html(shown)
     assert len(text) < 150_000
     words = "".join(Reader(text).words)
     assert type(shown).__name__ in words
@@ -103,8 +103,8 @@ def test_a_line_a_summary_and_a_picture(shown):
 
 
 def test_what_notebooks_ask_for():
-    assert RESULT._repr_html_() == page(RESULT)
-    assert repr(RESULT) == f"<MapResult: {RESULT.in_short()}>"
+    assert RESULT._repr_html_() == html(RESULT)
+    assert repr(RESULT) == f"<MapResult: {RESULT.short_repr()}>"
     assert "injective and bijective, 96 triangles" in repr(RESULT)
     assert repr(DIAGNOSIS).startswith("<Diagnosis: no injective map: 1 × ")
     assert repr(diagnose(PROBLEM)) == "<Diagnosis: no known obstruction>"
@@ -123,7 +123,7 @@ def test_summary_of_all_measures_is_that_of_each():
 def test_everything_is_escaped():
     """Names come from callers: an energy's class, a stage."""
     stage = replace(RESULT.stages[0], name="<script>alert('&')</script>")
-    text = page(replace(RESULT, stages=[stage]))
+    text = html(replace(RESULT, stages=[stage]))
     assert "<script" not in text
     assert stage.name in "".join(Reader(text).words)
 
@@ -135,11 +135,11 @@ def test_a_display_never_fails(monkeypatch):
         certify([], np.empty((0, 2))),
         certify(F, np.full(V.shape, np.nan)[:, :2]),
     ):
-        text = page(shown)
+        text = html(shown)
         assert not Reader(text).pictures
     assert "no picture: V is not finite" in text
-    monkeypatch.setattr("quasiharmonic.display.page.MOST_TRIANGLES", 10)
-    assert "96 triangles are drawn when asked for: .plot()" in page(RESULT)
+    monkeypatch.setattr("quasiharmonic.ui.display.page.MOST_TRIANGLES", 10)
+    assert "96 triangles are drawn when asked for: .plot()" in html(RESULT)
     assert MOST_TRIANGLES > 100_000
 
 
@@ -265,7 +265,7 @@ assert "numpy" not in sys.modules
 from quasiharmonic.surfaces import disk
 result = quasiharmonic.flatten(*disk(2))
 repr(result), result.summary()
-assert not {"matplotlib", "quasiharmonic.plot", "quasiharmonic.display"} & {*sys.modules}
+assert not {"matplotlib", "quasiharmonic.plot", "quasiharmonic.ui.display"} & {*sys.modules}
 assert "<img" in result._repr_html_()
 assert "matplotlib.pyplot" not in sys.modules
 """

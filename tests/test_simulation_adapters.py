@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import distortion, morph, surfaces
-from quasiharmonic.cli import main
-from quasiharmonic.exact.elements import inverted_elements
-from quasiharmonic.given.cells import planar_cells
+from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io.fem import read_fem
+from quasiharmonic.io.adapters.cells import planar_cells
+from quasiharmonic.io.fem.files import read_fem
+from quasiharmonic.ui.cli import main
 from shared.simulation import quadrilaterals, second_order
 
 

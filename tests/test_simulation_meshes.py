@@ -7,10 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic import Rails, Status, morph, surfaces
-from quasiharmonic.exact.elements import inverted_elements
-from quasiharmonic.mesh.elements import rim
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Rails, Status, boundary_loops, morph, surfaces
+from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+from quasiharmonic.geometry.mesh.elements import rim
 from shared.meshes import boundary_of
 from shared.simulation import channel, least_jacobian, quadrilaterals, second_order, turned
 

@@ -10,18 +10,17 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
-from quasiharmonic import Status, certify, injective_map, io, morph, polish, surfaces
-from quasiharmonic.cli import main
-from quasiharmonic.curves import Curve, Rails
-from quasiharmonic.curves.straying import Straying
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.energy.measures import distortion
-from quasiharmonic.energy.sliding import SlidingDescent
-from quasiharmonic.io.fem import read_fem
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Status, boundary_loops, certify, injective_map, io, morph, polish, surfaces
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.newton.sliding import SlidingDescent
+from quasiharmonic.geometry.curves import Curve, Rails
+from quasiharmonic.geometry.curves.deviation import Straying
+from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.targets import boundary_to, filled, outline, outline_curves
-from quasiharmonic.targets.glyphs import glyph_paths
+from quasiharmonic.targets.outlines.letters import glyph_paths
+from quasiharmonic.ui.cli import main
 from shared.meshes import lift
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -262,7 +261,7 @@ def test_some_are_held_and_some_are_told():
 
 
 def _half_circles():
-    from quasiharmonic.curves import Arc
+    from quasiharmonic.geometry.curves import Arc
 
     return Arc((0, 0), (1, 0), (0, 1), 0, np.pi), Arc((0, 0), (1, 0), (0, 1), np.pi, 2 * np.pi)
 
@@ -326,7 +325,7 @@ def test_the_system_is_that_of_displacements(rng):
     form = descent.energy.curvature_of(descent.energy.deform(descent.w))
     system.assemble(form)
     found = system.matrix().toarray()
-    from quasiharmonic.energy.newton_system import NewtonSystem
+    from quasiharmonic.energies.newton.newton_system import NewtonSystem
 
     whole = NewtonSystem(descent.energy.F, descent.energy.g, descent.w.size, descent.fixed)
     whole.assemble(form)

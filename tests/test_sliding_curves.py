@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import ellipe
 
-from quasiharmonic.curves import Arc, Curve
+from quasiharmonic.geometry.curves import Arc, Curve
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.targets import outline, outline_curves
 

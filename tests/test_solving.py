@@ -12,15 +12,14 @@ import pytest
 
 import quasiharmonic
 import quasiharmonic.linsolve
-from quasiharmonic import InverseMap, Problem, Status, injective_map, quasi_harmonic_map, solve
-from quasiharmonic.descent import LBFGS, Alternating, Newton, Patches, RandomRestarts, Untangling, VectorAdam
-from quasiharmonic.descent.untangling import untangled
-from quasiharmonic.energy.newton_system import NewtonSystem
+from quasiharmonic import InverseMap, Problem, Status, boundary_loops, injective_map, quasi_harmonic_map, solve
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.search import stages
-from quasiharmonic.search.stages import CoarseToFine, WhereMany
-from quasiharmonic.search.strategy import soonest, speed
+from quasiharmonic.solver.methods import LBFGS, Alternating, Newton, Patches, RandomRestarts, Untangling, VectorAdam
+from quasiharmonic.solver.methods.untangling import untangled
+from quasiharmonic.solver.search import stages
+from quasiharmonic.solver.search.stages import CoarseToFine, WhereMany
+from quasiharmonic.solver.search.strategy import soonest, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from shared.exact import inverted
 from shared.meshes import bend, boundary_of, lift, signed_areas

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, io
-from quasiharmonic.cli import main
-from quasiharmonic.exact.certificate import is_injective
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.problem import Problem
-from quasiharmonic.search.solving import quasi_harmonic_map
-from quasiharmonic.studio.following import Follower
-from quasiharmonic.studio.grips import grip
-from quasiharmonic.studio.laying import first_moment
-from quasiharmonic.studio.outlines import outline_by_hand, outline_drawn, outline_named
-from quasiharmonic.studio.protocol import ProtocolError, decode, encode
-from quasiharmonic.studio.sheets import MOST_TRIANGLES, sheet_of
+from quasiharmonic.solver.search.solving import quasi_harmonic_map
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.studio.falloff import grip
+from quasiharmonic.ui.studio.following import Follower
+from quasiharmonic.ui.studio.outlines import outline_by_hand, outline_drawn, outline_named
+from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
+from quasiharmonic.ui.studio.setup import first_moment
+from quasiharmonic.ui.studio.surface import MOST_TRIANGLES, sheet_of
 from shared.pages import Visitor
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
@@ -78,7 +78,7 @@ def test_a_map_that_follows_is_the_harmonic_map_of_the_last_tensors():
 
 @pytest.mark.parametrize("across", [(-0.6, 0.5), (-1.5, -1.5)], ids=["crossing", "turned over"])
 def test_what_cannot_be_reached_shows_a_certified_map_and_says_what_forbids_it(across, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.studio.following.PATIENCE", 0.05)
+    monkeypatch.setattr("quasiharmonic.ui.studio.following.PATIENCE", 0.05)
     one = Visitor()
     corner = one.session.moment.corners[2]
     # The corner across the far side: the outline crosses itself.
@@ -175,7 +175,7 @@ def test_a_corner_takes_straight_sides_along_and_a_side_bends_between_its_ends()
 
 
 def boundary(V, F):
-    from quasiharmonic.mesh.topology import boundary_loops
+    from quasiharmonic import boundary_loops
 
     (loop,) = boundary_loops(F, len(V))
     return loop

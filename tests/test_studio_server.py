@@ -21,12 +21,12 @@ pytest.importorskip("websockets", reason="the extra studio is not installed")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from quasiharmonic.cli import main
-from quasiharmonic.studio import server as served
-from quasiharmonic.studio import worker
-from quasiharmonic.studio.assets import assets, bundle
-from quasiharmonic.studio.protocol import decode, encode
 from quasiharmonic.surfaces import cat
+from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.studio import server as served
+from quasiharmonic.ui.studio import worker
+from quasiharmonic.ui.studio.assets import assets, bundle
+from quasiharmonic.ui.studio.protocol import decode, encode
 
 
 class Running:
@@ -161,7 +161,7 @@ def children():
     found = []
     for pid in filter(str.isdigit, os.listdir("/proc")):
         with contextlib.suppress(OSError), open(f"/proc/{pid}/cmdline", "rb") as file:
-            if b"quasiharmonic.studio.worker" in file.read() and parent(pid) == os.getpid():
+            if b"quasiharmonic.ui.studio.worker" in file.read() and parent(pid) == os.getpid():
                 found.append(int(pid))
     return found
 
@@ -237,7 +237,7 @@ def test_the_view_is_to_be_had_as_one_module():
 
 def test_without_websockets_the_command_says_how_to_get_them(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
-    monkeypatch.delitem(sys.modules, "quasiharmonic.studio.server")
+    monkeypatch.delitem(sys.modules, "quasiharmonic.ui.studio.server")
     assert main(["studio", "--no-browser"]) == 2
     assert "pip install 'quasiharmonic[studio]'" in capsys.readouterr().err
 

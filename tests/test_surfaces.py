@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import surfaces
-from quasiharmonic.mesh.topology import boundary_loops, components, edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 
 ALL = {
     "grid": surfaces.grid(4, 3),

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import targets
-from quasiharmonic.targets.contours import flatten
-from quasiharmonic.targets.svgpath import parse_path
+from quasiharmonic.targets.outlines.contours import flatten
+from quasiharmonic.targets.outlines.svgpath import parse_path
 
 AREA = targets.signed_area
 
@@ -251,10 +251,10 @@ def test_entity_bombs_and_files_outside(read, tmp_path):
 def test_huge_drawings(read, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="more than 1,000,000 points"):
         read(drawing('<path d="M0 0' + "c1 9 9 1 0 0" * 9000 + 'z"/>'), tolerance=1e-7)
-    monkeypatch.setattr("quasiharmonic.targets.svgpath.MOST_POINTS", 1000)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.svgpath.MOST_POINTS", 1000)
     with pytest.raises(ValueError, match="more than 1,000 pieces"):
         read(drawing('<path d="M0 0' + "h1v1" * 600 + '"/>'))
-    monkeypatch.setattr("quasiharmonic.targets.svg.MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.svg.MOST_BYTES", 1 << 20)
     with pytest.raises(ValueError, match="larger than 1 MiB; simplify"):
         read(drawing(" " * (1 << 20)))
     with pytest.raises(ValueError, match="tolerance is a share"):
@@ -368,7 +368,7 @@ def test_broken_files_of_points(tmp_path, text, message):
 
 
 def test_too_many_points(tmp_path, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.targets.polylines.MOST_POINTS", 3)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.polylines.MOST_POINTS", 3)
     (tmp_path / "outline.txt").write_text("0 0\n1 0\n1 1\n0 1\n")
     with pytest.raises(ValueError, match="more than 3 points at line 4; thin them out"):
         targets.read_polylines(tmp_path / "outline.txt")
@@ -451,7 +451,7 @@ def test_options_of_outlines():
 
 
 def test_the_command_lists_what_the_library_knows():
-    from quasiharmonic.cli.targets import FORMS
     from quasiharmonic.targets import specification
+    from quasiharmonic.ui.cli.targets import FORMS
 
     assert FORMS == specification.FORMS

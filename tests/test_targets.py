@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic import surfaces, targets
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.targets import truetype
-from quasiharmonic.targets.correspondence import upright
+from quasiharmonic import boundary_loops, surfaces, targets
+from quasiharmonic.targets.boundary.correspondence import upright
+from quasiharmonic.targets.outlines import truetype
 
 
 def distance(points, contour):

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.field.tensor import PARAMETERISATIONS, SI_LOG, TANH, own_tensor
+from quasiharmonic.solver.field.tensor import PARAMETERISATIONS, SI_LOG, TANH, own_tensor
 
 BOTH = list(PARAMETERISATIONS.values())
 

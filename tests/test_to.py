@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, cut_open, diagnose, injective_map, io, refine, surfaces, targets
-from quasiharmonic.cli import main
-from quasiharmonic.mesh.topology import boundary_loops, edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
-from quasiharmonic.targets.chord_room import ChordRoom, choose, make_room, reach
-from quasiharmonic.targets.correspondence import arc, at, off, places_along
-from quasiharmonic.targets.holes import least_stretch
+from quasiharmonic.targets.boundary import correspondence
+from quasiharmonic.targets.boundary.chord_clearance import ChordRoom, choose, make_room, reach
+from quasiharmonic.targets.boundary.correspondence import arc, at, off, places_along
+from quasiharmonic.targets.boundary.holes import least_stretch
+from quasiharmonic.targets.outlines import contours
+from quasiharmonic.ui.cli import main
 from shared.meshes import lift
 from shared.written import written
 
@@ -76,7 +78,7 @@ def test_corners_are_met_and_the_rest_lies_on_the_outline(text):
     (contour,) = outline(text)
     fixed, target = boundary_to(V, F, [contour])
     assert sorted(fixed.tolist()) == sorted(boundary_loops(F, len(V))[0].tolist())
-    sharp = targets.contours.corners(contour, 20)
+    sharp = contours.corners(contour, 20)
     assert all((target == contour[k]).all(axis=1).sum() == 1 for k in sharp)
     side = np.roll(contour, -1, axis=0) - contour
     for point in target:
@@ -91,7 +93,7 @@ def test_same_places_as_arc_length_where_nothing_is_in_the_way():
     (loop,) = boundary_loops(F, len(V))
     for contour in (targets.rectangle(2, 1), targets.letter("G")[0]):
         # From a corner on, as the outline may begin in the middle of a side.
-        first = targets.contours.from_corner(contour, 20)
+        first = contours.from_corner(contour, 20)
         np.testing.assert_allclose(boundary_to(V, F, contour)[1], targets.arc_length(V[loop], first), atol=1e-12)
 
 
@@ -321,7 +323,7 @@ def test_chords_across_a_pin_are_left_alone():
     # More ears than corners.
     ears = np.stack([np.arange(1, 11, 2) - 1, np.arange(1, 11, 2) + 1], axis=1)
     assert make_room(s, square, [(0, 0.0)], corner_angle=20, chords=ears) is None
-    stretch = next(targets.correspondence.stretches(s, [(2, 0.0)]))
+    stretch = next(correspondence.stretches(s, [(2, 0.0)]))
     assert reach(stretch, np.array([[3, 6], [1, 11]]), 12).tolist() == [
         4,
         4,

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from quasiharmonic.energy.deformation import DeformationEnergy
-from quasiharmonic.energy.energies import SymmetricDirichlet
-from quasiharmonic.energy.reweighted import ReweightedDirichlet
-from quasiharmonic.energy.turning import Turning
-from quasiharmonic.flattening.descent import FreeDescent, descend
-from quasiharmonic.flattening.start import disk_start
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
+from quasiharmonic.apps.flattening.descent import FreeDescent, descend
+from quasiharmonic.apps.flattening.start import disk_start
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.energies.newton.rotation_path import Turning
 from quasiharmonic.surfaces import grid, random_delaunay
 
 rng = np.random.default_rng(5)

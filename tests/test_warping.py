@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import distortion, morph, surfaces, warp_along, warp_by_landmarks
-from quasiharmonic.energy.bending import Plate, Pull
+from quasiharmonic.energies.bending import Plate, Pull
 
 
 def blobs(height, width, centres):
@@ -112,7 +112,7 @@ def test_filled_triangles_are_as_located_ones(shape, monkeypatch):
     moved = morph(points, F, upper, points[upper] + [0.1, -0.2]).points
     size = (299, 199)
     quick = warp_along(image, points * size, F, moved * size, shape=shape)
-    monkeypatch.setattr("quasiharmonic.apply.warping.LARGE", np.inf)
+    monkeypatch.setattr("quasiharmonic.apps.warping.warping.LARGE", np.inf)
     slow = warp_along(image, points * size, F, moved * size, shape=shape)
     assert np.array_equal(quick == 0, slow == 0)
     assert quick == pytest.approx(slow, abs=1e-9)

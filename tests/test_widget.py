@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, certify, injective_map, notebook, solve
+from quasiharmonic import Problem, boundary_loops, certify, injective_map, solve
 from quasiharmonic.io import MeshData, write_map
-from quasiharmonic.mesh.topology import boundary_loops
-from quasiharmonic.studio.assets import bundle
-from quasiharmonic.studio.protocol import decode, encode
 from quasiharmonic.surfaces import disk
+from quasiharmonic.ui import notebook
+from quasiharmonic.ui.studio.assets import bundle
+from quasiharmonic.ui.studio.protocol import decode, encode
 
 V, F = disk(5)
 (LOOP,) = boundary_loops(F, len(V))
@@ -159,7 +159,7 @@ def test_without_anywidget(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    monkeypatch.delitem(sys.modules, "quasiharmonic.notebook.widget", raising=False)
+    monkeypatch.delitem(sys.modules, "quasiharmonic.ui.notebook.widget", raising=False)
     with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[notebook\]'"):
         notebook.MapWidget  # noqa: B018
     with pytest.raises(AttributeError):

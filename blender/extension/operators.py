@@ -9,17 +9,18 @@ import bpy
 import numpy as np
 
 from quasiharmonic import Step, atlas, repair
-from quasiharmonic.apply.fitting import laid_along
-from quasiharmonic.arrays import IntArray, counted
-from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh, seaming
-from quasiharmonic.atlas.mapped import each_island
-from quasiharmonic.energy.polishing import polished
-from quasiharmonic.exact.convexity import not_convex
-from quasiharmonic.exact.overlapping import lying_on_others
-from quasiharmonic.mesh.topology import boundary_edges
-from quasiharmonic.result import MapResult, Status
-from quasiharmonic.search.solving import solve
-from quasiharmonic.targets.asked_corners import AskedCorners
+from quasiharmonic.apps.atlas import seaming
+from quasiharmonic.apps.atlas.mapped import each_island
+from quasiharmonic.apps.repair.fitting import laid_along
+from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh
+from quasiharmonic.energies.polishing import polished
+from quasiharmonic.geometry.exact.convexity import not_convex
+from quasiharmonic.geometry.exact.overlapping import lying_on_others
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.solver.search.solving import solve
+from quasiharmonic.targets.boundary.corner_spec import AskedCorners
+from quasiharmonic.util.arrays import IntArray, counted
 
 from . import outline, surface
 from .job import Work, Working

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 
 from quasiharmonic import targets
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 from .surface import Refused, numbers
 

@@ -10,11 +10,11 @@ import itertools
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray
-from quasiharmonic.atlas.verdict import is_mirrored
-from quasiharmonic.exact.certificate import flipped_triangles
-from quasiharmonic.exact.predicates import orientation
-from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.apps.atlas.verdict import is_mirrored
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # How many numbers away in each coordinate, and how often all corners of wrong triangles try.
 _REACH, _ROUNDS = 3, 20

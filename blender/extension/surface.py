@@ -8,9 +8,9 @@ from typing import Any
 import bpy
 import numpy as np
 
-from quasiharmonic.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.mesh.polygons import Polygons
-from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.polygons import Polygons
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 from .rounding import in_single_precision
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from quasiharmonic import cli
+from quasiharmonic.ui import cli
 
 
 def _write(app: Sphinx) -> None:

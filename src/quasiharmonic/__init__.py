@@ -7,110 +7,118 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from quasiharmonic.util.display import register_renderer
+
 # As of `typing`, whose import would take longer than all else here.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from typing import Any
 
-    from quasiharmonic.animation.animated import animate
-    from quasiharmonic.animation.frames import Animation, FrameStep
-    from quasiharmonic.apply.airmesh import AirMesh, Moment
-    from quasiharmonic.apply.cutting import Opened, cut_open
-    from quasiharmonic.apply.inverse import InverseMap, SurfacePoints
-    from quasiharmonic.apply.repairing import Repaired, RepairedIsland, repair
-    from quasiharmonic.apply.transfer import SurfaceMap
-    from quasiharmonic.apply.warping import Warped, warp_along, warp_by_landmarks
-    from quasiharmonic.curves import Rails
-    from quasiharmonic.cuts.finding import find_cuts
-    from quasiharmonic.descent import Descent
-    from quasiharmonic.energy.energies import Energy
-    from quasiharmonic.energy.measures import Distortion, distortion
-    from quasiharmonic.energy.polishing import polish
-    from quasiharmonic.exact.certificate import Certificate, certify, flipped_triangles, is_injective
-    from quasiharmonic.exact.diagnosis import Diagnosis, diagnose
-    from quasiharmonic.flattening.distance_descent import keep_distances
-    from quasiharmonic.flattening.flattened import flatten
-    from quasiharmonic.flattening.patterns import write_pattern
-    from quasiharmonic.gradients.derivative import Derivative
-    from quasiharmonic.gradients.flattened import flatten_derivative
-    from quasiharmonic.gradients.polished import polish_derivative
-    from quasiharmonic.gradients.tensors import quasi_harmonic_derivative
-    from quasiharmonic.ladder.mapping import injective_map
-    from quasiharmonic.ladder.refining import RefinedProblem, refine, refine_problem
-    from quasiharmonic.mesh.refinement import Refined
+    from quasiharmonic.apps.air_mesh.airmesh import AirMesh, Moment
+    from quasiharmonic.apps.animation.animated import animate
+    from quasiharmonic.apps.animation.frames import Animation, FrameStep
+    from quasiharmonic.apps.displacement_fields.inverse import InverseField, inverse_field
+    from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, nearest_invertible
+    from quasiharmonic.apps.flattening.distances.descent import keep_distances
+    from quasiharmonic.apps.flattening.flattened import flatten
+    from quasiharmonic.apps.flattening.patterns import write_pattern
+    from quasiharmonic.apps.gradients.derivative import Derivative
+    from quasiharmonic.apps.gradients.flattened import flatten_derivative
+    from quasiharmonic.apps.gradients.polished import polish_derivative
+    from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
+    from quasiharmonic.apps.inverse.inverse import InverseMap, SurfacePoints
+    from quasiharmonic.apps.inverse.transfer import SurfaceMap
+    from quasiharmonic.apps.mesh_motion.morphed import Morphed
+    from quasiharmonic.apps.mesh_motion.morphing import morph
+    from quasiharmonic.apps.mesh_motion.moving import MovingMesh
+    from quasiharmonic.apps.repair.cutting import Opened, cut_open
+    from quasiharmonic.apps.repair.repairing import Repaired, RepairedIsland, repair
+    from quasiharmonic.apps.warping.warping import Warped, warp_along, warp_by_landmarks
+    from quasiharmonic.energies.energies import Energy
+    from quasiharmonic.energies.measures import Distortion, distortion
+    from quasiharmonic.energies.polishing import polish
+    from quasiharmonic.geometry.curves import Rails
+    from quasiharmonic.geometry.exact.certificate import Certificate
+    from quasiharmonic.geometry.mesh.refinement import Refined
+    from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
-    from quasiharmonic.registration.inverse import InverseField, inverse_field
-    from quasiharmonic.registration.nearest import InvertibleField, nearest_invertible
-    from quasiharmonic.result import MapResult, Snapshot, Stage, Status, Step
-    from quasiharmonic.search.harmonising import harmonise
-    from quasiharmonic.search.many import injective_maps
-    from quasiharmonic.search.solving import quasi_harmonic_map, solve
-    from quasiharmonic.simulation.morphed import Morphed
-    from quasiharmonic.simulation.morphing import morph
-    from quasiharmonic.simulation.moving import MovingMesh
+    from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
+    from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+    from quasiharmonic.problem.verdict import certify, flipped_triangles, is_injective
+    from quasiharmonic.solver.methods import Descent
+    from quasiharmonic.solver.refine.mapping import injective_map
+    from quasiharmonic.solver.refine.refining import RefinedProblem, refine, refine_problem
+    from quasiharmonic.solver.search.harmonising import harmonise
+    from quasiharmonic.solver.search.many import injective_maps
+    from quasiharmonic.solver.search.solving import quasi_harmonic_map, solve
+    from quasiharmonic.targets.cuts.find import find_cuts
+    from quasiharmonic.ui.notebook.widget import MapWidget as MapWidget
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "AirMesh": "apply.airmesh",
-    "Animation": "animation.frames",
-    "Certificate": "exact.certificate",
-    "Derivative": "gradients.derivative",
-    "Descent": "descent",
-    "Diagnosis": "exact.diagnosis",
-    "Distortion": "energy.measures",
-    "Energy": "energy.energies",
-    "FrameStep": "animation.frames",
-    "InverseField": "registration.inverse",
-    "InverseMap": "apply.inverse",
-    "InvertibleField": "registration.nearest",
-    "MapResult": "result",
-    "Moment": "apply.airmesh",
-    "Morphed": "simulation.morphed",
-    "MovingMesh": "simulation.moving",
-    "Opened": "apply.cutting",
+    "AirMesh": "apps.air_mesh.airmesh",
+    "Animation": "apps.animation.frames",
+    "Certificate": "geometry.exact.certificate",
+    "Derivative": "apps.gradients.derivative",
+    "Descent": "solver.methods",
+    "Diagnosis": "problem.diagnosis",
+    "Distortion": "energies.measures",
+    "Energy": "energies.energies",
+    "FrameStep": "apps.animation.frames",
+    "InverseField": "apps.displacement_fields.inverse",
+    "InverseMap": "apps.inverse.inverse",
+    "InvertibleField": "apps.displacement_fields.nearest",
+    "MapResult": "problem.result",
+    # Not in `__all__`: it needs an extra, and ``from quasiharmonic import *`` must work without.
+    "MapWidget": "ui.notebook.widget",
+    "Moment": "apps.air_mesh.airmesh",
+    "Morphed": "apps.mesh_motion.morphed",
+    "MovingMesh": "apps.mesh_motion.moving",
+    "Opened": "apps.repair.cutting",
     "Problem": "problem",
-    "Rails": "curves",
-    "Refined": "mesh.refinement",
-    "RefinedProblem": "ladder.refining",
-    "Repaired": "apply.repairing",
-    "RepairedIsland": "apply.repairing",
-    "Snapshot": "result",
-    "Stage": "result",
-    "Status": "result",
-    "Step": "result",
-    "SurfaceMap": "apply.transfer",
-    "SurfacePoints": "apply.inverse",
-    "Warped": "apply.warping",
-    "animate": "animation.animated",
-    "certify": "exact.certificate",
-    "cut_open": "apply.cutting",
-    "diagnose": "exact.diagnosis",
-    "distortion": "energy.measures",
-    "find_cuts": "cuts.finding",
-    "flatten": "flattening.flattened",
-    "flatten_derivative": "gradients.flattened",
-    "flipped_triangles": "exact.certificate",
-    "harmonise": "search.harmonising",
-    "injective_map": "ladder.mapping",
-    "injective_maps": "search.many",
-    "inverse_field": "registration.inverse",
-    "is_injective": "exact.certificate",
-    "keep_distances": "flattening.distance_descent",
-    "morph": "simulation.morphing",
-    "nearest_invertible": "registration.nearest",
-    "polish": "energy.polishing",
-    "polish_derivative": "gradients.polished",
-    "quasi_harmonic_derivative": "gradients.tensors",
-    "quasi_harmonic_map": "search.solving",
-    "refine": "ladder.refining",
-    "refine_problem": "ladder.refining",
-    "repair": "apply.repairing",
-    "solve": "search.solving",
-    "warp_along": "apply.warping",
-    "warp_by_landmarks": "apply.warping",
-    "write_pattern": "flattening.patterns",
+    "Rails": "geometry.curves",
+    "Refined": "geometry.mesh.refinement",
+    "RefinedProblem": "solver.refine.refining",
+    "Repaired": "apps.repair.repairing",
+    "RepairedIsland": "apps.repair.repairing",
+    "Snapshot": "problem.result",
+    "Stage": "problem.result",
+    "Status": "problem.result",
+    "Step": "problem.result",
+    "SurfaceMap": "apps.inverse.transfer",
+    "SurfacePoints": "apps.inverse.inverse",
+    "Warped": "apps.warping.warping",
+    "animate": "apps.animation.animated",
+    "boundary_loops": "geometry.mesh.topology",
+    "certify": "problem.verdict",
+    "cut_open": "apps.repair.cutting",
+    "diagnose": "problem.diagnosis",
+    "distortion": "energies.measures",
+    "find_cuts": "targets.cuts.find",
+    "flatten": "apps.flattening.flattened",
+    "flatten_derivative": "apps.gradients.flattened",
+    "flipped_triangles": "problem.verdict",
+    "harmonise": "solver.search.harmonising",
+    "injective_map": "solver.refine.mapping",
+    "injective_maps": "solver.search.many",
+    "inverse_field": "apps.displacement_fields.inverse",
+    "is_injective": "problem.verdict",
+    "keep_distances": "apps.flattening.distances.descent",
+    "morph": "apps.mesh_motion.morphing",
+    "nearest_invertible": "apps.displacement_fields.nearest",
+    "polish": "energies.polishing",
+    "polish_derivative": "apps.gradients.polished",
+    "quasi_harmonic_derivative": "apps.gradients.tensors",
+    "quasi_harmonic_map": "solver.search.solving",
+    "refine": "solver.refine.refining",
+    "refine_problem": "solver.refine.refining",
+    "repair": "apps.repair.repairing",
+    "solve": "solver.search.solving",
+    "warp_along": "apps.warping.warping",
+    "warp_by_landmarks": "apps.warping.warping",
+    "write_pattern": "apps.flattening.patterns",
 }
 
 __all__ = [
@@ -145,6 +153,7 @@ __all__ = [
     "SurfacePoints",
     "Warped",
     "animate",
+    "boundary_loops",
     "certify",
     "cut_open",
     "diagnose",
@@ -176,7 +185,7 @@ __all__ = [
 
 
 # Modules that are part of what is public; they too are imported when they are first used.
-_MODULES = ("atlas", "batch", "curves", "io", "linsolve", "notebook", "plot", "surfaces", "targets")
+_MODULES = ("atlas", "batch", "io", "linsolve", "plot", "surfaces", "targets")
 
 
 def __getattr__(name: str) -> Any:
@@ -191,3 +200,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*__all__, *_MODULES, "__version__"])
+
+
+register_renderer(lambda: import_module(".ui.display", __name__))

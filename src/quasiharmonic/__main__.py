@@ -7,7 +7,7 @@ Nothing is imported before it is seen to that Ctrl-C ends the process in a sente
 def main() -> int:
     """Run the command with the arguments of the process, which then ends; its exit status."""
     try:
-        from quasiharmonic.cli import main as run
+        from quasiharmonic.ui.cli import main as run
 
         status = run()
     except SystemExit as end:
@@ -26,7 +26,7 @@ def main() -> int:
         # An interrupt that came out of an `exec`, as of a dataclass while it is loaded, counts as unhandled, and would
         # end the process by a signal in place of its status, until another one runs through.
         exec("")
-    from quasiharmonic.cli.streams import finish
+    from quasiharmonic.ui.cli.streams import finish
 
     return finish(status)
 

@@ -7,9 +7,10 @@ from base64 import b64decode, b64encode
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, certify, notebook
+from quasiharmonic import Problem, certify
 from quasiharmonic.surfaces import cat
 from quasiharmonic.targets import boundary_to
+from quasiharmonic.ui import notebook
 
 # What anywidget hands to `render`: a model whose messages go to the kernel and back.
 PAGE = """<!doctype html><meta charset="utf-8"><div id="cell" style="width: 900px"></div><script type="module">

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from quasiharmonic.gradients.layers import FlattenLayer, PolishedLayer
+from quasiharmonic.apps.gradients.layers import FlattenLayer, PolishedLayer
 from shared.differentiated import flattened_ring, held_ring, tensors
 
 jax = pytest.importorskip("jax")

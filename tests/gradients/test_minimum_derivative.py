@@ -7,19 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from quasiharmonic import (
-    Rails,
-    certify,
-    flatten,
-    flatten_derivative,
-    injective_map,
-    polish,
-    polish_derivative,
-)
-from quasiharmonic.curves import Curve
-from quasiharmonic.energy.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.energy.energies import Isotropic, SymmetricDirichlet
-from quasiharmonic.gradients import Doubt
+from quasiharmonic import Rails, certify, flatten, flatten_derivative, injective_map, polish, polish_derivative
+from quasiharmonic.apps.gradients import Doubt
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.energies import Isotropic, SymmetricDirichlet
+from quasiharmonic.geometry.curves import Curve
 from quasiharmonic.surfaces import disk, grid
 from shared.differentiated import (
     aligned,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, quasi_harmonic_derivative, quasi_harmonic_map
-from quasiharmonic.gradients import Doubt
+from quasiharmonic.apps.gradients import Doubt
 from shared.differentiated import held_ring, tensors, worst_difference
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import certify, distortion, flatten, injective_map
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops, certify, distortion, flatten, injective_map
 from quasiharmonic.surfaces import disk
 
 V, F = disk(3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import injective_map, polish_derivative
-from quasiharmonic.gradients import Doubt
+from quasiharmonic.apps.gradients import Doubt
 from shared.differentiated import flattened_ring, held_ring, tensors
 
 torch = pytest.importorskip("torch")

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from quasiharmonic.cli import main
+from quasiharmonic.ui.cli import main
 
-# What `quasiharmonic.batch.supervisor` starts in place of its `COMMAND`.
+# What `quasiharmonic.ui.batch.supervisor` starts in place of its `COMMAND`.
 TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
 linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import io
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops, io
 from quasiharmonic.surfaces import disk
 
 # Fields of a record that say how it went this time, and not what came out.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic import Problem, flatten, injective_map
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops, flatten, injective_map
 from quasiharmonic.surfaces import annulus
 
 

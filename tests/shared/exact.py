@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-from quasiharmonic.exact.predicates import SegmentRelation
+from quasiharmonic.geometry.exact.predicates import SegmentRelation
 
 
 def exact_orientation(a, b, c):

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.mesh.removal import remove_vertices, room_for_round
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
+from quasiharmonic.geometry.coarsening.removal import remove_vertices, room_for_round
 from quasiharmonic.surfaces import disk
 from shared.meshes import tangled
 

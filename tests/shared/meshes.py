@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
 
 

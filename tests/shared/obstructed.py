@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import boundary_loops
 from quasiharmonic.problem import Problem
 from quasiharmonic.surfaces import annulus, disk, grid
 from shared.meshes import boundary_of

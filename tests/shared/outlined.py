@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic import Problem
-from quasiharmonic.mesh.topology import boundary_loops
+from quasiharmonic import Problem, boundary_loops
 from quasiharmonic.surfaces import annulus, disk
 from shared.polygons import random_polygon, spiral, spread
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic import io
-from quasiharmonic.studio.protocol import Frame, decode, encode
-from quasiharmonic.studio.session import Session
-from quasiharmonic.studio.sheets import sheet_of
 from quasiharmonic.surfaces import cat
+from quasiharmonic.ui.studio.protocol import Frame, decode, encode
+from quasiharmonic.ui.studio.session import Session
+from quasiharmonic.ui.studio.surface import sheet_of
 
 
 class Visitor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.exact.predicates import SegmentRelation, segment_relation
+from quasiharmonic.geometry.exact.predicates import SegmentRelation, segment_relation
 
 # A corridor around three sides of a square: nobody sees from one end to the other.
 U = [[0, 0], [9, 0], [9, 9], [6, 9], [6, 3], [3, 3], [3, 9], [0, 9]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.surfaces import grid
 from shared.meshes import bend, lift
 

@@ -6,8 +6,8 @@ import os
 import signal
 import time
 
-from quasiharmonic.batch.supervisor import Supervisor
 from quasiharmonic.io.errors import OutputError
+from quasiharmonic.ui.batch.supervisor import Supervisor
 
 plain_attend = getattr(Supervisor.attend, "plain", Supervisor.attend)
 

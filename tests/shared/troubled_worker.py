@@ -10,8 +10,10 @@ import signal
 import sys
 import time
 
-from quasiharmonic.batch import account, together, worker
 from quasiharmonic.io import atomic
+from quasiharmonic.ui.batch import batched as together
+from quasiharmonic.ui.batch import metadata as account
+from quasiharmonic.ui.batch import worker
 
 fill_record, ready = worker.fill_record, together.ready
 

@@ -1,4 +1,8 @@
-"""Meshes, maps and problems in files."""
+"""Meshes, maps and problems in files.
+
+The package builds on `geometry.mesh`. Each format is a module of `formats` or of `fem`; `adapters` accepts mesh objects
+of other libraries. Start reading in `meshdata`, which is what every reader returns.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +14,20 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.atomic import check_writable, new_folder, no_remains, write_whole
 from quasiharmonic.io.errors import MeshFileError, OutputError
-from quasiharmonic.io.gltfmesh import read_gltf
-from quasiharmonic.io.gltfwrite import write_gltf
+from quasiharmonic.io.formats.gltfmesh import read_gltf
+from quasiharmonic.io.formats.gltfwrite import write_gltf
+from quasiharmonic.io.formats.obj import read_obj, write_obj
+from quasiharmonic.io.formats.off import read_off, write_off
+from quasiharmonic.io.formats.ply import read_ply, write_ply
+from quasiharmonic.io.formats.stl import read_stl
 from quasiharmonic.io.handles import ProblemArrays, problem_arrays, problem_files, read_handles, read_problem
-from quasiharmonic.io.holding import TEXTURED, not_held
+from quasiharmonic.io.losses import TEXTURED, not_held
 from quasiharmonic.io.materials import companions
 from quasiharmonic.io.meshdata import MeshData, check_mapped, in_plane, map_of, vertex_places
-from quasiharmonic.io.obj import read_obj, write_obj
-from quasiharmonic.io.off import read_off, write_off
 from quasiharmonic.io.per_triangle import FORMATS as PER_TRIANGLE_FORMATS
 from quasiharmonic.io.per_triangle import write_per_triangle
-from quasiharmonic.io.ply import read_ply, write_ply
 from quasiharmonic.io.refined import refined_mesh
-from quasiharmonic.io.seamed import cut_at_seams, mapped, seamed, without_idle
-from quasiharmonic.io.stl import read_stl
+from quasiharmonic.io.seams import cut_at_seams, mapped, seamed, without_idle
 from quasiharmonic.io.textures import Texture, checkerboard, read_texture
 
 __all__ = [

@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray, named
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.formats.obj import read_obj
 from quasiharmonic.io.meshdata import MeshData, vertex_places
-from quasiharmonic.io.obj import read_obj
 from quasiharmonic.io.textual import integer, read_text
-from quasiharmonic.mesh.topology import boundary_edges
+from quasiharmonic.util.arrays import FloatArray, IntArray, named
 
 
 class ProblemArrays(NamedTuple):

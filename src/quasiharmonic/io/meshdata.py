@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import (
+from quasiharmonic.geometry.mesh.polygons import Polygons, triangulated
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textures import Texture
+from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_finite,
@@ -18,10 +22,6 @@ from quasiharmonic.arrays import (
     triangle_rows,
     vertex_array,
 )
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.textures import Texture
-from quasiharmonic.mesh.polygons import Polygons, triangulated
-from quasiharmonic.mesh.seams import SeamedMesh
 
 
 class Carried:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray, map_array, triangle_rows, vertex_array
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import OutputError
+from quasiharmonic.util.arrays import FloatArray, map_array, triangle_rows, vertex_array
 
 #: Suffixes that `write_per_triangle` knows.
 FORMATS = (".csv", ".npz", ".ply")

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray, IntArray
+from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.io.meshdata import MeshData
-from quasiharmonic.mesh.polygons import Polygons
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from quasiharmonic.mesh.refinement import Refined
+    from quasiharmonic.geometry.mesh.refinement import Refined
 
 
 def refined_mesh(mesh: MeshData, refined: Refined, uv: FloatArray) -> tuple[MeshData, IntArray]:

@@ -1,5 +1,7 @@
 """Sparse Cholesky behind one small protocol: analyse a pattern once, factor, solve, release.
 
+The package builds on `geometry.mesh`. Start reading in `base`, then `laplacian`.
+
 >>> import numpy as np
 >>> from quasiharmonic.linsolve import make_solver
 >>> indptr, indices = [0, 2, 3], [0, 1, 1]  # upper triangle of [[2, -1], [-1, 2]]
@@ -73,7 +75,8 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
         Which backend to use. "auto" takes the first of `available` for so many entries that loads.
     ordered : bool
         The unknowns are numbered such that eliminating them in turn leaves a sparse factor, as
-        `quasiharmonic.mesh.dissection` numbers them. A backend then looks for no order of its own, if it can be told.
+        `quasiharmonic.linsolve.dissection` numbers them. A backend then looks for no order of its own, if it can be
+        told.
 
     Returns
     -------

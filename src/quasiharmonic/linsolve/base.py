@@ -14,11 +14,11 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.hearing import still_at_it
-from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.linsolve.guard import ResidualTest
+from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.kernels import compiled
+from quasiharmonic.util.progress import still_at_it
 
 Pattern = NDArray[np.int32]
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.util.arrays import FloatArray
 
 # Up to this many unknowns of a planar mesh the supernodal code does not repay its overhead (18 ms against 30 at 20k).
 SIMPLICIAL_BELOW = 50_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.kernels import compiled
 
 # Largest residual that a backward stable factorisation can be held responsible for, relative to |A||x| + |b| after
 # scaling the diagonal to one. Cholesky stays near 1e-15; a factor that is wrong is wrong in the first digits.

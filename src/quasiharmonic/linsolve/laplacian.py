@@ -13,11 +13,11 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import ComplexArray, FloatArray, IntArray, own_triangles
-from quasiharmonic.kernels import compiled
 from quasiharmonic.linsolve import make_solver, takes_order
+from quasiharmonic.linsolve.dissection import nested_dissection
 from quasiharmonic.linsolve.pattern import stiffness_pattern
-from quasiharmonic.mesh.dissection import nested_dissection
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, own_triangles
+from quasiharmonic.util.kernels import compiled
 
 # From this many unknowns on they are numbered by dissection. Minimum degree is as good for fewer (10k unknowns: 17 ms
 # to order and analyse, 7 to factor, for both), and there is nothing to do in parallel yet.

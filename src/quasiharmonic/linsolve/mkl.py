@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray
 from quasiharmonic.linsolve.base import LinearSolver, Pattern
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.util.arrays import FloatArray
 
 _ANALYSE, _FACTOR, _SOLVE, _FORWARD_ONLY, _RELEASE = 11, 22, 33, 331, -1
 _MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3

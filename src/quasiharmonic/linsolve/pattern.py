@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.arrays import IntArray, check_range, own_triangles
-from quasiharmonic.kernels import compiled
-from quasiharmonic.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import IntArray, check_range, own_triangles
+from quasiharmonic.util.kernels import compiled
 
 
 class StiffnessPattern(NamedTuple):

@@ -22,11 +22,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.linsolve.qdldl import Qdldl
 from quasiharmonic.linsolve.superlu import SuperLU
+from quasiharmonic.util.arrays import FloatArray
 
 # Minimum fill. Left to itself rslab tries several orders. Its nested dissection takes five times as long to analyse
 # (300,000 unknowns: 3.3 s against 0.3 to 0.6) for a factor that is never twice as quick. It takes no order of ours.

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.arrays import FloatArray
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.util.arrays import FloatArray
 
 
 class SuperLU(LinearSolver):

@@ -10,7 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.arrays import (
+from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh, flat_triangles
+from quasiharmonic.geometry.mesh.surface import surface_edges
+from quasiharmonic.geometry.mesh.topology import trace_loops
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     ReadOnly,
@@ -20,10 +24,6 @@ from quasiharmonic.arrays import (
     unchangeable,
     vertex_array,
 )
-from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.mesh.reference import Reference, ReferenceMesh, flat_triangles
-from quasiharmonic.mesh.surface import surface_edges
-from quasiharmonic.mesh.topology import trace_loops
 
 
 class Domain(ReadOnly):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from quasiharmonic.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 
 class Frame:

@@ -1,19 +1,22 @@
-"""Places to map a boundary to: outlines, and which boundary vertex goes where on them."""
+"""Targets: outlines, which boundary vertex goes where on them, and where to cut a surface.
 
-from quasiharmonic.targets.asked_corners import nearest_on_boundary
-from quasiharmonic.targets.boundary import boundary_to
-from quasiharmonic.targets.chords import flattened_edges
-from quasiharmonic.targets.contours import signed_area
-from quasiharmonic.targets.correspondence import arc_length
-from quasiharmonic.targets.curves import outline_curves
-from quasiharmonic.targets.glyphs import letter
-from quasiharmonic.targets.nesting import filled, nested
-from quasiharmonic.targets.outlines import disk, ellipse, rectangle, regular_polygon, ring, star
-from quasiharmonic.targets.polylines import read_polylines
+The package builds on `problem` and `geometry.curves`. Start reading in `outlines.shapes`, then `boundary.boundary_to`.
+"""
+
+from quasiharmonic.targets.boundary.boundary_to import boundary_to
+from quasiharmonic.targets.boundary.chords import flattened_edges
+from quasiharmonic.targets.boundary.corner_spec import nearest_on_boundary
+from quasiharmonic.targets.boundary.correspondence import arc_length
+from quasiharmonic.targets.boundary.turning import BoundaryLoop, boundary_corners, boundary_turning
+from quasiharmonic.targets.outlines.contours import signed_area
+from quasiharmonic.targets.outlines.letters import letter
+from quasiharmonic.targets.outlines.nesting import filled, nested
+from quasiharmonic.targets.outlines.outline_curves import outline_curves
+from quasiharmonic.targets.outlines.polylines import read_polylines
+from quasiharmonic.targets.outlines.shapes import disk, ellipse, rectangle, regular_polygon, ring, star
+from quasiharmonic.targets.outlines.svg import read_svg
+from quasiharmonic.targets.outlines.words import word
 from quasiharmonic.targets.specification import outline
-from quasiharmonic.targets.svg import read_svg
-from quasiharmonic.targets.turning import BoundaryLoop, boundary_corners, boundary_turning
-from quasiharmonic.targets.words import word
 
 __all__ = [
     "BoundaryLoop",

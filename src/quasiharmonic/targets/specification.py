@@ -6,13 +6,13 @@ import math
 from os import PathLike, fspath
 from pathlib import Path
 
-from quasiharmonic.arrays import FloatArray
-from quasiharmonic.targets import outlines
-from quasiharmonic.targets.contours import MOST_POINTS
-from quasiharmonic.targets.glyphs import Font, letter
-from quasiharmonic.targets.polylines import read_polylines
-from quasiharmonic.targets.svg import read_svg
-from quasiharmonic.targets.words import word
+from quasiharmonic.targets.outlines import shapes as outlines
+from quasiharmonic.targets.outlines.contours import MOST_POINTS
+from quasiharmonic.targets.outlines.letters import Font, letter
+from quasiharmonic.targets.outlines.polylines import read_polylines
+from quasiharmonic.targets.outlines.svg import read_svg
+from quasiharmonic.targets.outlines.words import word
+from quasiharmonic.util.arrays import FloatArray
 
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 _POINT_FILES = ".txt", ".csv"

@@ -1,1 +1,0 @@
-"""Sequences of targets and of maps: each frame certified, and none that leaps."""

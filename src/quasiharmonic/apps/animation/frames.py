@@ -1,0 +1,178 @@
+"""What a sequence of targets becomes: its frames, and how far vertices move from one to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.problem.result import MapResult
+from quasiharmonic.util.arrays import BoolArray, FloatArray, check_finite, counted, kind_of, named, real_array
+
+
+@dataclass(frozen=True)
+class FrameStep:
+    """How far an animation is; what its callback gets.
+
+    Attributes
+    ----------
+    frame : int
+        The frame at hand, from 0 on.
+    frames : int
+        How many there are.
+    sweep : int
+        0 while maps are found, and then the number of the sweep that keeps them from leaping.
+    move : float
+        The largest move of a vertex between two frames so far, over that of the boundary; 0 before there are two.
+    """
+
+    frame: int
+    frames: int
+    sweep: int
+    move: float
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """A sequence of maps.
+
+    Attributes
+    ----------
+    frames : list of MapResult
+        One for each target: its status and certificate, and what forbids a map where there is none. Shorter where
+        the work was interrupted before each had one.
+    targets : (t, k, 2) float64
+        Where the boundary and pins are in each; as asked for, but where a frame has been bridged.
+    bridged : (t,) bool
+        Frames whose target allows no map or none was found, and which lie between their neighbours instead.
+    energies : (t,) float64
+        The mean energy of each polished frame; NaN of all others.
+    limit : float or None
+        How many times as far as the boundary a vertex was to move at most; None where the frames were not polished.
+    interrupted : bool
+        Whether Ctrl-C ended the work before all was done that was asked for.
+    """
+
+    frames: list[MapResult]
+    targets: FloatArray
+    bridged: BoolArray
+    energies: FloatArray
+    limit: float | None = None
+    interrupted: bool = False
+
+    def __repr__(self) -> str:
+        frames = counted("frame", "frames", len(self.frames))
+        return f"<Animation: {frames}, {np.count_nonzero(self.found)} injective, largest move {self.largest_move:.3g}>"
+
+    @property
+    def uv(self) -> FloatArray:
+        """Every frame's map; (t, n, 2) float64, of no vertices where there is no frame."""
+        return np.stack([frame.uv for frame in self.frames]) if self.frames else np.empty((0, 0, 2))
+
+    @property
+    def found(self) -> BoolArray:
+        """Which frames have no inverted triangle, decided exactly; (t,) bool."""
+        return np.array([frame.injective for frame in self.frames], dtype=bool)
+
+    @property
+    def bijective(self) -> BoolArray:
+        """Which frames besides overlap nowhere, decided exactly; (t,) bool."""
+        return np.array([bool(frame.certificate.bijective) for frame in self.frames], dtype=bool)
+
+    @property
+    def moves(self) -> FloatArray:
+        """How far a vertex moves at most from a frame to the next, over what the boundary and pins do at most.
+
+        Returns
+        -------
+        (t - 1,) float64
+            NaN where the boundary rests, or one of the two frames has no map.
+        """
+        found = self.found
+        ratio = np.full(max(len(self.frames) - 1, 0), np.nan)
+        for t in np.flatnonzero(found[1:] & found[:-1]):
+            boundary = farthest(self.targets[t + 1] - self.targets[t])
+            if boundary > 0:
+                ratio[t] = farthest(self.frames[t + 1].uv - self.frames[t].uv) / boundary
+        return ratio
+
+    @property
+    def largest_move(self) -> float:
+        """The largest of ``moves``; 0 where there is none."""
+        moves = self.moves
+        return float(moves[np.isfinite(moves)].max(initial=0.0))
+
+    def summary(self) -> str:
+        """Say how many frames are certified, which are not and why, and how far vertices move."""
+        found, count = self.found, counted("frame", "frames", len(self.frames))
+        lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, decided exactly"]
+        if self.interrupted:
+            lines.append("interrupted before all was done")
+        if self.bridged.any():
+            lines.append(f"between their neighbours: {named('frame', 'frames', np.flatnonzero(self.bridged))}")
+        overlapping = np.flatnonzero(found & ~self.bijective)
+        if overlapping.size:
+            lines.append(f"overlapping: {named('frame', 'frames', overlapping)}")
+        for t in np.flatnonzero(~found)[:5]:
+            diagnosis = self.frames[t].diagnosis
+            known = diagnosis.obstructions if diagnosis is not None else ()
+            lines.append(f"frame {t}: {known[0].message if known else self.frames[t].status.value}")
+        more = int(np.count_nonzero(~found)) - 5
+        if more > 0:
+            lines.append(f"and {counted('frame', 'frames', more)} more without a map")
+        lines.append(f"no vertex moves more than {self.largest_move:.3g} times as far as the boundary")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: everything but the maps."""
+        return {
+            "frames": len(self.frames),
+            "certified": int(np.count_nonzero(self.found)),
+            "overlapping": np.flatnonzero(self.found & ~self.bijective).tolist(),
+            "missing": np.flatnonzero(~self.found).tolist(),
+            "bridged": np.flatnonzero(self.bridged).tolist(),
+            "interrupted": self.interrupted,
+            "largest_move": self.largest_move,
+            "moves": [None if np.isnan(move) else float(move) for move in self.moves],
+            "mean_energies": [None if np.isnan(energy) else float(energy) for energy in self.energies],
+            "status": [frame.status.name.lower() for frame in self.frames],
+            "diagnoses": {
+                int(t): frame.diagnosis.to_dict()
+                for t, frame in enumerate(self.frames)
+                if not frame.injective and frame.diagnosis is not None
+            },
+        }
+
+
+def farthest(moved: FloatArray) -> float:
+    """The length of the longest of some displacements (k, 2)."""
+    return float(np.hypot(*moved.T).max(initial=0.0))
+
+
+def checked_targets(targets: Iterable[ArrayLike], count: int) -> FloatArray:
+    """A sequence of targets as one array (t, k, 2), each with so many rows.
+
+    Raises
+    ------
+    TypeError
+        When there is no going through them.
+    ValueError
+        When there is none, or one has another shape, no real numbers or a place that is not finite: names the first
+        such frame.
+    """
+    if not isinstance(targets, Iterable) or isinstance(targets, str | bytes):
+        raise TypeError(f"targets must be a sequence of arrays ({count}, 2), not {kind_of(targets)}")
+    checked = []
+    for t, target in enumerate(targets):
+        name = f"targets: frame {t}"
+        array = real_array(name, target)
+        if array.shape != (count, 2):
+            raise ValueError(f"{name} must have shape ({count}, 2), not {array.shape}")
+        check_finite(name, "row", "rows", array)
+        checked.append(array)
+    if not checked:
+        raise ValueError("targets: there is no frame")
+    return np.stack(checked)

@@ -1,0 +1,211 @@
+"""Islands packed into the unit square: turned to their least boxes, scaled alike, apart by a margin.
+
+Islands are packed as the boxes around them, by `quasiharmonic.apps.atlas.skyline`, in several orders; a bisection finds
+the largest scale at which one of them has room for all. Nothing is mirrored, and no triangle is inverted by rounding:
+that is decided exactly on what is handed back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Sized
+from math import sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.atlas.skyline import Laid, laid
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    kind_of,
+    map_array,
+    named,
+    real_array,
+    triangle_array,
+)
+
+# How far below the largest scale that is known not to fit a scale may stay.
+_PRECISION = 0.002
+# Room around each box that rounding may take, in addition to the margin.
+_SLACK = 1e-12
+# Boxes whose areas differ by no more than this share are equally small: the one least turned is taken.
+_AS_SMALL = 1e-9
+# Of the square's side, what islands must be left.
+_LEAST = 1e-6
+# Places of hull points that are computed at a time.
+_BLOCK = 1 << 20
+
+
+def packed(
+    uv: Sequence[ArrayLike], F: Sequence[ArrayLike], areas: ArrayLike, *, margin: float = 1 / 256
+) -> list[FloatArray]:
+    """Lay the islands of a map into the unit square without overlap, as large as fits, all at one texel density.
+
+    Parameters
+    ----------
+    uv : sequence of (m, 2) array
+        Places of each island's vertices.
+    F : sequence of (k, 3) array of int
+        Its triangles, by its own vertices.
+    areas : (i,) array
+        Areas of the islands on the surface, in any unit. In the square they are in proportion to these. An island
+        without area on the surface or in the plane is scaled as the others are on average.
+    margin : float
+        Least room between two islands' boxes, as a share of the square's side: 4/1024 are four texels of 1,024. To
+        the square's sides there is half of it, so that copies of the square side by side keep it too.
+
+    Returns
+    -------
+    list of (m, 2) float64
+        New places. Boxes around islands are disjoint, by the margin or more along an axis, and within the square.
+        An island is turned such that its box is least, by 45° at most, and by a quarter more where that fits better;
+        never mirrored. The same input gives the same places.
+
+    Raises
+    ------
+    ValueError
+        When arrays are malformed, or the sequences differ in length; when so many islands have no room with such a
+        margin; when an island has triangles so thin that rounding to places in the square would invert them.
+    """
+    islands, triangles, surface = _checked(uv, F, areas, margin)
+    if not islands:
+        return []
+    start = np.cumsum([0, *map(len, islands)])
+    every = np.concatenate([rows + first for rows, first in zip(triangles, start, strict=False)])
+    owner = np.repeat(np.arange(len(islands)), [len(rows) for rows in triangles])
+    # In units of about the map's size, a power of two, so that no square overflows.
+    largest = np.abs(np.concatenate(islands)).max()
+    islands = [np.ldexp(points, -int(np.frexp(largest)[1])) for points in islands]
+    before = flipped_triangles(every, np.concatenate(islands))
+
+    turned = [_turned(points, _least_box(points)) for points in islands]
+    for i in np.unique(owner[np.setdiff1d(flipped_triangles(every, np.concatenate(turned)), before)]).tolist():
+        turned[i] = islands[i]
+    turned = [points - points.min(axis=0) for points in turned]
+    scale = _densities(turned, triangles, surface)
+    sizes = scale[:, None] * np.array([points.max(axis=0) for points in turned])
+    whole, places = _largest_scale(sizes, margin)
+    found = [_placed(points, whole * scale[i], places[i], margin / 2 + _SLACK) for i, points in enumerate(turned)]
+    lost = np.setdiff1d(flipped_triangles(every, np.concatenate(found)), before)
+    if lost.size:
+        i = int(owner[lost[0]])
+        own = lost[owner[lost] == i] - int(np.searchsorted(owner, i))
+        raise ValueError(
+            f"island {i}: rounding to places in the unit square would invert {named('triangle', 'triangles', own)} of "
+            "it, too thin for that: polish the map first, or leave it unpacked"
+        )
+    return found
+
+
+def _checked(
+    uv: Sequence[ArrayLike], F: Sequence[ArrayLike], areas: ArrayLike, margin: float
+) -> tuple[list[FloatArray], list[IntArray], FloatArray]:
+    """Arrays of the right types and shapes, or a ValueError that says which are not."""
+    surface = real_array("areas", areas)
+    for name, arrays in (("uv", uv), ("F", F)):
+        if not isinstance(arrays, Sized) or isinstance(arrays, str | bytes):
+            raise ValueError(f"{name} must be a list of arrays, one for every island, not {kind_of(arrays)}")
+    if surface.ndim != 1 or not len(uv) == len(F) == len(surface):
+        raise ValueError(
+            f"there are {len(uv)} islands' places, {len(F)} islands' triangles and areas of shape {surface.shape}: one "
+            "of each is needed for every island"
+        )
+    wrong = np.flatnonzero(~((surface >= 0) & np.isfinite(surface)))
+    if wrong.size:
+        raise ValueError(
+            f"areas must be finite and not negative, as they are not of {named('island', 'islands', wrong)}"
+        )
+    if not 0 <= margin < 1:
+        raise ValueError(f"margin must be a share of the square's side, from 0 to below 1, not {margin}")
+    islands = [map_array(f"uv[{i}]", points) for i, points in enumerate(uv)]
+    return islands, [triangle_array(rows, len(points)) for rows, points in zip(F, islands, strict=True)], surface
+
+
+def _least_box(points: FloatArray) -> complex:
+    """Direction of the least box around points, as a complex number of length 1, at most 45° off the x-axis.
+
+    One of its sides lies along a side of the convex hull (Freeman and Shapira 1975).
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):
+        # Too few points, or all on a line.
+        return 1.0 + 0.0j
+    corners = np.ascontiguousarray(hull).view(np.complex128).ravel()
+    side = np.roll(corners, -1) - corners
+    along = np.concatenate([[1.0], side[side != 0] / np.abs(side[side != 0])])
+    along *= 1j ** -np.round(np.angle(along) / (np.pi / 2))
+    area = np.concatenate([_box_areas(corners, some) for some in np.array_split(along, 1 + along.size**2 // _BLOCK)])
+    small = np.flatnonzero(area <= (1 + _AS_SMALL) * area.min())
+    return complex(along[small[np.argmin(np.abs(along[small].imag))]])
+
+
+def _box_areas(corners: ComplexArray, along: ComplexArray) -> FloatArray:
+    """Areas of the boxes around points whose sides run in some directions."""
+    seen = corners[None, :] * along.conj()[:, None]
+    return np.asarray(np.ptp(seen.real, axis=1) * np.ptp(seen.imag, axis=1))
+
+
+def _turned(points: FloatArray, along: complex) -> FloatArray:
+    """Points turned such that a direction becomes that of the x-axis; themselves where it is."""
+    c, s = along.real, along.imag
+    return points if s == 0 else points @ np.array([[c, -s], [s, c]])
+
+
+def _densities(islands: list[FloatArray], F: list[IntArray], surface: FloatArray) -> FloatArray:
+    """What each island is to be scaled by so that areas are in proportion to those on the surface."""
+    plane = np.array([_area(points, rows) for points, rows in zip(islands, F, strict=True)])
+    surface = surface / (surface.max() or 1.0)
+    known = (plane > 0) & (surface > 0)
+    mean = surface[known].sum() / plane[known].sum() if known.any() else 1.0
+    return np.sqrt(np.divide(surface, plane, out=np.full(len(plane), mean), where=known))
+
+
+def _area(uv: FloatArray, F: IntArray) -> float:
+    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
+    return float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2)
+
+
+def _largest_scale(sizes: FloatArray, margin: float) -> tuple[float, list[Laid]]:
+    """The largest scale at which boxes (k, 2) have room, all but, and where they lie then."""
+    room = margin + 2 * _SLACK
+    # Which of them is best depends on the boxes.
+    longest, shortest = sizes.max(axis=1), sizes.min(axis=1)
+    orders = [np.argsort(-by, kind="stable") for by in (longest, longest * shortest, longest + shortest, shortest)]
+
+    def at(scale: float) -> list[Laid] | None:
+        boxes = [(scale * w + room, scale * h + room) for w, h in sizes.tolist()]
+        for order in orders:
+            found = laid([boxes[i] for i in order])
+            if found is not None:
+                return [found[k] for k in np.argsort(order)]
+        return None
+
+    large = longest.max() or 1.0
+    low, high, best = 0.0, 1 / large, at(0.0)
+    scale = min((1 - room) / large, 1 / sqrt(max((longest * shortest).sum(), _LEAST * large**2)))
+    # Where margins leave next to nothing, that is nothing.
+    while best is not None and high - low > _PRECISION * high and high * large > _LEAST:
+        found = at(scale)
+        if found is None:
+            high = scale
+        else:
+            low, best = scale, found
+        scale = (low + high) / 2 if low > 0 else 0.8 * high
+    if best is None or (low == 0 and longest.max() > 0):
+        raise ValueError(
+            f"{len(sizes)} islands, each with a margin of {margin:g} of the square's side around it, have no room: "
+            "lower the margin"
+        )
+    return low, best
+
+
+def _placed(points: FloatArray, scale: float, place: Laid, inset: float) -> FloatArray:
+    """An island, its box's corner at the origin, in its place: turned by a quarter, scaled, shifted."""
+    if place.turned:
+        points = np.stack([points[:, 1].max() - points[:, 1], points[:, 0]], axis=1)
+    return np.asarray(scale * points + (place.x + inset, place.y + inset))

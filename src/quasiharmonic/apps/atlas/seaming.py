@@ -1,0 +1,89 @@
+"""Where the seams of a surface are: where its map has them, along edges that somebody names, or where they do good."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.polygons import Polygons
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, trace_loops
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.util.arrays import IntArray, named_edges
+
+
+def cut_apart(
+    mesh: SeamedMesh, *, polygons: Polygons | None = None, disks_too: bool = True, reach: bool = True
+) -> SeamedMesh:
+    """Cut every island of a surface into a disk that lies flat well; see `quasiharmonic.find_cuts`.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+        Its seams stay.
+    polygons : Polygons, optional
+        The faces that its triangles are parts of, inside which nothing is cut.
+    disks_too : bool
+        Whether islands that are disks already are cut where that is worth it. Otherwise they are left.
+    reach : bool
+        Whether cuts go on to what sticks out. A cut that only makes a disk is shorter, and seldom leaves an outline no
+        room beside it.
+
+    Returns
+    -------
+    SeamedMesh
+        Without places; or ``mesh`` itself, if nothing was to be cut.
+
+    Raises
+    ------
+    ValueError
+        As `quasiharmonic.find_cuts`.
+    """
+    if not disks_too and all(_is_disk(island.F, len(island.vertices)) for island in mesh.islands):
+        return mesh
+    seams = mesh.seams
+    inside = np.empty((0, 2), dtype=np.int64) if polygons is None else polygons.diagonals(mesh.F)
+    found = find_cuts(mesh.V, mesh.F, edges=seams, uncut=inside, gain=0.1 if reach else np.inf)
+    return mesh if len(found) == len(seams) else mesh.cut(found)
+
+
+def cut_along(mesh: SeamedMesh, pairs: ArrayLike, *, polygons: Polygons | None = None) -> SeamedMesh:
+    """Cut a surface along edges, whatever seams its map has.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh
+    pairs : (k, 2) array of int
+        Vertices at both ends of each edge.
+    polygons : Polygons, optional
+        The faces that its triangles are parts of.
+
+    Returns
+    -------
+    SeamedMesh
+        Without places.
+
+    Raises
+    ------
+    ValueError
+        When one is no edge, or inside a face; names the first ones.
+    """
+    cut = SeamedMesh(mesh.V, mesh.F).cut(pairs)
+    if polygons is not None:
+        inside, given = polygons.diagonals(mesh.F), np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
+        within = np.isin(_keys(given, len(mesh.V)), _keys(inside, len(mesh.V)))
+        if within.any():
+            raise ValueError(
+                f"{named_edges(given[within])} inside a face of more than three corners, not at its border"
+            )
+    return cut
+
+
+def _keys(pairs: IntArray, n: int) -> IntArray:
+    return edge_keys(pairs[:, 0], pairs[:, 1], n)
+
+
+def _is_disk(F: IntArray, n: int) -> bool:
+    found = edges(F, n)
+    euler = n - len(found.interior) - len(found.boundary) + len(F)
+    return euler == 1 and len(found.boundary) > 0 and len(trace_loops(found.boundary)) == 1

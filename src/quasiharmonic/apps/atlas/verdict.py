@@ -1,0 +1,203 @@
+"""The exact verdict on a map with seams: on each of its islands, and on how they lie to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.geometry.exact import certificate
+from quasiharmonic.geometry.exact.certificate import Certificate
+from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.geometry.mesh.seams import Island, SeamedMesh, which_island
+from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
+from quasiharmonic.util.arrays import FloatArray, IntArray, counted, named
+
+#: What a map is multiplied by to be reflected at the v axis.
+MIRROR = np.array([-1.0, 1.0])
+
+# Pairs of islands that are named at most; an atlas of stacked ones has as many as pairs there are.
+_MOST_PAIRS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class IslandVerdict:
+    """The verdict on one island; elements by the mesh's numbers.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Its triangles, ascending.
+    mirrored : bool
+        Whether every triangle is strictly negative, as in an island that was turned over on purpose. It then is judged
+        as the other side shows it. A single island is never held for mirrored, but for inverted.
+    certificate : Certificate
+        By the island's own numbers.
+    flipped : (a,) int64
+        Its triangles that are not strictly positive (mirrored: not strictly negative).
+    """
+
+    triangles: IntArray
+    mirrored: bool
+    certificate: Certificate
+    flipped: IntArray
+
+    @property
+    def injective(self) -> bool:
+        """Whether its triangles are all strictly positive, or all strictly negative."""
+        return self.certificate.injective
+
+    @property
+    def bijective(self) -> bool:
+        """Whether it moreover covers no point twice."""
+        return bool(self.certificate.bijective)
+
+    def summary(self) -> str:
+        """Say in a sentence what is certified or wrong."""
+        where = which_island(self.triangles)
+        turned = ", mirrored" if self.mirrored else ""
+        if not self.injective:
+            return f"{where}{turned}: not injective, {named('triangle', 'triangles', self.flipped)} not positive"
+        return f"{where}{turned}: injective, {'bijective' if self.bijective else 'but it overlaps itself'}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; of the triangles, the first and how many there are."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "flipped": self.flipped.tolist(),
+            "reasons": [reason.text for reason in self.certificate.reasons],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class AtlasVerdict:
+    """The verdict on a map with seams; made by `certify`.
+
+    Attributes
+    ----------
+    islands : tuple of IslandVerdict
+        By their first triangle.
+    overlapping : (p, 2) int64
+        Pairs of bijective islands that share points of the plane, by their places in ``islands``; 1000 at most.
+    """
+
+    islands: tuple[IslandVerdict, ...]
+    overlapping: IntArray
+
+    @property
+    def injective(self) -> bool:
+        """Whether there are islands, and each is injective."""
+        return bool(self.islands) and all(island.injective for island in self.islands)
+
+    @property
+    def bijective(self) -> bool:
+        """Whether each island is bijective. Whether they overlap each other is another question."""
+        return bool(self.islands) and all(island.bijective for island in self.islands)
+
+    @property
+    def flipped(self) -> IntArray:
+        """Triangles that are not as their island is wound, ascending."""
+        return np.sort(np.concatenate([np.empty(0, dtype=np.int64), *(island.flipped for island in self.islands)]))
+
+    @property
+    def mirrored(self) -> IntArray:
+        """Islands all of whose triangles are negative."""
+        return np.flatnonzero([island.mirrored for island in self.islands])
+
+    def summary(self) -> str:
+        """Say what is certified; and of which islands it is not, or what is unusual about them."""
+        count = len(self.islands)
+        injective = sum(island.injective for island in self.islands)
+        bijective = sum(island.bijective for island in self.islands)
+        lines = [f"{counted('island', 'islands', count)}: {injective} injective, {bijective} bijective."]
+        if self.mirrored.size:
+            lines.append(f"Mirrored, every triangle negative: {named('island', 'islands', self.mirrored)} (from 0).")
+        if len(self.overlapping):
+            first = ", ".join(f"{one} and {other}" for one, other in self.overlapping[:5].tolist())
+            more = f", … ({len(self.overlapping)} pairs in all)" if len(self.overlapping) > 5 else ""
+            lines.append(f"Islands lie on or touch each other: {first}{more} (from 0).")
+        lines += [f"- {island.summary()}" for island in self.islands if not island.bijective][:10]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "islands": [island.to_dict() for island in self.islands],
+            "overlapping": self.overlapping.tolist(),
+        }
+
+
+def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
+    """Judge a map with seams exactly, island by island.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, or a mesh or path that stands for one
+        Triangles without a place are in no island, and not judged.
+
+    Returns
+    -------
+    AtlasVerdict
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> print(certify(SeamedMesh(V, F, uv=V)).summary())
+    1 island: 1 injective, 1 bijective.
+    """
+    mesh = seamed_mesh(mesh)
+    judged = []
+    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
+        found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)
+        wrong = np.sort(np.concatenate([found.flipped, found.degenerate, found.nonfinite]))
+        judged.append(IslandVerdict(island.triangles, mirrored, found, island.triangles[wrong]))
+    return AtlasVerdict(tuple(judged), _overlapping(mesh.islands, judged))
+
+
+def mirrored_islands(mesh: SeamedMesh) -> list[bool]:
+    """Which islands are mirrored; of a single one it is never said, as it is nobody's purpose."""
+    return [len(mesh.islands) > 1 and is_mirrored(island.F, island.uv) for island in mesh.islands]
+
+
+def unmirrored(mesh: SeamedMesh) -> SeamedMesh:
+    """The map with its mirrored islands reflected, to be measured; where they lie does not matter then."""
+    turned = zip(mesh.islands, mirrored_islands(mesh), strict=True)
+    return mesh.with_places([island.uv * MIRROR if mirrored else island.uv for island, mirrored in turned])
+
+
+def is_mirrored(F: IntArray, uv: FloatArray) -> bool:
+    """Whether every triangle is strictly negative."""
+    return bool((orientation_or_nonfinite(*uv[F].swapaxes(0, 1))[0] < 0).all())
+
+
+def _overlapping(islands: Sequence[Island], judged: Sequence[IslandVerdict]) -> IntArray:
+    """Pairs of bijective islands that are not bijective together."""
+    sound = [k for k, verdict in enumerate(judged) if verdict.bijective]
+    if len(sound) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    low = np.array([islands[k].uv.min(axis=0) for k in sound])
+    high = np.array([islands[k].uv.max(axis=0) for k in sound])
+    pairs: list[tuple[int, int]] = []
+    for row, k in enumerate(sound):
+        near = (low[row + 1 :] <= high[row]).all(axis=1) & (high[row + 1 :] >= low[row]).all(axis=1)
+        for other in np.flatnonzero(near) + row + 1:
+            if len(pairs) == _MOST_PAIRS:
+                break
+            if not _apart(islands[k], islands[sound[other]], judged[k].mirrored, judged[sound[other]].mirrored):
+                pairs.append((k, sound[other]))
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _apart(one: Island, other: Island, mirrored: bool, also: bool) -> bool:
+    """Whether two bijective islands have no point of the plane in common."""
+    F = np.concatenate([one.F[:, ::-1] if mirrored else one.F, (other.F[:, ::-1] if also else other.F) + len(one.uv)])
+    return bool(certificate.certify(F, np.concatenate([one.uv, other.uv])).bijective)

@@ -1,0 +1,207 @@
+"""From a field without folds down to the nearest one, patch by patch, each with a step length of its own.
+
+Free are the pixels of some patches, between which no cell has free pixels of two. With ``w`` where pixels go and ``a``
+where the given field takes them, both in the grid's unit, a patch descends::
+
+    ½ Σ |w − a|²  +  κ Σ B((det − δ) / d)        B(s) = −(s − 1)² log s   for s < 1,   0 for s ≥ 1
+
+over its pixels and its cells' corner triangles. The barrier [1]_ is infinite at determinants of δ and vanishes, with
+two derivatives, from δ + d on: pixels whose cells are not nearly folded are pulled by the first term alone, to exactly
+where the field takes them. κ is lowered in steps, and what is left of the barrier is then a layer too thin to matter.
+
+All patches at hand share one matrix, which falls apart into a block each, and Newton's direction; how far they go
+along it, whether they are at rest, is each one's own concern.
+
+References
+----------
+.. [1] M. Li, Z. Ferguson, T. Schneider, T. Langlois, D. Zorin, D. Panozzo, C. Jiang, D. Kaufman, Incremental potential
+   contact. ACM Transactions on Graphics 39 (2020), equation 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.apps.displacement_fields.grid import Grid
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Deformation, Isotropic
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.progress import still_at_it
+
+# The barrier's width d, and its weights κ, one after the other.
+_WIDTH, _WEIGHTS = 0.05, (1e-3, 1e-5)
+# A patch is at rest when Newton's model promises less than this part of its value, or than this, in squared pixels.
+_TOLERANCE, _NOTHING = 1e-6, 1e-14
+# Or when a step lowers it by less than this part.
+_IDLE = 1e-9
+_STEPS, _HALVINGS = 100, 30
+# As of Newton's other descents: part of the way to the first collapse, and of the decrease that the slope promises.
+_FRACTION, _SUFFICIENT = 0.9, 1e-4
+# What the matrix's diagonal is raised by if need be.
+_SHIFTS = 0.0, 1e-12, 1e-8, 1e-4
+# Free pixels of which one matrix is made, about.
+_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True)
+class ThinBarrier(Isotropic):
+    """A barrier at determinants of ``least`` that is 0 from ``least + width`` on."""
+
+    least: float
+    width: float
+
+    barrier = True
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``B(s)``."""
+        s = self._place(d)
+        return np.where(s > 0, -((s - 1) ** 2) * np.log(np.where(s > 0, s, 1)), np.inf)
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """By a, and by b the negative: φ is a function of det = a − b."""
+        s = self._inside(d)
+        slope = -(2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) / self.width
+        return slope, -slope
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """By a twice, by both, by b twice."""
+        s = self._inside(d)
+        bend = -(2 * np.log(s) + 4 * (s - 1) / s - ((s - 1) / s) ** 2) / self.width**2
+        return bend, -bend, bend
+
+    def _place(self, d: Deformation) -> FloatArray:
+        return np.minimum((d.det - self.least) / self.width, 1)
+
+    def _inside(self, d: Deformation) -> FloatArray:
+        s = self._place(d)
+        return np.where(s > 0, s, 1)
+
+
+def approach(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, least: float) -> None:
+    """Bring the free pixels as near to a given field as they get.
+
+    Parameters
+    ----------
+    grid : Grid
+    w : (h, w) complex128
+        A map in the grid's unit whose determinants are above ``least`` at all corners of cells with free pixels.
+        Changed in place.
+    given : (h, w) complex128
+        The map to be near to.
+    patch : (h, w) int64
+        Each free pixel's patch, from 1 on; 0 where pixels stay.
+    least : float
+        δ, what determinants stay above.
+    """
+    size = np.bincount(patch.ravel())
+    size[0] = 0
+    batch = (np.cumsum(size) - size) // _AT_ONCE
+    # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never taken.
+    with np.errstate(all="ignore"):
+        for number in range(int(batch[-1]) + 1):
+            todo = np.flatnonzero((batch == number) & (size > 0))
+            for weight in _WEIGHTS:
+                _descend(grid, w, given, patch, todo, least, weight)
+
+
+def _descend(
+    grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, todo: IntArray, least: float, weight: float
+) -> None:
+    """Bring the patches ``todo`` to rest under one weight of the barrier; a matrix of those alone that still move."""
+    steps = _STEPS
+    while todo.size and steps:
+        batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), least, weight)
+        moving = np.ones(todo.size, dtype=bool)
+        while steps and 2 * np.count_nonzero(moving) > todo.size:
+            still_at_it()
+            moving &= batch.step(moving)
+            steps -= 1
+        batch.enter(w)
+        todo = todo[moving]
+
+
+class _Batch:
+    """Some patches, with one matrix."""
+
+    def __init__(
+        self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, least: float, weight: float
+    ) -> None:
+        touched = touched_cells(patch > 0)
+        cells = grid.cells(*np.nonzero(touched))
+        pixels, local = np.unique(cells, return_inverse=True)
+        F = grid.corner_triangles(local.reshape(-1, 4))
+        self.weight, self._pixels = weight, pixels
+        self.here, self.given = w.ravel()[pixels], given.ravel()[pixels]
+        label = patch.ravel()[pixels]
+        self.free = np.flatnonzero(label)
+        _, own = np.unique(label[self.free], return_inverse=True)
+        self.patches = int(own.max()) + 1
+        self.of_pixel = own
+        of = np.full(len(pixels), -1, dtype=np.int64)
+        of[self.free] = own
+        self.of_triangle = np.repeat(of[local.reshape(-1, 4)].max(axis=1), 4)
+        self.energy = DeformationEnergy(grid.points.reshape(-1, 2)[pixels] / grid.unit, F, ThinBarrier(least, _WIDTH))
+        self.system = NewtonSystem(F, self.energy.g, len(pixels), np.flatnonzero(label == 0))
+        self._count = len(F)
+
+    def enter(self, w: ComplexArray) -> None:
+        """Put the free pixels' places into a map (h, w)."""
+        w.ravel()[self._pixels[self.free]] = self.here[self.free]
+
+    def _values(self, w: ComplexArray) -> tuple[FloatArray, Deformation]:
+        """Of each patch, what is descended; and the deformation."""
+        deformation = self.energy.deform(w)
+        density = self.energy.energy.density(deformation)
+        apart = np.abs((w - self.given)[self.free]) ** 2
+        near = np.bincount(self.of_pixel, apart, minlength=self.patches)
+        return 0.5 * near + self.weight * np.bincount(self.of_triangle, density, minlength=self.patches), deformation
+
+    def step(self, moving: BoolArray) -> BoolArray:
+        """One step of each patch that moves; whether there may be another."""
+        value, deformation = self._values(self.here)
+        # The energy is a mean, the patches' a sum.
+        share = self.weight * self._count
+        pull = share * self.energy.gradient_of(deformation, len(self.here))[self.free]
+        gradient = pull + (self.here - self.given)[self.free]
+        self.system.assemble(self.energy.curvature_of(deformation).scaled(np.full(self._count, share)))
+        one = np.ones(self.free.size)
+        self.system.add_blocks(one, 0 * one, one)
+        found = self.system.descent(gradient, _SHIFTS)
+        direction = found[0] if found is not None else self.system.solve_diagonal(-gradient)
+        fall = -(gradient.real * direction.real + gradient.imag * direction.imag)
+        promise = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
+        fallen = self._search(direction, promise, value, moving & (promise > 0))
+        return (fallen > _IDLE * value) & (0.5 * promise > np.maximum(_TOLERANCE * value, _NOTHING))
+
+    def _search(
+        self, direction: ComplexArray, promise: FloatArray, before: FloatArray, moving: BoolArray
+    ) -> FloatArray:
+        """Go along a direction, each patch as far as is good; by how much each has fallen."""
+        full = np.zeros_like(self.here)
+        full[self.free] = direction
+        reach = np.full(self.patches, np.inf)
+        np.minimum.at(reach, self.of_triangle, self.energy.steps_to_collapse(self.here, full))
+        t = np.where(moving, np.minimum(1, _FRACTION * reach), 0)
+        start, trial = self.here[self.free], self.here.copy()
+        for _ in range(_HALVINGS):
+            trial[self.free] = start + t[self.of_pixel] * direction
+            value, _ = self._values(trial)
+            too_far = moving & ~(value <= before - _SUFFICIENT * t * promise)
+            if not too_far.any():
+                break
+            t[too_far] *= 0.5
+        else:
+            t[too_far] = 0
+            trial[self.free] = start + t[self.of_pixel] * direction
+        self.here = trial
+        return np.where(t > 0, before - value, 0)
+
+
+def touched_cells(pixels: BoolArray) -> BoolArray:
+    """The cells (h − 1, w − 1) that have one of the pixels (h, w)."""
+    rows = pixels[:-1] | pixels[1:]
+    touched: BoolArray = rows[:, :-1] | rows[:, 1:]
+    return touched

@@ -1,0 +1,139 @@
+"""A displacement field on a grid of pixels: what it is, and when it folds.
+
+A field says of the pixel in row y and column x, at the place ``p = (x · spacing_x, y · spacing_y)``, that it goes to
+``p + field[y, x]``. Between pixels displacements are interpolated bilinearly, as registration software does it. On a
+cell, the square between four pixels, the determinant of such a map's derivative is an affine function of the two
+coordinates, and at each corner it is the area of the triangle that the corner makes with its two neighbours over that
+of the triangle at rest. So it is positive on the whole cell if and only if all four *corner triangles* are, which is
+if and only if the cell's image is strictly convex and not turned over: both ways of cutting each cell along a diagonal
+give positive triangles [1]_. Central differences, which are often looked at instead, can be positive everywhere in a
+field that folds.
+
+::
+
+    0 ── 1      corner triangles 0 1 2, 1 3 0, 2 0 3, 3 2 1: each begins with its corner and runs
+    │    │      the way from the axis x to the axis y
+    2 ── 3
+
+References
+----------
+.. [1] Y. Liu, J. Chen, S. Wei, A. Carass, J. Prince, On finite difference Jacobian computation in deformable image
+   registration. International Journal of Computer Vision (2024).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
+
+# Of a cell's vertices, numbered along x and then along y.
+_TRIANGLES = np.array([[0, 1, 2], [1, 3, 0], [2, 0, 3], [3, 2, 1]])
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid of pixels.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Rows and columns, at least two of each.
+    spacing : (float, float)
+        Between columns, along x, and between rows, along y.
+    """
+
+    shape: tuple[int, int]
+    spacing: tuple[float, float] = (1.0, 1.0)
+
+    @property
+    def unit(self) -> float:
+        """The side of a square as large as a cell."""
+        return float(np.sqrt(self.spacing[0]) * np.sqrt(self.spacing[1]))
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Where the pixels are; (h, w, 2)."""
+        rows, columns = self.shape
+        x, y = np.arange(columns) * self.spacing[0], np.arange(rows) * self.spacing[1]
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    @cached_property
+    def rest(self) -> ComplexArray:
+        """The same in the grid's unit, as complex numbers; (h, w)."""
+        return np.ascontiguousarray(self.points / self.unit).view(np.complex128)[..., 0]
+
+    def cells(self, rows: IntArray, columns: IntArray) -> IntArray:
+        """The four vertices of some cells, pixels counted row by row; (k, 4) int64."""
+        first = rows * self.shape[1] + columns
+        return np.stack([first, first + 1, first + self.shape[1], first + self.shape[1] + 1], axis=1)
+
+    def corner_triangles(self, cells: IntArray) -> IntArray:
+        """All corner triangles of cells (k, 4); (4 k, 3) int64."""
+        return cells[:, _TRIANGLES].reshape(-1, 3)
+
+    def triangles(self) -> IntArray:
+        """The grid as a mesh: each cell cut from its first row's second pixel to its second row's first; (f, 3)."""
+        rows, columns = np.indices((self.shape[0] - 1, self.shape[1] - 1)).reshape(2, -1)
+        return self.cells(rows, columns)[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
+
+    def jacobians(self, w: ComplexArray) -> FloatArray:
+        """Determinants at the corners of all cells of a map (h, w) in the grid's unit; (h − 1, w − 1, 4)."""
+        along, down = np.diff(w, axis=1), np.diff(w, axis=0)
+        upper, lower, left, right = along[:-1], along[1:], down[:, :-1], down[:, 1:]
+        sides = ((upper, left), (upper, right), (lower, left), (lower, right))
+        # What overflows is infinite or NaN.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
+
+
+def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
+    """The grid of a field of some shape.
+
+    Raises
+    ------
+    ValueError
+        When the spacing is not one or two positive numbers.
+    """
+    sides = real_array("spacing", spacing)
+    if sides.shape not in ((), (2,)) or not (np.isfinite(sides) & (sides > 0)).all():
+        raise ValueError(f"spacing must be a positive number, or two, along x and along y, not {spacing!r}")
+    x, y = np.broadcast_to(sides, 2).tolist()
+    return Grid((shape[0], shape[1]), (x, y))
+
+
+def checked_field(field: ArrayLike) -> FloatArray:
+    """A displacement field as (h, w, 2) float64; a copy.
+
+    Raises
+    ------
+    ValueError
+        When it has another shape, or is not finite; names the first pixels, row and column.
+    """
+    array = real_array("field", field)
+    if array.ndim != 3 or array.shape[2] != 2 or min(array.shape[:2]) < 2:
+        advice = ""
+        if array.ndim == 3 and array.shape[0] == 2:
+            advice = ": hand over numpy.moveaxis(field, 0, -1)"
+        elif array.ndim == 4 or (array.ndim == 3 and array.shape[2] == 3):
+            advice = "; fields of volumes are not handled"
+        raise ValueError(
+            "field must have shape (height, width, 2), a displacement along x and y for each of at least 2 × 2 "
+            f"pixels, not {array.shape}{advice}"
+        )
+    bad = np.asarray(~np.isfinite(array).all(axis=2))
+    if bad.any():
+        raise ValueError(f"field is not finite at {named_pixels(bad)}")
+    return array
+
+
+def named_pixels(mask: BoolArray, most: int = 5) -> str:
+    """Name the first pixels of a mask (h, w): ``pixels (0, 3), (2, 7), … (17 in all), row and column``."""
+    where = np.argwhere(mask)
+    listed = ", ".join(f"({y}, {x})" for y, x in where[:most].tolist())
+    rest = f", … ({len(where)} in all)" if len(where) > most else ""
+    return f"{'pixel' if len(where) == 1 else 'pixels'} {listed}{rest}, row and column"

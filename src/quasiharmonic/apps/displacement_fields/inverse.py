@@ -1,0 +1,140 @@
+"""The inverse of a displacement field, on the same grid.
+
+A field without folds maps each cell, bilinearly, onto a convex quadrilateral, and these lie side by side. Which one a
+pixel lies in is decided exactly, and where in it is a quadratic equation. So the inverse is no iteration's limit: at
+the pixels it is right to rounding, as far as the field reaches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.displacement_fields.grid import Grid, checked_field, checked_grid, named_pixels
+from quasiharmonic.apps.displacement_fields.nearest import fold_free
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.exact.point_location import PointLocator
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class InverseField:
+    """The inverse of a displacement field.
+
+    Attributes
+    ----------
+    field : (h, w, 2) float64
+        From the pixel at the place q to where it comes from, ``q + field``; NaN where it comes from nowhere.
+    outside : (h, w) bool
+        The pixels that come from nowhere: what the given field makes of the grid does not reach them.
+    error : float
+        The farthest that a pixel is off after the way there and back, through the given field between its pixels, in
+        the unit of the field: rounding.
+    """
+
+    field: FloatArray
+    outside: BoolArray
+    error: float
+
+    def summary(self) -> str:
+        """In a sentence."""
+        share = 100 * float(self.outside.mean())
+        return f"{share:.3g} % of the pixels lie outside; there and back the others are off by {self.error:.2g} at most"
+
+
+def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField:
+    """Invert a displacement field that does not fold.
+
+    Parameters
+    ----------
+    field : (h, w, 2) array
+        Displacements along x and y; see `nearest_invertible`.
+    spacing : float or (float, float)
+        From a pixel to the next, along x and along y.
+
+    Returns
+    -------
+    InverseField
+        On the same grid.
+
+    Raises
+    ------
+    ValueError
+        When the field folds or its border overlaps itself, is not finite, or an argument has the wrong shape. The
+        message names the pixels.
+
+    Notes
+    -----
+    At its own pixels the inverse is exact; between them, where software interpolates it, it differs from that of the
+    given field, which is not bilinear there, by the square of the spacing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> field = np.zeros((5, 6, 2))
+    >>> field[..., 0] = 1.0
+    >>> back = inverse_field(field)
+    >>> back.field[2, 3].tolist(), bool(back.outside[:, 0].all())
+    ([-1.0, 0.0], True)
+    """
+    given = checked_field(field)
+    grid = checked_grid(given.shape, spacing)
+    wrong = ~fold_free(given, spacing=spacing)
+    if wrong.any():
+        raise ValueError(
+            f"the field folds, so it has no inverse: at the cells whose first pixels are {named_pixels(wrong)}. "
+            "`nearest_invertible` gives the nearest one that does not"
+        )
+    places, F = (grid.points + given).reshape(-1, 2), grid.triangles()
+    certificate = certify(F, places)
+    if not certificate.bijective:
+        raise ValueError(f"the field has no inverse. {certificate.summary()}")
+    pixels = grid.points.reshape(-1, 2)
+    triangle = PointLocator(places[F]).find(pixels)
+    found = np.flatnonzero(triangle >= 0)
+    images = _Images(grid, places, triangle[found] // 2)
+    back = np.full(pixels.shape, np.nan)
+    back[found] = images.source(pixels[found]) - pixels[found]
+    away = images.forward(pixels[found] + back[found]) - pixels[found]
+    error = float(np.hypot(*away.T).max(initial=0))
+    return InverseField(back.reshape(given.shape), (triangle < 0).reshape(grid.shape), error)
+
+
+class _Images:
+    """The images of some cells (m,), ``first + s along + t down + s t twist`` for s and t from 0 to 1."""
+
+    def __init__(self, grid: Grid, places: FloatArray, cell: IntArray) -> None:
+        row, column = np.divmod(cell, grid.shape[1] - 1)
+        self.corner, self.spacing = np.stack([column, row], axis=1), np.array(grid.spacing)
+        self.first, right, below, last = (places[vertex] for vertex in grid.cells(row, column).T)
+        self.along, self.down = right - self.first, below - self.first
+        self.twist = last - right - below + self.first
+
+    def source(self, points: FloatArray) -> FloatArray:
+        """Where points (m, 2) come from, one in each cell's image."""
+        away, twist = self.first - points, self.twist
+        t = _rising_root(
+            _cross(twist, self.down), _cross(self.along, self.down) + _cross(twist, away), _cross(self.along, away)
+        )
+        across = self.along + t[:, None] * twist
+        s = -np.einsum("mi,mi->m", away + t[:, None] * self.down, across) / np.einsum("mi,mi->m", across, across)
+        return (self.corner + np.stack([np.clip(s, 0, 1), t], axis=1)) * self.spacing
+
+    def forward(self, points: FloatArray) -> FloatArray:
+        """Where points (m, 2) of the cells go."""
+        s, t = (points / self.spacing - self.corner).T[..., None]
+        return self.first + s * self.along + t * self.down + s * t * self.twist
+
+
+def _rising_root(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """The root in [0, 1] at which ``a t² + b t + c`` rises through 0, there being one."""
+    root = np.sqrt(np.maximum(b**2 - 4 * a * c, 0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(b >= 0, -2 * c / (b + root), (root - b) / (2 * a))
+    return np.clip(t, 0, 1)
+
+
+def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
+    return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]

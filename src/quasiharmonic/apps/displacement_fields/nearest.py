@@ -1,0 +1,243 @@
+"""The nearest field without folds."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.displacement_fields.approach import approach
+from quasiharmonic.apps.displacement_fields.grid import Grid, checked_field, checked_grid, named_pixels
+from quasiharmonic.apps.displacement_fields.patches import NoRoomError, filled_in, folded, grown, labelled
+from quasiharmonic.geometry.exact.certificate import Certificate, certify
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, counted
+
+# Pixels that are this near to where they were, in pixels, are put there.
+_THERE = 1e-6
+# Patches whose rim has moved grow by so many pixels, so many times at most.
+_WIDER, _ROUNDS = 4, 12
+
+
+@dataclass(frozen=True, eq=False)
+class InvertibleField:
+    """A displacement field without folds, and what it has cost.
+
+    Attributes
+    ----------
+    field : (h, w, 2) float64
+        Without folds.
+    moved : (h, w) bool
+        Where it is another than the given one; elsewhere it is that to the last bit.
+    certificate : Certificate
+        Of the pixels' places as a mesh, each cell cut along one diagonal: whether the field is injective, and, looking
+        at the border too, whether no place is covered twice.
+    folds : int
+        Cells that the given field folds: with a corner whose determinant is not above ``least``.
+    patches : int
+        Parts of the grid, apart from each other, in which it was changed.
+    distance : float
+        Root of the mean square, over all pixels, of how far the field is from the given one, in the unit of the field.
+    seconds : float
+    """
+
+    field: FloatArray
+    moved: BoolArray
+    certificate: Certificate
+    folds: int
+    patches: int
+    distance: float
+    seconds: float
+
+    def summary(self) -> str:
+        """In a sentence or two."""
+        if not self.folds:
+            return f"The field does not fold, and is as it was. {self.certificate.summary()}"
+        moved = int(np.count_nonzero(self.moved))
+        return (
+            f"{counted('cell', 'cells', self.folds)} folded; {counted('pixel', 'pixels', moved)} moved, "
+            f"{self.distance:.3g} away in the root mean square over all. {self.certificate.summary()}"
+        )
+
+
+def nearest_invertible(
+    field: ArrayLike,
+    *,
+    spacing: ArrayLike = 1.0,
+    least: float = 0.01,
+    held: ArrayLike | None = None,
+) -> InvertibleField:
+    """Make a displacement field invertible, and change it as little as that takes.
+
+    A field folds at a cell, the square between four pixels, where the derivative of the map that it stands for, between
+    pixels bilinear, has a determinant that is not positive; that is, where one of the four triangles that each corner
+    makes with its two neighbours is inverted. This finds a field without folds that is as near to the given one as
+    it gets by going downhill: the sum of the squared distances over all pixels has a local minimum there.
+
+    Parameters
+    ----------
+    field : (h, w, 2) array
+        Displacements along x, to the right, and y, down, of the pixel in row y and column x; in the unit of the
+        spacing. The pixel at the place p goes to ``p + field``.
+    spacing : float or (float, float)
+        From a pixel to the next, along x and along y.
+    least : float
+        What the determinants of the derivative are above, all four of each cell; at least 0 and less than 1, and taken
+        to be what rounding does to a determinant where it is less. Cells that have less are folds. What is above by a
+        little survives being stored in single precision.
+    held : (h, w) array of bool, optional
+        Pixels that keep their displacements; none by default, those of the border neither.
+
+    Returns
+    -------
+    InvertibleField
+        Away from the folds it is the given field to the last bit; where nothing folds, everywhere.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape, the field is not finite, or another option has no such value. The message
+        names the pixels.
+    RuntimeError
+        When no field was found, because of pixels that are held, or of displacements so large that nothing is left of
+        a pixel when they are rounded.
+
+    Notes
+    -----
+    The distance has many local minima where folds are deep; which one is found follows from the start, a harmonic fill
+    of patches around the folds (`quasiharmonic.apps.displacement_fields.patches`). Where the field's border overlaps
+    itself, which is no fold, `Certificate.bijective` is False and says where.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:40, :40]
+    >>> bump = np.exp(-((x - 20) ** 2 + (y - 20) ** 2) / 18)
+    >>> mended = nearest_invertible(np.stack([6 * bump, 0 * bump], axis=-1))
+    >>> mended.certificate.bijective, mended.folds, bool(mended.moved.mean() < 0.1)
+    (True, 8, True)
+    """
+    began = time.perf_counter()
+    given = checked_field(field)
+    grid = checked_grid(given.shape, spacing)
+    if not isinstance(least, Real) or not 0 <= least < 1:
+        raise ValueError(f"least must be at least 0 and less than 1, not {least!r}")
+    kept = _held(held, grid)
+    w = _map(grid, given)
+    least = max(least, _rounding(w))
+    wrong = folded(grid, w, least)
+    mended = given.copy()
+    if wrong.any():
+        _check_held(wrong, kept)
+        here = _descended(grid, w, kept, least)
+        moved = here != w
+        places = np.stack([here.real, here.imag], axis=-1) * grid.unit
+        mended[moved] = (places - grid.points)[moved]
+        if not _fold_free(grid, mended).all():
+            raise RuntimeError("rounding folds the field that was found: displacements are too large for its spacing")
+    certificate = certify(grid.triangles(), (grid.points + mended).reshape(-1, 2))
+    moved = (mended != given).any(axis=2)
+    away = np.hypot(*np.moveaxis(mended - given, 2, 0))
+    farthest = float(away.max())
+    return InvertibleField(
+        field=mended,
+        moved=moved,
+        certificate=certificate,
+        folds=int(np.count_nonzero(wrong)),
+        patches=int(labelled(moved).max()),
+        distance=farthest * float(np.sqrt(((away / (farthest or 1.0)) ** 2).mean())),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
+    """Say of each cell of a displacement field whether it does not fold, exactly.
+
+    Parameters
+    ----------
+    field : (h, w, 2) array
+    spacing : float or (float, float)
+        Both as of `nearest_invertible`.
+
+    Returns
+    -------
+    (h − 1, w − 1) bool
+        Whether all four corner triangles of the pixels' places, as doubles have them, are positive.
+
+    Raises
+    ------
+    ValueError
+        As `nearest_invertible`.
+    """
+    given = checked_field(field)
+    return _fold_free(checked_grid(given.shape, spacing), given)
+
+
+def _fold_free(grid: Grid, field: FloatArray) -> BoolArray:
+    places = (grid.points + field).reshape(-1, 2)
+    rows, columns = np.indices((grid.shape[0] - 1, grid.shape[1] - 1)).reshape(2, -1)
+    a, b, c = places[grid.corner_triangles(grid.cells(rows, columns))].swapaxes(0, 1)
+    positive = (orientation(a, b, c) > 0).reshape(grid.shape[0] - 1, grid.shape[1] - 1, 4)
+    return np.asarray(positive.all(axis=2))
+
+
+def _map(grid: Grid, field: FloatArray) -> ComplexArray:
+    """Where pixels go, in the grid's unit; (h, w)."""
+    return np.ascontiguousarray((grid.points + field) / grid.unit).view(np.complex128)[..., 0]
+
+
+def _rounding(w: ComplexArray) -> float:
+    """What rounding may do to a determinant of a map (h, w), generously: of most of it, whatever single pixels do."""
+    side = max(float(np.median(np.abs(np.diff(w, axis=axis)))) for axis in (0, 1))
+    return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
+
+
+def _held(held: ArrayLike | None, grid: Grid) -> BoolArray:
+    if held is None:
+        return np.zeros(grid.shape, dtype=bool)
+    mask = np.asarray(held)
+    if mask.shape != grid.shape or mask.dtype != bool:
+        raise ValueError(f"held must be an array of bool of shape {grid.shape}, not of {mask.dtype} and {mask.shape}")
+    return mask
+
+
+def _check_held(wrong: BoolArray, held: BoolArray) -> None:
+    """Refuse folds that nobody may mend."""
+    stuck = wrong & held[:-1, :-1] & held[1:, :-1] & held[:-1, 1:] & held[1:, 1:]
+    if stuck.any():
+        raise ValueError(f"held: cells fold whose four pixels are all held; the first of each is {named_pixels(stuck)}")
+
+
+def _descended(grid: Grid, given: ComplexArray, held: BoolArray, least: float) -> ComplexArray:
+    """The nearest map, from one without folds; patches grow until nothing moves at their rims."""
+    try:
+        w, patch = filled_in(grid, given, held, least)
+    except NoRoomError as none:
+        raise RuntimeError(
+            "no field without folds was found that keeps what is held; what folds still has "
+            f"{named_pixels(none.mask)}. Hold fewer pixels around these"
+        ) from none
+    moving = patch
+    for _ in range(_ROUNDS):
+        approach(grid, w, given, moving, least)
+        _put_back(grid, w, given, least)
+        rim = (w != given) & (moving > 0) & grown(patch == 0, 1, held)
+        pressing = np.isin(moving, np.unique(moving[rim])) & rim.any() & (moving > 0)
+        free = (patch > 0) | grown(pressing, _WIDER, held)
+        if np.array_equal(free, patch > 0):
+            break
+        patch = labelled(free)
+        moving = np.where(np.isin(patch, np.unique(patch[pressing])), patch, 0)
+    return w
+
+
+def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, least: float) -> None:
+    """Put pixels to where they were that are all but there, if nothing folds with that."""
+    there = (w != given) & (np.abs(w - given) < _THERE)
+    before = w[there]
+    w[there] = given[there]
+    if folded(grid, w, least).any():
+        w[there] = before

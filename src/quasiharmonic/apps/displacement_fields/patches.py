@@ -1,0 +1,147 @@
+"""Patches around the folds of a field, and a map of each without folds that fits into the field around it.
+
+The pixels of cells that fold are freed, and those a little way around them. Inside each patch displacements become
+harmonic: as smooth as those around it let them be. Where that folds too, the patch grows, and what it meets it takes
+in; a patch that has become the whole grid takes the field smoothed until it does not fold, as every field does in
+the end: far enough smoothed it is a translation.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quasiharmonic.apps.displacement_fields.grid import Grid
+from quasiharmonic.linsolve import make_solver
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import dia_array
+
+# How far around folded cells pixels are freed, and by what factor patches that fold still grow.
+_REACH, _GROWTH = 2, 2
+# Standard deviations of smoothing, in pixels, grow by this factor.
+_SMOOTHER = 1.2
+_EIGHT = np.ones((3, 3), dtype=bool)
+
+
+class NoRoomError(Exception):
+    """Pixels that are held leave no map without folds that could be found; ``mask`` (h, w) says where."""
+
+    def __init__(self, mask: BoolArray) -> None:
+        super().__init__("pixels that are held leave no room")
+        self.mask = mask
+
+
+def folded(grid: Grid, w: ComplexArray, least: float) -> BoolArray:
+    """The cells (h − 1, w − 1) of which a corner's determinant is not above ``least``."""
+    return np.asarray(~(grid.jacobians(w) > least).all(axis=2))
+
+
+def corners_of(cells: BoolArray) -> BoolArray:
+    """The pixels (h, w) of some cells (h − 1, w − 1)."""
+    pixels = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=bool)
+    for y in (0, 1):
+        for x in (0, 1):
+            pixels[y : y + cells.shape[0], x : x + cells.shape[1]] |= cells
+    return pixels
+
+
+def labelled(free: BoolArray) -> IntArray:
+    """Number the patches that free pixels (h, w) make, from 1 on: no cell has pixels of two."""
+    from scipy.ndimage import label
+
+    return np.asarray(label(free, structure=_EIGHT)[0], dtype=np.int64)
+
+
+def grown(pixels: BoolArray, steps: int, held: BoolArray) -> BoolArray:
+    """Pixels and all that are at most some steps away, by rows, columns or both, but for those that are held."""
+    from scipy.ndimage import maximum_filter
+
+    around: BoolArray = maximum_filter(pixels, 2 * steps + 1, mode="constant") & ~held
+    return around
+
+
+def filled_in(grid: Grid, given: ComplexArray, held: BoolArray, least: float) -> tuple[ComplexArray, IntArray]:
+    """A map without folds that is the given one but for some patches.
+
+    Parameters
+    ----------
+    grid : Grid
+    given : (h, w) complex128
+        A map in the grid's unit.
+    held : (h, w) bool
+        Pixels that stay.
+    least : float
+        What all determinants are to be above.
+
+    Returns
+    -------
+    w : (h, w) complex128
+    patch : (h, w) int64
+        The patch of each pixel that has been freed, from 1 on, and 0 of all others.
+
+    Raises
+    ------
+    NoRoomError
+        When none was found, which only pixels that are held can do.
+    """
+    w, steps = given.copy(), _REACH
+    free = grown(corners_of(folded(grid, given, least)), steps, held)
+    while not free.all():
+        patch = labelled(free)
+        _fill(grid, w, given, free)
+        wrong = folded(grid, w, least)
+        if not wrong.any():
+            return w, patch
+        steps *= _GROWTH
+        failed = np.unique(patch[corners_of(wrong)])
+        larger = grown(np.isin(patch, failed[failed > 0]) | corners_of(wrong), steps, held) | free
+        if np.array_equal(larger, free):
+            raise NoRoomError(corners_of(wrong))
+        free = larger
+    return _smoothed(grid, given, least), labelled(free)
+
+
+def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
+    """Make the displacements of free pixels harmonic, those of the others given, the grid's border free."""
+    from scipy.sparse import csr_array, dia_array, kron, triu
+
+    inside, moved = np.flatnonzero(free), (given - grid.rest).ravel()
+    (rows, columns), aspect = grid.shape, grid.spacing[1] / grid.spacing[0]
+    across, along = (dia_array((np.ones((1, count)), [0]), shape=(count, count)) for count in (rows, columns))
+    laplacian = aspect * kron(across, _path(columns)) + kron(_path(rows), along) / aspect
+    own_rows = csr_array(laplacian)[inside]
+    load = -(own_rows @ np.where(free.ravel(), 0, moved))
+    matrix = csr_array(triu(own_rows[:, inside], format="csr"))
+    matrix.sort_indices()
+    with make_solver(matrix.indptr, matrix.indices) as solver:
+        solver.factor(matrix.data)
+        answer = solver.solve(np.stack([load.real, load.imag], axis=1))
+    w[:] = given
+    w.ravel()[inside] = grid.rest.ravel()[inside] + answer[:, 0] + 1j * answer[:, 1]
+
+
+def _path(count: int) -> dia_array:
+    """The Laplacian of so many points in a row."""
+    from scipy.sparse import dia_array
+
+    bands = np.full((3, count), -1.0)
+    bands[1] = 2
+    bands[1, [0, -1]] = 1
+    return dia_array((bands, [-1, 0, 1]), shape=(count, count))
+
+
+def _smoothed(grid: Grid, given: ComplexArray, least: float) -> ComplexArray:
+    """The map whose displacements are smoothed by a Gaussian, as little as leaves no fold."""
+    from scipy.ndimage import gaussian_filter
+
+    moved, deviation = given - grid.rest, 1.0
+    while deviation < max(grid.shape):
+        smooth = [gaussian_filter(part, deviation, mode="nearest") for part in (moved.real, moved.imag)]
+        w: ComplexArray = grid.rest + smooth[0] + 1j * smooth[1]
+        if not folded(grid, w, least).any():
+            return w
+        deviation *= _SMOOTHER
+    return grid.rest + moved.mean()

@@ -1,0 +1,235 @@
+"""What keeps a free boundary from running into itself: a barrier between its vertices and the edges near them.
+
+A vertex ``v`` of the boundary and an edge ``a → b`` that faces it across what is outside the surface are in *contact*
+where their distance ``d`` is below a reach ``d̂``, and repel each other by ``(d̂/d − 1)²``, which begins smoothly and
+grows beyond all bounds [1]_. The reach is a share of the boundary's own edges there: a limb that the map has shrunk to
+a millionth keeps gaps of a millionth. Second derivatives leave out how the direction of contact turns (Gauss and
+Newton): with ``n`` the unit vector from the edge's nearest point ``(1 − s) a + s b`` to ``v``, the gap changes by
+``Re n̄ (dv − (1 − s) da − s db)``, and what is kept is a factor times the square of this.
+
+To Newton's system a contact is one more triangle ``v, a, b``: whatever its corners do is affine, so the gap's change
+is ``Re(α dp + β dq)`` in the derivatives of a fixed right triangle at rest, and its square a quadratic form in them.
+
+The barrier only shows Newton's method the way. Whether the boundary is simple is decided exactly, on every map.
+
+References
+----------
+.. [1] J. Smith, S. Schaefer, Bijective parameterization with free boundaries. ACM Transactions on Graphics 34 (2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.energies.energies import QuadraticForm
+from quasiharmonic.geometry.exact.loops import contacts, judge_loops
+from quasiharmonic.geometry.exact.predicates import box_pairs_between
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+# A gap is kept open from this share of the boundary's edges there on, ...
+_REACH = 1.0
+# ... and pairs up to so many times as far apart are looked at during a step, which may bring them nearer.
+_LOOKOUT = 2.0
+_MOST_MEETINGS = 1000
+#: Half the gradients of the hat functions of a triangle v, a, b with its right angle at a and legs of 1.
+HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Pairs of a boundary vertex and a boundary edge that may touch.
+
+    Attributes
+    ----------
+    corners : (3, c) int64
+        Vertex, and tail and head of the edge.
+    reach : (c,) float64
+        The distance at which they begin to repel each other, in the map's units; 0 for those that do not.
+    """
+
+    corners: IntArray
+    reach: FloatArray
+
+    @classmethod
+    def none(cls) -> Contacts:
+        """No contacts."""
+        return cls(np.zeros((3, 0), dtype=np.int64), np.zeros(0))
+
+    def room(self, w: ComplexArray) -> float:
+        """The least distance over its reach; ``inf`` without contacts."""
+        d, _, _ = _nearest(*w[self.corners])
+        return float(np.min(d[self.reach > 0] / self.reach[self.reach > 0], initial=np.inf))
+
+    def value(self, w: ComplexArray) -> float:
+        """The sum of the barriers of a map (n,) complex128."""
+        d, _, _ = _nearest(*w[self.corners])
+        return float(np.sum(self._excess(d) ** 2))
+
+    def gradient(self, w: ComplexArray) -> ComplexArray:
+        """Its derivative by the positions, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
+        d, normal, s = _nearest(*w[self.corners])
+        pull = -2 * self._excess(d) * self.reach / d**2 * normal
+        parts = np.concatenate([pull, -(1 - s) * pull, -s * pull])
+        at = self.corners.ravel()
+        return np.bincount(at, parts.real, minlength=w.size) + 1j * np.bincount(at, parts.imag, minlength=w.size)
+
+    def curvature(self, w: ComplexArray) -> QuadraticForm:
+        """Its second derivative along the present directions of contact, in the derivatives that `HATS` defines."""
+        d, normal, s = _nearest(*w[self.corners])
+        half: FloatArray = 0.5 * self._stiffness(d)
+        # dv − da = dp + dq and db − da = i (dp − dq).
+        alpha: ComplexArray = normal.conj() * (1 - 1j * s)
+        beta: ComplexArray = normal.conj() * (1 + 1j * s)
+        return QuadraticForm(
+            pp=half * (1 + s**2),
+            qq=half * (1 + s**2),
+            p2=half * alpha**2,
+            q2=half * beta**2,
+            pq=2 * half * alpha * beta,
+            pqc=2 * half * alpha * beta.conj(),
+        )
+
+    def blocks(self, w: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Bound its second derivative by one that does not couple vertices: blocks xx, xy, yy, (n,) float64 each.
+
+        Of three terms the square of the sum is at most three times the sum of the squares.
+        """
+        d, normal, s = _nearest(*w[self.corners])
+        bound = 3 * self._stiffness(d) * np.stack([np.ones(s.shape), (1 - s) ** 2, s**2])
+        at = self.corners.ravel()
+
+        def summed(part: FloatArray) -> FloatArray:
+            # Of nothing bincount makes integers.
+            return np.bincount(at, (bound * part).ravel(), minlength=w.size).astype(np.float64, copy=False)
+
+        return summed(normal.real**2), summed(normal.real * normal.imag), summed(normal.imag**2)
+
+    def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
+        """Those of a known set (3, k) of pairs of ``n`` vertices, with reach 0 for the others in it, and the rest."""
+        keys, own = (pairs[0] * n + pairs[1] for pairs in (known, self.corners))
+        order = np.argsort(keys)
+        keys = np.append(keys[order], np.iinfo(np.int64).max)
+        place = np.searchsorted(keys, own)
+        found = keys[place] == own
+        reach = np.zeros(known.shape[1])
+        reach[order[place[found]]] = self.reach[found]
+        return Contacts(known, reach), Contacts(self.corners[:, ~found], self.reach[~found])
+
+    def within(self, w: ComplexArray, most: float) -> Contacts:
+        """Those whose distance is below so many times their reach."""
+        d, _, _ = _nearest(*w[self.corners])
+        near = d < most * self.reach
+        return Contacts(self.corners[:, near], self.reach[near])
+
+    def _stiffness(self, d: FloatArray) -> FloatArray:
+        """The barriers' second derivatives by the distances."""
+        ratio = self.reach / d
+        return np.where(ratio > 1, 2 * ratio * (3 * ratio - 2) / d**2, 0.0)
+
+    def _excess(self, d: FloatArray) -> FloatArray:
+        return np.maximum(self.reach / d - 1, 0)
+
+
+class Rim:
+    """The boundary of a surface.
+
+    Parameters
+    ----------
+    loops : sequence of (l,) int64
+        Boundary loops, the surface to their left.
+    """
+
+    def __init__(self, loops: Sequence[IntArray]) -> None:
+        self._loops = list(loops)
+        self._vertex = np.concatenate(loops)
+        ends = np.cumsum([len(loop) for loop in loops])
+        starts = ends - [len(loop) for loop in loops]
+        number = np.arange(self._vertex.size)
+        self._next, self._previous = number + 1, number - 1
+        self._next[ends - 1], self._previous[starts] = starts, ends - 1
+        self._edges = np.stack([self._vertex, self._vertex[self._next]], axis=1)
+
+    def meets_itself(self, uv: FloatArray) -> bool:
+        """Whether the boundary touches or crosses itself under a map (n, 2), or lies on the surface, exactly.
+
+        Where it does not, and all triangles are positive, the map is bijective (`exact.certificate`). That no two edges
+        meet is not enough: where the triangles at a boundary vertex wind around it by more than a full turn,
+        a loop can be simple and run the wrong way round.
+        """
+        return bool(judge_loops(self._loops, uv)[1])
+
+    def meetings(self, uv: FloatArray) -> IntArray:
+        """List the vertices (k,) at the ends of the first thousand pairs of edges that meet, if any do."""
+        tail, head = uv[self._edges[:, 0]], uv[self._edges[:, 1]]
+        short = self._edges[(tail == head).all(axis=1)]
+        pairs = contacts(uv, self._edges, _MOST_MEETINGS).pairs
+        return np.unique(np.concatenate([short.ravel(), self._edges[pairs].ravel()]))
+
+    def tangled(self, uv: FloatArray) -> float:
+        """The share of the boundary's vertices at the ends of edges that meet; of the first thousand pairs at least."""
+        return self.meetings(uv).size / self._vertex.size
+
+    def contacts(self, w: ComplexArray) -> Contacts:
+        """Pairs that are near each other across what is outside the surface.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+            A map whose boundary is simple.
+        """
+        p = w[self._vertex]
+        q = p[self._next]
+        length = np.abs(q - p)
+        around = 0.5 * (length + length[self._previous])
+        # The vertex's own edges and those next to it come first into its box, and are many: sort them out early.
+        radius = (_LOOKOUT * _REACH * around)[:, None]
+        here, there = _planar(p), _planar(q)
+        boxes = here - radius, here + radius, np.minimum(here, there), np.maximum(here, there)
+        found = [self._apart(*pairs) for pairs in box_pairs_between(*boxes)]
+        i, j = np.concatenate(found, axis=1) if found else np.zeros((2, 0), dtype=np.int64)
+        reach = _REACH * np.minimum(around[i], length[j])
+        d, normal, s = _nearest(p[i], p[j], q[j])
+        near = np.flatnonzero(d < _LOOKOUT * reach)
+        i, j, reach, normal, s = i[near], j[near], reach[near], normal[near], s[near]
+        # The way from the vertex to the edge leads through the outside, at both of its ends ...
+        head = self._next[j]
+        faced = ((q - p)[j].conj() * normal).imag < 0
+        for place, at in ((0, j), (1, head)):
+            those = np.flatnonzero(s == place)
+            faced[those] = ~self._within(p, at[those], normal[those])
+        # ... and is not an edge of the boundary.
+        end = np.where(s == 0, j, np.where(s == 1, head, -1))
+        kept = np.flatnonzero(faced & (self._next[i] != end) & (self._previous[i] != end))
+        kept = kept[~self._within(p, i[kept], -normal[kept])]
+        corners = self._vertex[np.stack([i[kept], j[kept], head[kept]])]
+        return Contacts(corners, reach[kept])
+
+    def _apart(self, i: IntArray, j: IntArray) -> IntArray:
+        """Pairs (2, k) without those of a vertex and an edge of its own."""
+        apart = np.flatnonzero((i != j) & (i != self._next[j]))
+        return np.stack([i[apart], j[apart]])
+
+    def _within(self, p: ComplexArray, i: IntArray, direction: ComplexArray) -> BoolArray:
+        """Whether directions from vertices of the boundary lead into the surface."""
+        ahead, behind = p[self._next[i]] - p[i], p[self._previous[i]] - p[i]
+        left, right = (ahead.conj() * direction).imag > 0, (direction.conj() * behind).imag > 0
+        convex = (ahead.conj() * behind).imag > 0
+        inside: BoolArray = np.where(convex, left & right, left | right)
+        return inside
+
+
+def _planar(w: ComplexArray) -> FloatArray:
+    return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
+
+
+def _nearest(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """Distances of points from segments, unit vectors from the nearest points, and these points' places s."""
+    along = b - a
+    square = along.real**2 + along.imag**2
+    s = np.clip(((v - a) * along.conj()).real / np.where(square > 0, square, 1), 0, 1)
+    apart = v - (a + s * along)
+    d = np.abs(apart)
+    return d, apart / np.where(d > 0, d, 1), s

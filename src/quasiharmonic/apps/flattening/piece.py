@@ -1,0 +1,423 @@
+"""One connected surface on its way into the plane."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.flattening.collapse import has_collapsed
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.descent import FreeDescent, GuardedDescent, descend
+from quasiharmonic.apps.flattening.layout import in_given_unit
+from quasiharmonic.apps.flattening.multilevel.start import coarse_start
+from quasiharmonic.apps.flattening.start import disk_start
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.geometry.exact.certificate import certify, is_injective
+from quasiharmonic.linsolve import available
+from quasiharmonic.problem import Domain
+from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.util.arrays import FloatArray, check_callback, counted
+
+#: From so many triangles on a surface is flattened by way of coarse meshes.
+COARSE_FROM = 50_000
+# A mean energy below this is near enough to the least for Newton's own steps.
+_NEAR = 1.0
+# ... and below this also where the boundary is guarded, which makes steps short whatever they aim at. From above, steps
+# of Newton's that halve it at best would be too many.
+_FAR = 1e4
+# Energies are equal if they differ by no more than this part of them.
+_SAME = 1e-6
+# Of so many last maps of a free descent the latest is looked for that is bijective, if its energy is at most so many
+# times the last one's: far from that the start is the better place to begin anew.
+_RECENT, _NOT_FAR = 12, 10.0
+# Every so many steps of a free descent it is looked whether so much of the boundary has met itself that it will not
+# come apart again.
+_LOOK_EVERY, _TANGLED = 8, 0.1
+# Two descents from different starts have come to the same if their energies differ by no more than this part of them.
+_AGREE = 0.1
+# A descent that has not come to an end in so many steps is asked whether it will get anywhere.
+_MANY = 100
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a caller of `flatten` has chosen, checked.
+
+    Attributes
+    ----------
+    density : Energy
+    name : str
+        Of the energy.
+    tolerance : float
+    max_iterations : int
+    linear_solver : str
+    callback : callable or None
+    record : int
+    """
+
+    density: Energy
+    name: str
+    tolerance: float
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    record: int
+
+    def __post_init__(self) -> None:
+        check_callback(self.callback)
+
+
+class Piece:
+    """A connected surface that can be flattened, in a unit near its size.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+    F : (f, 3) array of int
+
+    Raises
+    ------
+    ValueError
+        As `Domain`; where the surface has handles, or a triangle no area.
+
+    Attributes
+    ----------
+    V : (n, 3) float64
+        Positions in units of ``2 ** exponent``.
+    F : (f, 3) int64
+    loops : list of (l,) int64
+        Boundary loops.
+    exponent : int
+    area : float
+        The surface's, in square units.
+    """
+
+    def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
+        domain = Domain(V, F, [])
+        self.F, self.loops = domain.F, domain.loops
+        handles, odd = divmod(self._missing(domain), 2)
+        if handles or odd:
+            raise ValueError(
+                f"the surface has {counted('handle', 'handles', handles)} and cannot lie in the plane: "
+                "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
+            )
+        self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
+        self.V = np.zeros((domain.n, 3))
+        self.V[:, : domain.V.shape[1]] = np.ldexp(domain.V, -self.exponent)
+
+        corners = self.V[self.F]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+
+    @classmethod
+    def united(cls, pieces: Sequence[Piece]) -> Piece:
+        """Several pieces as one that is not connected, their elements piece after piece, in the largest one's unit."""
+        made = object.__new__(cls)
+        first = np.cumsum([0, *(len(piece.V) for piece in pieces)])[:-1].tolist()
+        made.F = np.concatenate([piece.F + k for piece, k in zip(pieces, first, strict=True)])
+        made.loops = [loop + k for piece, k in zip(pieces, first, strict=True) for loop in piece.loops]
+        made.exponent = max(piece.exponent for piece in pieces)
+        smaller = [piece.exponent - made.exponent for piece in pieces]
+        made.V = np.concatenate([np.ldexp(piece.V, down) for piece, down in zip(pieces, smaller, strict=True)])
+        made.area = float(sum(np.ldexp(piece.area, 2 * down) for piece, down in zip(pieces, smaller, strict=True)))
+        return made
+
+    @staticmethod
+    def _missing(domain: Domain) -> int:
+        """What the Euler characteristic is short of a disk's with as many holes: two for each handle."""
+        found = domain.edges
+        euler = domain.n - len(found.interior) - len(found.boundary) + len(domain.F)
+        return 2 - len(domain.loops) - euler
+
+    def energy(self, density: Energy, weights: FloatArray | None) -> DeformationEnergy:
+        """The energy of its maps."""
+        return DeformationEnergy(self.V, self.F, density, weights=weights)
+
+
+@dataclass
+class _Attempt:
+    """Where descents from one start have ended."""
+
+    energy: float
+    uv: FloatArray
+    status: Status
+    solver: str
+    stages: range
+
+
+class Flattening:
+    """The descent of one surface's map, and what is to be told of it.
+
+    Parameters
+    ----------
+    piece : Piece
+    settings : Settings
+    weights : (f,) float64 or None
+    """
+
+    def __init__(self, piece: Piece, settings: Settings, weights: FloatArray | None) -> None:
+        self._piece, self._settings, self._weights = piece, settings, weights
+        self._rim = Rim(piece.loops)
+        self._measure = piece.energy(settings.density, weights)
+        self._bijective: FloatArray | None = None
+        # Whether a free descent has ended on itself, and the map, if that had come to rest.
+        self._overlaps = False
+        self._overlapping: FloatArray | None = None
+        self._starts = self._own_starts()
+        # The solver and the energy of those that there have been.
+        self._begun: set[tuple[str, float]] = set()
+        # Of the last descent.
+        self._steps = 0
+        self._solver = ""
+        self._stages: list[Stage] = []
+        self._history: list[Step] = []
+        self._path: list[Snapshot] = []
+
+    def run(self, start: FloatArray | None) -> MapResult:
+        """Flatten, from an injective map (n, 2) in the piece's unit or from one of the library's own.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            Before there is a first bijective map.
+        """
+        began = time.perf_counter()
+        try:
+            status = self._descended(start)
+            if self._collapsed(status):
+                status = self._begun_otherwise(status)
+        except KeyboardInterrupt:
+            if self._bijective is None:
+                raise
+            status = Status.INTERRUPTED
+        assert self._bijective is not None
+        uv = self._bijective
+        if self._blind_to_scale(uv):
+            uv = self._in_scale(uv)
+        return MapResult(
+            uv=uv,
+            status=status,
+            certificate=certify(self._piece.F, uv, loops=self._piece.loops),
+            stages=self._stages,
+            history=self._history,
+            path=self._path,
+            linear_solver=self._solver,
+            seconds=time.perf_counter() - began,
+        )
+
+    def _descended(self, start: FloatArray | None) -> Status:
+        """Descend freely, and once more with the boundary guarded if it has ended on itself."""
+        if start is not None:
+            start = self._in_scale(start)
+            if not self._rim.meets_itself(start):
+                self._bijective = start
+            status = self._descent(start, guarded=False, near=False)
+            if status is not None:
+                return status
+        if self._bijective is None:
+            # Nothing was given, or what was given overlaps itself and ended so.
+            own, near = self._own_start()
+            status = self._descent(own, guarded=False, near=near)
+            if status is not None:
+                return status
+        return self._guarded()
+
+    def _guarded(self) -> Status:
+        """Descend from the bijective map at hand to bijective ones."""
+        assert self._bijective is not None
+        near = self._measure.value(in_units(self._bijective, 0)) < _FAR
+        status = self._descent(self._bijective, guarded=True, near=near)
+        assert status is not None
+        return status
+
+    def _collapsed(self, status: Status) -> bool:
+        """Whether the descent that has ended so has come to a stand at a map which is far from what there should be."""
+        # What has converged is at a minimum, whatever that is like; only barriers of a boundary without room may feign
+        # it, and then there is a map to compare with.
+        converged = status is Status.POLISHED and self._overlapping is None
+        falling = status is Status.STILL_FALLING and self._steps < _MANY
+        if converged or falling or status is Status.INTERRUPTED:
+            return False
+        assert self._bijective is not None
+        piece, uv = self._piece, self._bijective
+        angles_alone = self._blind_to_scale(uv)
+        return has_collapsed(
+            piece.V, piece.F, piece.loops, piece.area, uv, self._overlapping, angles_alone=angles_alone
+        )
+
+    def _begun_otherwise(self, status: Status) -> Status:
+        """Descend from other starts until there is a map that has not collapsed; else take the best of all."""
+        attempts, first = [self._attempt(status, 0)], len(self._stages)
+        try:
+            while (own := self._next_start()) is not None:
+                found = self._descent(own[0], guarded=False, near=own[1]) if not self._overlaps else None
+                status = found or self._guarded()
+                attempts.append(self._attempt(status, first))
+                if not self._collapsed(status):
+                    return self._chosen(attempts, attempts[-1])
+                if self._agreed(attempts):
+                    return self._chosen(attempts)
+                first = len(self._stages)
+        except KeyboardInterrupt:
+            self._chosen([*attempts, self._attempt(Status.INTERRUPTED, first)])
+            raise
+        self._chosen(attempts)
+        return Status.COLLAPSED
+
+    def _agreed(self, attempts: Sequence[_Attempt]) -> bool:
+        """Whether different starts have led to the same as the last: then that is what the surface asks for."""
+        *others, last = attempts
+        least = min(attempt.energy for attempt in attempts)
+
+        def begun(attempt: _Attempt) -> float:
+            return self._stages[attempt.stages.start].energy[0]
+
+        return last.energy <= (1 + _AGREE) * least and any(
+            other.energy <= (1 + _AGREE) * least and abs(begun(other) - begun(last)) > _AGREE * begun(last)
+            for other in others
+        )
+
+    def _attempt(self, status: Status, first: int) -> _Attempt:
+        """The map at hand, to which the stages from ``first`` on have led."""
+        assert self._bijective is not None
+        energy = self._measure.value(in_units(self._bijective, 0))
+        return _Attempt(energy, self._bijective, status, self._solver, range(first, len(self._stages)))
+
+    def _chosen(self, attempts: Sequence[_Attempt], best: _Attempt | None = None) -> Status:
+        """Take on where one attempt has ended, by default the one of least energy; the others are discarded."""
+        best = best or min(attempts, key=lambda attempt: attempt.energy)
+        for attempt in attempts:
+            for k in attempt.stages if attempt is not best else ():
+                self._stages[k] = replace(self._stages[k], kept=False)
+        self._bijective, self._solver = best.uv, best.solver
+        return best.status
+
+    def _own_start(self) -> tuple[FloatArray, bool]:
+        """A bijective map, and whether it is near its best already."""
+        own = self._next_start()
+        if own is None:
+            raise ValueError(
+                "no bijective map to start from was found within double precision: the triangles differ too much in "
+                "size; give one by start"
+            )
+        return own
+
+    def _next_start(self) -> tuple[FloatArray, bool] | None:
+        """The next of the library's own starts that there is, and whether it is near its best already."""
+        began = time.perf_counter()
+        for name, start in self._starts:
+            uv = start()
+            if uv is None:
+                continue
+            uv = self._in_scale(uv)
+            energy = self._measure.value(in_units(uv, 0))
+            if (self._settings.linear_solver, energy) in self._begun:
+                # Of a small surface the coarse mesh is the surface itself.
+                continue
+            self._begun.add((self._settings.linear_solver, energy))
+            self._bijective = uv
+            what = f"start anew, {name}" if self._stages else "start"
+            self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
+            return uv, energy < _NEAR
+        return None
+
+    def _own_starts(self) -> Iterator[tuple[str, Callable[[], FloatArray | None]]]:
+        """Bijective maps to begin with, the best bet first; each is made when it is called for, and may not exist."""
+        piece, solver = self._piece, self._settings.linear_solver
+        surface = piece.V, piece.F, piece.loops
+        disk = "disk", partial(disk_start, *surface, solver)
+        large = len(piece.F) >= COARSE_FROM
+        yield "as it lies", self._as_it_lies
+        if not large:
+            yield disk
+        yield "coarse mesh", partial(coarse_start, *surface, solver)
+        yield "coarse mesh, guarded", partial(coarse_start, *surface, solver, guarded=True)
+        if large:
+            yield disk
+        for other in [name for name in available() if name != self._solver][:1]:
+            self._settings = replace(self._settings, linear_solver=other)
+            yield f"coarse mesh, {other}", partial(coarse_start, *surface, other)
+
+    def _as_it_lies(self) -> FloatArray | None:
+        """The surface itself, if it is plane and covers no point twice: there is no better map."""
+        V, F, loops = self._piece.V, self._piece.F, self._piece.loops
+        if np.ptp(V[:, 2]) > 0:
+            return None
+        # Seen from the side on which its triangles are counterclockwise.
+        uv = V[:, :2] * [np.sign(signed_areas(F, in_units(V[:, :2], 0)).sum()) or 1.0, 1.0]
+        return uv if certify(F, uv, loops=loops).bijective else None
+
+    def _blind_to_scale(self, uv: FloatArray) -> bool:
+        """Whether a map of twice the size would be as good."""
+        w = in_units(uv, 0)
+        here, doubled = self._measure.value(w), self._measure.value(2 * w)
+        return abs(doubled - here) <= _SAME * here
+
+    def _in_scale(self, uv: FloatArray) -> FloatArray:
+        """A map scaled to the surface's area; only by a power of two, exactly, where more would invert a triangle."""
+        unit = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
+        centred = unit - unit.mean(axis=0)
+        area = float(signed_areas(self._piece.F, in_units(centred, 0)).sum())
+        factor = np.sqrt(self._piece.area / area)
+        scaled = centred * factor
+        return scaled if is_injective(self._piece.F, scaled) else np.ldexp(unit, round(np.log2(factor)))
+
+    def _descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
+        """Descend from a map, which is bijective if the descent is guarded; None where the end overlaps itself."""
+        began = time.perf_counter()
+        settings, solver = self._settings, self._settings.linear_solver
+        energy = self._piece.energy(settings.density if near else ReweightedDirichlet(), self._weights)
+        descent = GuardedDescent(energy, uv, solver, self._rim) if guarded else FreeDescent(energy, uv, solver)
+        self._solver = descent.system.solver.name
+        first = self._measure.value(descent.w)
+        apart, status, steps = guarded, Status.STILL_FALLING, 0
+        recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)
+        try:
+            self._report(descent)
+            course = descend(descent, settings.density, settings.tolerance)
+            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):
+                status = outcome or status
+                recent.append((self._measure.value(descent.w), descent.uv))
+                self._report(descent)
+                if not guarded and steps % _LOOK_EVERY == 0 and self._rim.tangled(descent.uv) > _TANGLED:
+                    break
+        finally:
+            # Also what Ctrl-C has left half done may be a better map than there was.
+            last = self._measure.value(descent.w)
+            apart = guarded or not self._rim.meets_itself(descent.uv)
+            if apart:
+                self._bijective = descent.uv
+            else:
+                self._overlaps = True
+                self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
+                self._bijective = self._latest_bijective(recent, _NOT_FAR * last)
+            self._steps = steps
+            seconds = time.perf_counter() - began
+            name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
+            self._stages.append(Stage(name, steps, seconds, (0, 0), (first, last), kept=apart))
+        return status if apart else None
+
+    def _latest_bijective(self, recent: Iterable[tuple[float, FloatArray]], most: float) -> FloatArray | None:
+        """The latest of some maps with their energies that is bijective and of no more energy; else what there was."""
+        for energy, uv in reversed([*recent]):
+            if energy <= most and not self._rim.meets_itself(uv):
+                return uv
+        return self._bijective
+
+    def _report(self, descent: FreeDescent) -> None:
+        settings, number = self._settings, len(self._history)
+        self._history.append(Step(number, 0, self._measure.value(descent.w)))
+        if settings.record and number % settings.record == 0:
+            self._path.append(Snapshot(number, in_given_unit(descent.uv, self._piece.exponent)))
+        if settings.callback is not None:
+            settings.callback(self._history[-1])

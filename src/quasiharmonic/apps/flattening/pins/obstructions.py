@@ -1,0 +1,112 @@
+"""What forbids a bijective map with given vertices held, whatever the boundary does: conditions on the pins alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.geometry.exact.loops import contacts
+from quasiharmonic.geometry.exact.predicates import box_pairs_between, orientation
+from quasiharmonic.geometry.mesh.topology import Edges, edge_keys
+from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
+from quasiharmonic.util.arrays import FloatArray, IntArray, named, named_edges
+
+# Pairs that meet which are named at most.
+_MOST = 100
+
+
+def pin_obstructions(F: IntArray, n: int, found: Edges, fixed: IntArray, target: FloatArray) -> Diagnosis:
+    """Name what is wrong with pins by themselves.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    n : int
+        Number of vertices.
+    found : Edges
+        Of the triangles.
+    fixed : (k,) int64
+        The pins, each once.
+    target : (k, 2) float64
+        Where they are held.
+
+    Returns
+    -------
+    Diagnosis
+        With pins in one place, triangles whose three pins are not wound counterclockwise, edges between two pins that
+        meet others or a pin, and pins within a triangle of others. None of them proves nothing.
+    """
+    held = np.zeros(n, dtype=bool)
+    held[fixed] = True
+    where = np.zeros((n, 2))
+    where[fixed] = target
+    obstructions = [
+        *_shared_places(fixed, target),
+        *_wound_wrongly(F, held, where, found),
+        *_crossing(held, where, found, fixed),
+        *_covered(F, held, where, fixed),
+    ]
+    return Diagnosis(tuple(obstructions), ("the outline, which is free, was not looked at",))
+
+
+def _shared_places(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]:
+    order = np.lexsort((fixed, target[:, 1], target[:, 0]))
+    placed = target[order]
+    first = np.flatnonzero(np.concatenate([[True], (placed[1:] != placed[:-1]).any(axis=1)]))
+    for group in np.split(fixed[order], first[1:]):
+        if group.size > 1:
+            message = f"{named('Vertex', 'Vertices', group)} are held in one place."
+            yield Obstruction(Kind.PIN, Forbids.BIJECTIVE, message, vertices=group)
+
+
+def _wound_wrongly(F: IntArray, held: NDArray[np.bool_], where: FloatArray, found: Edges) -> Iterator[Obstruction]:
+    whole = np.flatnonzero(held[F].all(axis=1))
+    corners = F[whole]
+    sign = orientation(*(where[corners[:, k]] for k in range(3)))
+    n = len(held)
+    boundary = edge_keys(found.boundary[:, 0], found.boundary[:, 1], n)
+    for t, abc, s in zip(whole[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
+        sides = np.stack([abc, np.roll(abc, -1)], axis=1)
+        message = (
+            f"All vertices of {named('triangle', 'triangles', t[None])} are held, "
+            f"and their places {'invert' if s < 0 else 'flatten'} it."
+        )
+        split = sides[~np.isin(edge_keys(sides[:, 0], sides[:, 1], n), boundary)]
+        yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
+
+
+def _crossing(held: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: IntArray) -> Iterator[Obstruction]:
+    """Edges between pins that meet other such edges or other pins."""
+    inner, outer = (pairs[held[pairs].all(axis=1)] for pairs in (found.interior, found.boundary))
+    segments = np.concatenate([inner, outer, np.stack([fixed, fixed], axis=1)])
+    joined = len(inner) + len(outer)
+    if not joined:
+        return
+    pairs = contacts(where, segments, _MOST).pairs
+    # Two pins in one place are named elsewhere, and so are edges without length.
+    apart = (where[segments[:, 0]] != where[segments[:, 1]]).any(axis=1) | (np.arange(len(segments)) >= joined)
+    for i, j in pairs[(pairs[:, 0] < joined) & apart[pairs].all(axis=1)].tolist():
+        ends = segments[[i, j]]
+        other = named_edges(ends[1:]) if j < joined else named("vertex", "vertices", ends[1, :1])
+        message = f"Both ends of {named_edges(ends[:1])} are held, and the segment between them meets {other}."
+        split = ends[[k < len(inner) for k in (i, j)]]
+        kind = Kind.CHORD if len(split) else Kind.CROSSING
+        edges_ = ends if j < joined else ends[:1]
+        yield Obstruction(kind, Forbids.BIJECTIVE, message, vertices=np.unique(ends), edges=edges_, split=split)
+
+
+def _covered(F: IntArray, held: NDArray[np.bool_], where: FloatArray, fixed: IntArray) -> Iterator[Obstruction]:
+    """Pins inside a triangle that other pins hold."""
+    whole = np.flatnonzero(held[F].all(axis=1))
+    corners = where[F[whole]]
+    places = where[fixed]
+    for i, j in box_pairs_between(corners.min(axis=1), corners.max(axis=1), places, places):
+        sign = [orientation(corners[i, k], corners[i, k - 2], places[j]) for k in range(3)]
+        inside = (np.minimum.reduce(sign) > 0).nonzero()[0]
+        for t, pin in zip(whole[i[inside]].tolist(), fixed[j[inside]].tolist(), strict=True):
+            message = f"Vertex {pin} is held within triangle {t}, all of whose vertices are held, too."
+            yield Obstruction(
+                Kind.PIN, Forbids.BIJECTIVE, message, vertices=np.array([pin, *F[t]]), triangles=np.array([t])
+            )

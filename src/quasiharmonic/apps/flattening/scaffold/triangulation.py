@@ -1,0 +1,251 @@
+"""The plane around a flat surface as triangles of good shape: outside up to a frame, and inside the holes.
+
+As long as no triangle of surface and air is inverted, and the frame stays, the surface does not overlap itself. Air
+with points of its own gives way, where triangles that span a whole gap lock.
+
+    boundary ──lengths──▶ quadtree ──middles, not near an edge──▶ inner points ──constrained Delaunay──▶ triangles
+             ──▶ those of the surface's inside cut out ──▶ smoothed ──▶ air
+
+Nothing is added on the boundary. Where a gap is narrower than the edges around it, triangles span it: there is no other
+way without splitting edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, named
+
+# Side of a square of the tree over the length of an edge in it.
+_SPACING = 1.4
+# Inner points nearer to the boundary than this part of their square's side are left out.
+_CLEARANCE = 0.55
+# The frame's sides are bent outwards by this part of their length: corners of a hull are strictly convex.
+_BULGE = 0.05
+# Squares of the tree along the longer side of the frame, before any is split.
+_ACROSS = 8
+_SMOOTHINGS = 3
+_MEETS_ITSELF = "the boundary meets itself, and no air fits around it: certify(F, uv) names where"
+# Shapes above this, 1 being an equilateral triangle's, may get worse in smoothing.
+_GOOD = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Air:
+    """What is around a flat surface.
+
+    Attributes
+    ----------
+    points : (k, 2) float64
+        New points, which follow the surface's n vertices: they are vertices n … n + k - 1.
+    F : (a, 3) int64
+        Triangles between the surface's boundary vertices and the new points, counterclockwise.
+    frame : (h,) int64
+        Those new vertices that lie on the frame, counterclockwise.
+    """
+
+    points: FloatArray
+    F: IntArray
+    frame: IntArray
+
+
+def air_around(
+    F: ArrayLike,
+    uv: ArrayLike,
+    loops: Sequence[IntArray],
+    *,
+    margin: float = 0.5,
+    around: ArrayLike | None = None,
+) -> Air:
+    """Triangulate the plane around a flat surface, up to a frame, and its holes.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+        Triangles of the surface; only their vertices' number matters here.
+    uv : (n, 2) array
+        A map that is bijective, as `certify` decides it. Inner vertices are not looked at.
+    loops : sequence of (l,) int64
+        The boundary loops, the surface to their left (`quasiharmonic.geometry.mesh.topology.boundary_loops`).
+    margin : float
+        Distance of the frame, over the longer side of the boundary's box.
+    around : (p, 2) array, optional
+        Places that the frame is to be around, too, by the same margin.
+
+    Returns
+    -------
+    Air
+        Surface and air together, ``np.concatenate([F, air.F])``, are a triangle mesh whose only boundary is the frame.
+        Deterministic.
+
+    Raises
+    ------
+    ValueError
+        When the boundary meets itself, so that nothing could be around it, or ``margin`` is not positive.
+    """
+    if not 0 < margin < np.inf:
+        raise ValueError(f"margin must be positive, not {margin}")
+    places = np.asarray(uv, dtype=np.float64)
+    n, boundary = len(places), np.concatenate(loops)
+    # A power of two, so that no digit is lost on the way.
+    exponent = int(np.frexp(np.abs(places[boundary]).max())[1])
+    others = np.empty((0, 2)) if around is None else np.ldexp(np.asarray(around, dtype=np.float64), -exponent)
+    outline = np.ldexp(places[boundary], -exponent)
+    start = np.cumsum([0, *(len(loop) for loop in loops)])
+    heads = np.concatenate([np.roll(np.arange(*ends), -1) for ends in pairwise(start.tolist())])
+    segments = np.stack([np.arange(len(boundary)), heads], axis=1)
+
+    corner, side, shape = _squares(np.concatenate([outline, others]), margin)
+    frame = _frame(corner, side, shape)
+    inner = _inner_points(outline, outline[heads], corner, side, shape)
+    points, triangles = _conforming(outline, segments, frame, inner)
+    triangles = triangles[_outside(triangles, segments, len(points))]
+    points = _smoothed(points, triangles, len(outline) + len(frame))
+    # What was put within the surface, by misjudgement, has gone with its triangles.
+    used = np.unique(triangles[triangles >= len(outline)])
+    number = np.concatenate([boundary, np.zeros(len(points) - len(outline), dtype=np.int64)])
+    number[used] = n + np.arange(len(used))
+    air = Air(np.ldexp(points[used], exponent), number[triangles], number[len(outline) + np.arange(len(frame))])
+    bad = flipped_triangles(air.F, np.concatenate([places, air.points]))
+    if bad.size:
+        raise ValueError(f"the boundary is too near to itself for air, at {named('vertex', 'vertices', air.F[bad, 0])}")
+    return air
+
+
+def _squares(points: FloatArray, margin: float) -> tuple[FloatArray, float, tuple[int, int]]:
+    """Corner, side and numbers of the squares that cover the points' box and a margin around it."""
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    longer = float(extent.max())
+    side = (1 + 2 * margin) * longer / _ACROSS
+    across = np.ceil((extent + 2 * margin * longer) / side - 1e-9)
+    return low + (extent - side * across) / 2, side, (int(across[0]), int(across[1]))
+
+
+def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArray:
+    """A rectangle with bent sides, counterclockwise, a point for every square along it; (h, 2) float64."""
+    width, height = side * shape[0], side * shape[1]
+    frame = []
+    for start, along, outward, count in (
+        ((0.0, 0.0), (width, 0.0), (0, -1), shape[0]),
+        ((width, 0.0), (0.0, height), (1, 0), shape[1]),
+        ((width, height), (-width, 0.0), (0, 1), shape[0]),
+        ((0.0, height), (0.0, -height), (-1, 0), shape[1]),
+    ):
+        t = (np.arange(count) / count)[:, None]
+        bulge = 4 * _BULGE * np.hypot(*along) * t * (1 - t)
+        frame.append(corner + start + t * np.array(along) + bulge * np.array(outward))
+    return np.concatenate(frame)
+
+
+def _inner_points(
+    tails: FloatArray, heads: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
+) -> FloatArray:
+    """Points in the air, as dense as the boundary's edges are short, and not too near to these; (k, 2) float64."""
+    from scipy.spatial import KDTree
+
+    lengths = np.hypot(*(heads - tails).T)
+    tree = Quadtree.around(
+        np.concatenate([(tails + heads) / 2, tails]),
+        _SPACING * np.concatenate([lengths, lengths]),
+        corner,
+        side,
+        shape,
+    )
+    points, sizes = tree.points()
+    # In pieces no longer than half the squares that they are in, the nearest middle tells the nearest edge.
+    pieces = []
+    p, q = tails, heads
+    while len(p):
+        middle = (p + q) / 2
+        done = 2 * np.hypot(*(q - p).T) <= 1.01 * tree.sizes_at(middle)
+        pieces.append(np.stack([p[done], q[done]]))
+        p, q, middle = p[~done], q[~done], middle[~done]
+        p, q = np.concatenate([p, middle]), np.concatenate([middle, q])
+    p, q = np.concatenate(pieces, axis=1)
+    nearest = KDTree((p + q) / 2).query(points)[1]
+    p, q = p[nearest], q[nearest]
+    along, away = (q - p) @ (1, 1j), (points - p) @ (1, 1j)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        local = away / along
+    local = np.where(np.isfinite(local), local, 0)
+    distance = np.abs(local - np.clip(local.real, 0, 1)) * np.abs(along)
+    return points[(local.imag < 0) & (distance > _CLEARANCE * sizes)]
+
+
+def _conforming(
+    outline: FloatArray, segments: IntArray, frame: FloatArray, inner: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Triangulate all points with the segments as edges, without such inner points as lie on one."""
+    hull = len(outline) + np.arange(len(frame))
+    while True:
+        points = np.concatenate([outline, frame, inner])
+        try:
+            return points, constrained_delaunay(points, segments, hull)
+        except BlockedError as blocked:
+            at = blocked.point - len(outline) - len(frame)
+            if at < 0:
+                raise ValueError(_MEETS_ITSELF) from blocked
+            inner = np.delete(inner, at, axis=0)
+        except ValueError as error:
+            raise ValueError(_MEETS_ITSELF) from error
+
+
+def _outside(triangles: IntArray, segments: IntArray, n: int) -> BoolArray:
+    """Which triangles are on the right of the segments, (t,): those that can be reached without crossing one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    keys = edge_keys(tails, heads, n)
+    order = np.argsort(keys, kind="stable")
+    walls = edge_keys(segments[:, 0], segments[:, 1], n)
+    paired = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    open_ = paired[~np.isin(keys[order[paired]], walls)]
+    graph = coo_array((np.ones(open_.size), (order[open_] // 3, order[open_ + 1] // 3)), shape=2 * (len(triangles),))
+    label = connected_components(graph, directed=False)[1]
+    directed = np.sort(segments[:, 1] * n + segments[:, 0])
+    at = np.isin(tails * n + heads, directed)
+    return np.isin(label, np.unique(label[np.flatnonzero(at) // 3]))
+
+
+def _smoothed(points: FloatArray, triangles: IntArray, held: int) -> FloatArray:
+    """Move points, but the first ones, to the middle of their neighbours, where no triangle gets a worse shape."""
+    n = len(points)
+    tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    count = np.maximum(np.bincount(tails, minlength=n), 1)
+    best, shape = points, _shapes(points, triangles)
+    for _ in range(_SMOOTHINGS):
+        middle = np.stack([np.bincount(tails, best[heads, k], minlength=n) / count for k in range(2)], axis=1)
+        moved = best.copy()
+        moved[held:] = middle[held:]
+        idle = np.zeros(n, dtype=bool)
+        while True:
+            after = _shapes(moved, triangles)
+            worse = after < np.minimum(shape, _GOOD)
+            back = triangles[worse].ravel()
+            back = back[~idle[back]]
+            back = back[back >= held]
+            if not back.size:
+                break
+            idle[back] = True
+            moved[back] = best[back]
+        best, shape = moved, after
+    return best
+
+
+def _shapes(points: FloatArray, triangles: IntArray) -> FloatArray:
+    """Of triangles, 1 for equilateral ones, towards 0 for slivers, negative for inverted ones; (t,) float64."""
+    w = np.ascontiguousarray(points).view(np.complex128).ravel()
+    corners = w[triangles.T]
+    sides = (np.abs(corners - np.roll(corners, 1, axis=0)) ** 2).sum(axis=0)
+    return 4 * np.sqrt(3) * signed_areas(triangles, w) / sides

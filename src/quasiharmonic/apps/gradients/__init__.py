@@ -1,0 +1,20 @@
+"""Derivatives of maps: how a map moves as its target, its tensors or its surface do, and the transpose of that.
+
+The package builds on `energies` and `problem`. Start reading in `derivative`, then `polished`.
+"""
+
+from __future__ import annotations
+
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Gradients
+from quasiharmonic.apps.gradients.flattened import flatten_derivative
+from quasiharmonic.apps.gradients.polished import polish_derivative
+from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
+
+__all__ = [
+    "Derivative",
+    "Doubt",
+    "Gradients",
+    "flatten_derivative",
+    "polish_derivative",
+    "quasi_harmonic_derivative",
+]

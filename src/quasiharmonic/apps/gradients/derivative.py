@@ -1,0 +1,306 @@
+"""The derivative of a map: what its users hold in hands, whatever the map.
+
+A map w of a surface with rest positions z, tensors μ and held vertices at t solves equations ``R(w, t, z, μ) = 0`` at
+the vertices that may move: the forces there vanish. So with K the derivative of R by the unknowns
+
+    dw = −K⁻¹ (∂R/∂t dt + ∂R/∂z dz + ∂R/∂μ dμ),
+
+and for a function of the map with gradient c one solve ``K ℓ = c`` gives all of its gradients,
+``−(∂R/∂t)ᵀ ℓ`` and so on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property, partial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.gradients.forces import Felt, Forces
+from quasiharmonic.apps.gradients.gauge import Gauge
+from quasiharmonic.apps.gradients.strain import Strain
+from quasiharmonic.apps.gradients.tensor_forces import TensorForces
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_finite,
+    held_places,
+    map_array,
+    named,
+    real_array,
+    work,
+)
+
+
+class Doubt(Enum):
+    """Why a derivative may not be what differences of the map would show; the value is a sentence for the user."""
+
+    NEAR_SINGULAR = (
+        "The second derivative is singular but for rounding: there are other maps next to this one that are as good, "
+        "or it is about to leap to another."
+    )
+    NOT_LEAST = "The second derivative has a negative direction: the map is at rest, but another next to it is better."
+    NOT_AT_REST = (
+        "The map did not come to rest to rounding. The derivative is that of the forces that are left, which it takes "
+        "as staying what they are."
+    )
+    NEAR_COLLAPSE = "Triangles of the map are so thin that their rounding is a good part of them."
+    CONTACT = (
+        "The boundary leans on itself: without what keeps it apart the map would overlap itself. The derivative takes "
+        "that push as staying what it is."
+    )
+    SLIDING = (
+        "Vertices that slide rest at a kink or an end of their curve, and are taken as held there; a small change may "
+        "let them go."
+    )
+    CLIPPED = "Tensors are as far from isotropic as doubles allow, and do not follow μ any further."
+
+
+class Gradients:
+    """The gradients of one number that depends on a map, each computed when it is first asked for.
+
+    Attributes
+    ----------
+    target : (k, 2) float64
+        By the held vertices' places, in the order of ``fixed``.
+    rest : (n, d) float64
+        By the rest positions.
+    mu : (f,) complex128 or None
+        By the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``, of a map that has them.
+    """
+
+    def __init__(
+        self,
+        target: Callable[[], FloatArray],
+        rest: Callable[[], FloatArray],
+        mu: Callable[[], ComplexArray | None],
+    ) -> None:
+        self._target, self._rest, self._mu = target, rest, mu
+
+    @cached_property
+    def target(self) -> FloatArray:
+        """By the held vertices' places."""
+        return self._target()
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """By the rest positions."""
+        return self._rest()
+
+    @cached_property
+    def mu(self) -> ComplexArray | None:
+        """By the Beltrami coefficients."""
+        return self._mu()
+
+
+class Inverse(Protocol):
+    """The inverse of the derivative of forces by what may move; symmetric."""
+
+    def solve(self, load: ComplexArray) -> ComplexArray:
+        """The displacement (n,) of all vertices under a load (n,); zero where nothing may move."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """A factor s between the scale of a map and that of its surface, which both have a part in.
+
+    Attributes
+    ----------
+    by_places : (n,) complex128
+        Derivative of log s by the map.
+    by_rest : (n, d) float64
+        By the rest positions.
+    """
+
+    by_places: ComplexArray
+    by_rest: FloatArray
+
+    def change(self, dw: ComplexArray, dV: FloatArray) -> float:
+        """The change of log s."""
+        return work(self.by_places, dw) + float(np.sum(self.by_rest * dV))
+
+
+class Derivative:
+    """How a map moves with what it depends on, to first order.
+
+    Made by `quasi_harmonic_derivative`, `polish_derivative` and `flatten_derivative`. What is expensive, a
+    factorisation, is done by then: `jvp` and `vjp` take one solve each. Threads may share a derivative.
+
+    Attributes
+    ----------
+    uv : (n, 2) float64
+        The map: as it was given, but for what it lacked of being at rest to rounding. Polished and flattened maps are
+        injective, decided exactly.
+    doubts : tuple of Doubt
+        Why not to rely on the derivative; empty as a rule.
+    """
+
+    def __init__(
+        self,
+        uv: FloatArray,
+        *,
+        fixed: IntArray,
+        forces: Forces,
+        inverse: Inverse,
+        strain: Callable[[], Strain] | None,
+        rest_shape: tuple[int, ...],
+        doubts: Iterable[Doubt] = (),
+        unit: float = 1.0,
+        on_curves: IntArray | None = None,
+        scale: Scale | None = None,
+        gauge: Gauge | None = None,
+        tensors: TensorForces | None = None,
+    ) -> None:
+        self.uv = uv
+        self.uv.flags.writeable = False
+        self.doubts = tuple(doubts)
+        self._fixed, self._forces, self._inverse = fixed, forces, inverse
+        self._make_strain, self._rest_shape, self._unit = strain, rest_shape, unit
+        self._follows = np.ones(fixed.size, dtype=bool) if on_curves is None else ~np.isin(fixed, on_curves)
+        self._scale, self._gauge, self._tensors = scale, gauge, tensors
+
+    @cached_property
+    def _strain(self) -> Strain | None:
+        return None if self._make_strain is None else self._make_strain()
+
+    @property
+    def reliable(self) -> bool:
+        """Whether there are no doubts."""
+        return not self.doubts
+
+    def jvp(
+        self, *, target: ArrayLike | None = None, rest: ArrayLike | None = None, mu: ArrayLike | None = None
+    ) -> FloatArray:
+        """How the map moves as what it depends on does.
+
+        Parameters
+        ----------
+        target : (k, 2) array, optional
+            Of the held vertices' places, in the order of ``fixed``. Boundary vertices that slide, or are at corners of
+            their curves, are where the curves say: theirs do not count.
+        rest : (n, 2) or (n, 3) array, optional
+            Of the rest positions.
+        mu : (f,) array, optional
+            Of the Beltrami coefficients, of a map that has them.
+
+        Returns
+        -------
+        (n, 2) float64
+
+        Raises
+        ------
+        ValueError
+            When one of them has another shape or is not finite, or ``mu`` is given for a map without tensors.
+        """
+        n, forces = len(self.uv), self._forces
+        held = np.zeros(n, dtype=np.complex128)
+        load = np.zeros(n, dtype=np.complex128)
+        moved = np.zeros(self._rest_shape)
+        if target is not None:
+            places = as_complex(held_places(target, self._fixed.size)) / self._unit
+            held[self._fixed[self._follows]] = places[self._follows]
+            load += forces.by_places(held)
+        if rest is not None:
+            moved = self._rest_positions(rest)
+            if self._strain is not None:
+                load += forces.by_strain(*self._strain.of(moved))
+        if mu is not None:
+            if self._tensors is None:
+                raise ValueError("mu: only a quasi-harmonic map is a map of tensors")
+            load += self._tensors.by_mu(forces, self._checked_mu(mu))
+        more = 0.0 if self._scale is None else self._scale.change(held, moved)
+        if self._scaled:
+            load += more * forces.by_scale
+        dw = held - self._inverse.solve(load)
+        if self._gauge is not None:
+            dw = self._gauge.fixed(dw, held, more)
+        return as_rows(self._unit * dw)
+
+    def vjp(self, cotangent: ArrayLike) -> Gradients:
+        """The gradients of a function of the map, by what the map depends on.
+
+        Parameters
+        ----------
+        cotangent : (n, 2) array
+            The function's gradient by the map's positions.
+
+        Returns
+        -------
+        Gradients
+
+        Raises
+        ------
+        ValueError
+            When the cotangent has another shape or is not finite.
+        """
+        pull = self._unit * as_complex(map_array("cotangent", cotangent, len(self.uv)))
+        on_pin, on_scale = 0j, 0.0
+        if self._gauge is not None:
+            pull, on_pin, on_scale = self._gauge.pulled(pull)
+        response = self._inverse.solve(pull)
+        felt = self._forces.felt(response)
+        if self._scaled:
+            on_scale -= work(self._forces.by_scale, response)
+        return Gradients(
+            partial(self._by_target, pull, felt, on_pin, on_scale),
+            partial(self._by_rest, felt, on_scale),
+            partial(self._by_mu, felt),
+        )
+
+    @property
+    def _scaled(self) -> bool:
+        """Whether the forces depend on the scale between map and surface."""
+        return self._scale is not None and self._gauge is None
+
+    def _by_target(self, pull: ComplexArray, felt: Felt, on_pin: complex, on_scale: float) -> FloatArray:
+        by_places = pull - self._forces.gathered(felt.hp, felt.hq)
+        if self._scale is not None:
+            by_places += on_scale * self._scale.by_places
+        if self._gauge is not None and self._gauge.pin is not None:
+            by_places[self._gauge.pin] += on_pin
+        by_held = by_places[self._fixed] / self._unit
+        by_held[~self._follows] = 0
+        return as_rows(by_held)
+
+    def _by_rest(self, felt: Felt, on_scale: float) -> FloatArray:
+        out = np.zeros(self._rest_shape)
+        if self._strain is not None:
+            out -= self._strain.pull(*self._forces.strain_of(felt))
+        if self._scale is not None:
+            out += on_scale * self._scale.by_rest
+        return out
+
+    def _by_mu(self, felt: Felt) -> ComplexArray | None:
+        return None if self._tensors is None else -self._tensors.of(self._forces, felt)
+
+    def _rest_positions(self, rest: ArrayLike) -> FloatArray:
+        moved = real_array("rest", rest)
+        if moved.shape != self._rest_shape:
+            raise ValueError(f"rest must have shape {self._rest_shape}, as the rest positions have, not {moved.shape}")
+        check_finite("rest", "vertex", "vertices", moved)
+        return moved
+
+    def _checked_mu(self, mu: ArrayLike) -> ComplexArray:
+        array, f = np.asarray(mu), self._forces.share.size
+        if array.shape != (f,) or array.dtype.kind not in "iufc":
+            raise ValueError(f"mu must hold {f} numbers, one a triangle, not {array.dtype} of shape {array.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(
+                f"mu is not finite at {named('triangle', 'triangles', np.flatnonzero(~np.isfinite(array)))}"
+            )
+        return array.astype(np.complex128)
+
+
+def as_complex(rows: FloatArray) -> ComplexArray:
+    """Places (n, 2) as complex numbers (n,)."""
+    return np.ascontiguousarray(rows).view(np.complex128).ravel()
+
+
+def as_rows(w: ComplexArray) -> FloatArray:
+    """Complex numbers (n,) as places (n, 2)."""
+    return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)

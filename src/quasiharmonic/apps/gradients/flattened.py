@@ -1,0 +1,139 @@
+"""The derivative of maps that have been flattened: boundary free, some vertices held or none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Scale, as_rows
+from quasiharmonic.apps.gradients.freedom import Freedom
+from quasiharmonic.apps.gradients.gauge import Gauge
+from quasiharmonic.apps.gradients.minimum import Minimum
+from quasiharmonic.apps.gradients.polished import NOT_FOUND, log_surface, placed, surface_strain
+from quasiharmonic.energies.deformation import DeformationEnergy, positive_weights, signed_areas
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.polishing import energy_named, injective_array
+from quasiharmonic.geometry.exact.loops import judge_loops
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.problem import Domain
+from quasiharmonic.util.arrays import ComplexArray, IntArray
+
+# Energies are equal if they differ by no more than this part of them, as `flattening.piece` has it.
+_SAME = 1e-6
+
+
+@takes_mesh
+@takes_mesh
+def flatten_derivative(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    fixed: ArrayLike = (),
+    energy: str | Energy = "symmetric-dirichlet",
+    weights: ArrayLike | None = None,
+    linear_solver: str = "auto",
+) -> Derivative:
+    """Bring a flattened map to rest to rounding, and differentiate it by held places and rest positions.
+
+    Parameters
+    ----------
+    V, F, fixed, energy, weights, linear_solver
+        As `quasiharmonic.flatten` had them, but for ``"distances"``; one connected surface.
+    uv : (n, 2) array
+        The flattened map, ``fixed`` where they are held.
+
+    Returns
+    -------
+    Derivative
+        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``. With no vertex held it is that
+        which lies nearest to ``uv`` (`quasiharmonic.apps.gradients.gauge`), wherever `flatten` would lay it: use it for
+        what does not depend on where the map lies. With one held the map may turn about it, and the same is so.
+
+    Raises
+    ------
+    ValueError
+        As `quasiharmonic.flatten`; when there are several surfaces; when ``uv`` is not injective: of a map that was not
+        found there is no derivative.
+
+    Examples
+    --------
+    The area of a flattened cap grows twice as fast as the cap does:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import flatten
+    >>> from quasiharmonic.surfaces import disk
+    >>> square, F = disk(6)
+    >>> V = np.column_stack([square, 0.3 * (square**2).sum(axis=1)])
+    >>> derivative = flatten_derivative(V, F, flatten(V, F).uv)
+    >>> from quasiharmonic.energies.deformation import signed_areas
+    >>> area = lambda uv: signed_areas(F, uv @ (1, 1j)).sum()
+    >>> growth = derivative.jvp(rest=V)
+    >>> change = area(derivative.uv + 1e-6 * growth) / area(derivative.uv) - 1
+    >>> bool(abs(change - 2e-6) < 1e-9)
+    True
+    """
+    domain = Domain(V, F, fixed)
+    chosen = energy_named(energy)
+    start = injective_array(domain, uv, NOT_FOUND)
+    strain = surface_strain(domain)
+    exponent = int(np.frexp(np.abs(domain.V).max())[1])
+    w = in_units(start, exponent)
+    measure = DeformationEnergy(
+        np.ldexp(domain.V, -exponent),
+        domain.F,
+        chosen,
+        weights=None if weights is None else positive_weights(weights, len(domain.F)),
+    )
+    gauge = _gauge(measure, w, domain)
+    if gauge is not None and gauge.keeps_area:
+        # At rest at some scale, and then at the surface's own.
+        w = _minimum(measure, w, gauge, domain.fixed, linear_solver).w
+        size = float(strain.m.sum()) * 4.0**-exponent
+        w = (w - w.mean()) * np.sqrt(size / signed_areas(domain.F, w).sum()) + w.mean()
+    minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver), []
+    if _overlaps(domain, minimum.w) and not _overlaps(domain, w):
+        minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver, settle=False), [Doubt.CONTACT]
+    return Derivative(
+        placed(minimum.w, exponent, domain.fixed, start),
+        fixed=domain.fixed,
+        forces=minimum.forces,
+        inverse=minimum,
+        strain=lambda: strain,
+        rest_shape=domain.V.shape,
+        doubts=[*doubts, *minimum.doubts],
+        unit=2.0**exponent,
+        scale=Scale(np.zeros_like(w), log_surface(strain)) if gauge is not None and gauge.keeps_area else None,
+        gauge=None if gauge is None else replace(gauge, w=minimum.w),
+    )
+
+
+def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:
+    """What the map may do at no cost."""
+    if domain.fixed.size > 1:
+        return None
+    here, doubled = measure.value(w), measure.value(2 * w)
+    pin = int(domain.fixed[0]) if domain.fixed.size else None
+    return Gauge(w, pin, abs(doubled - here) <= _SAME * here, domain.loops)
+
+
+def _minimum(
+    measure: DeformationEnergy,
+    w: ComplexArray,
+    gauge: Gauge | None,
+    fixed: IntArray,
+    linear_solver: str,
+    *,
+    settle: bool = True,
+) -> Minimum:
+    sliding, tangent = None, None
+    if gauge is not None:
+        fixed, sliding, tangent = replace(gauge, w=w).fixing()
+    return Minimum(measure, w, Freedom(measure, w.size, fixed, linear_solver, sliding, tangent), settle=settle)
+
+
+def _overlaps(domain: Domain, w: ComplexArray) -> bool:
+    return bool(judge_loops(domain.loops, as_rows(w))[1])

@@ -1,0 +1,222 @@
+"""Where the vertices of a map may go: anywhere, nowhere, along a line that fixes the gauge, or along curves.
+
+Unknowns are those of `SlidingSystem`: both coordinates of a free vertex, the way along its tangent of one that slides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.sliding import SlidingSystem
+from quasiharmonic.geometry.curves.boundary_curves import Track
+from quasiharmonic.geometry.curves.deviation import Straying
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+# Of the energy, the weight of the barrier that keeps a boundary near its curves: as `energy.sliding` has it.
+_WEIGHT = 1e-2
+# Of a curve's length, the step over which the barrier's slopes are differenced.
+_STEP = 1e-6
+
+
+class Freedom:
+    """Vertices that are held, vertices that keep to lines through where they are, and all others.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+    n : int
+        Number of vertices.
+    fixed : (k,) int64
+        Vertices that stay.
+    linear_solver : str
+    sliding : (l,) int64
+        Vertices that keep to lines.
+    tangent : (l,) complex128
+        The lines' directions, of length 1.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        Its matrix is by the unknowns.
+    resting : bool
+        Whether a vertex that slides is held where it is.
+    """
+
+    resting = False
+
+    def __init__(
+        self,
+        energy: DeformationEnergy,
+        n: int,
+        fixed: IntArray,
+        linear_solver: str,
+        sliding: IntArray | None = None,
+        tangent: ComplexArray | None = None,
+    ) -> None:
+        self._n = n
+        self.sliding = np.zeros(0, dtype=np.int64) if sliding is None else sliding
+        self.system = SlidingSystem(energy.F, energy.g, n, fixed, linear_solver, sliding=self.sliding)
+        if tangent is not None:
+            self.system.tangent = tangent
+
+    def extra(self) -> float:
+        """What is minimised beside the energy, where the vertices are."""
+        return 0.0
+
+    def aim(self, pull: ComplexArray) -> None:
+        """Get ready for the forces (n,) of the map at hand."""
+
+    def gathered(self, load: ComplexArray) -> ComplexArray:
+        """Loads (n,) on the unknowns; of a vertex that slides the real part, and the imaginary one is zero."""
+        system = self.system
+        out = load[system.free]
+        out[system.at] = (system.tangent.conj() * out[system.at]).real
+        return out
+
+    def slopes(self, pull: ComplexArray) -> ComplexArray:
+        """The derivative by the unknowns of all that is minimised, from the forces (n,)."""
+        return self.gathered(pull)
+
+    def spread(self, step: ComplexArray) -> ComplexArray:
+        """Displacements (n,) of the vertices under a step of the unknowns, to first order."""
+        out = np.zeros(self._n, dtype=np.complex128)
+        out[self.system.free] = step
+        out[self.sliding] = self.system.tangent * step[self.system.at].real
+        return out
+
+    def moved(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
+        """The map after a step of the unknowns, None where it cannot be taken."""
+        return w + self.spread(step)
+
+    def keep(self) -> None:
+        """Stay where the last step that was tried has led."""
+
+
+class OnCurves(Freedom):
+    """Boundary vertices that slide along curves, as in `quasiharmonic.polish`.
+
+    The barrier that keeps the boundary's edges near the curves has the bounds and the weight that a polish begun here
+    would give it, and keeps them.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+    track : Track
+    fixed : (k,) int64
+        Held vertices, with or without those that slide.
+    loops : sequence of (l,) int64
+        The boundary.
+    exponent : int
+        The map is in units of ``2 ** exponent``.
+    linear_solver : str
+    """
+
+    def __init__(
+        self,
+        energy: DeformationEnergy,
+        track: Track,
+        fixed: IntArray,
+        loops: Sequence[IntArray],
+        exponent: int,
+        linear_solver: str,
+    ) -> None:
+        held = np.setdiff1d(fixed, track.vertices)
+        super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
+        self._track, self._s, self._there = track, track.s, track.s
+        self._straying, self._unit = Straying(track, loops, exactly=True), 2.0**exponent
+        self._weight = _WEIGHT * energy.value(in_units(track.uv, exponent))
+        self._both = (self._straying.pairs >= 0).all(axis=1)
+        self.system.couple(self._straying.pairs[self._both])
+
+    def extra(self) -> float:
+        """The barrier, where the last step that was tried has led."""
+        return self._weight * self._straying.value(self._there)
+
+    def aim(self, pull: ComplexArray) -> None:
+        s, at, system = self._s, pull[self.sliding], self.system
+        kink = self._track.at_kink(s)
+        ahead, curvature = self._track.frame(s, np.ones(s.size, dtype=bool))
+        back, curvature_back = self._track.frame(s, ~kink)
+        self._slopes = self._barrier_slopes(s)
+        slope, slope_back = (_along(tangent, at) + self._slopes for tangent in (ahead, back))
+        turned = kink & (slope_back > np.maximum(-slope, 0))
+        rests: BoolArray = kink & (slope >= 0) & (slope_back <= 0)
+        self.resting = bool(rests.any())
+        tangent: ComplexArray = np.where(rests, 0, np.where(turned, back, ahead))
+        system.tangent = tangent
+        # Only to the side that it falls to may a vertex leave a kink.
+        self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
+        system.bend = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
+        bends = self._barrier_bends(s)
+        for end in (0, 1):
+            number = self._straying.pairs[:, end]
+            np.add.at(system.bend, number[number >= 0], bends[number >= 0, end, end])
+        both = (tangent[self._straying.pairs[self._both]] != 0).all(axis=1)
+        system.coupling = np.where(both, bends[self._both, 0, 1], 0)
+
+    def slopes(self, pull: ComplexArray) -> ComplexArray:
+        out = self.gathered(pull)
+        out[self.system.at] += np.where(self.system.tangent == 0, 0, self._slopes)
+        return out
+
+    def moved(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
+        along = step[self.system.at].real
+        along = np.where(along * self._side < 0, 0, along)
+        there = self._track.moved(self._s, self._unit * along)
+        if not self._track.in_order(there):
+            return None
+        self._there = there
+        out = w + self.spread(step)
+        exponent = round(np.log2(self._unit))
+        out[self.sliding] = in_units(self._track.position(there), exponent)
+        return out
+
+    def keep(self) -> None:
+        self._s = self._there
+
+    def _by_edges(self, s: FloatArray) -> FloatArray:
+        """The barrier's slopes by the lengths at each edge's ends, in units; (e, 2)."""
+        return self._weight * self._unit * self._straying.derivatives(s)[0]
+
+    def _barrier_slopes(self, s: FloatArray) -> FloatArray:
+        """The barrier's slopes by the lengths of the vertices that slide, in units; (l,)."""
+        out, by_edges = np.zeros(s.size), self._by_edges(s)
+        for end in (0, 1):
+            number = self._straying.pairs[:, end]
+            np.add.at(out, number[number >= 0], by_edges[number >= 0, end])
+        return out
+
+    @cached_property
+    def _colours(self) -> IntArray:
+        """Three kinds of vertices that slide, such that no edge has two of a kind."""
+        colours = np.arange(self._s.size) % 2
+        one, other = self._straying.pairs[self._both].T
+        colours[other[colours[one] == colours[other]]] = 2
+        return colours
+
+    def _barrier_bends(self, s: FloatArray) -> FloatArray:
+        """Its second derivatives edge by edge, (e, 2, 2): those of `Straying` leave out what Gauss and Newton do."""
+        pairs = self._straying.pairs
+        out = np.zeros((len(pairs), 2, 2))
+        lengths = np.array([chain.curve.length for chain in self._track.chains for _ in range(chain.sliding.sum())])
+        step = _STEP * lengths / max(s.size, 1)
+        for colour in range(3):
+            change = np.where(self._colours == colour, step, 0.0)
+            if not change.any():
+                continue
+            ahead, behind = (self._by_edges(self._track.moved(s, way * change)) for way in (1, -1))
+            for end in (0, 1):
+                those = np.flatnonzero((pairs[:, end] >= 0) & (change[pairs[:, end]] > 0))
+                width = 2 * change[pairs[those, end]] / self._unit
+                out[those, :, end] = (ahead - behind)[those] / width[:, None]
+        return 0.5 * (out + out.swapaxes(1, 2))
+
+
+def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
+    """Components of vectors along unit tangents."""
+    return tangent.real * vector.real + tangent.imag * vector.imag

@@ -1,0 +1,325 @@
+"""Maps as functions of arrays, for the frameworks that differentiate programs: many problems at a time, forth and back.
+
+What PyTorch and JAX each need is thin; what they have in common is here. An argument has the shape of one problem's, or
+that with further axes in front, over which it is a batch; batches go together as NumPy broadcasts them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.gradients.derivative import Derivative
+from quasiharmonic.apps.gradients.flattened import flatten_derivative
+from quasiharmonic.apps.gradients.polished import polish_derivative
+from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import MapResult
+from quasiharmonic.solver.search.solving import solve
+from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, real_array
+
+#: Of one argument: what a framework hands over, as NumPy has it.
+Array = NDArray[Any]
+
+
+class MapNotFound(ValueError):  # noqa: N818  what it says is what happened
+    """No injective map was found, so that there is nothing to differentiate.
+
+    Attributes
+    ----------
+    result : MapResult
+        What there is instead, with its status and diagnosis.
+    """
+
+    def __init__(self, result: MapResult) -> None:
+        super().__init__(f"no injective map was found ({result.status.name.lower()}): {result.status.value}")
+        self.result = result
+
+
+class DoubtfulDerivative(UserWarning):
+    """A gradient has been asked for that its derivative has `Doubt` about."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layer(ABC):
+    """A map as a function of arrays. Layers that do the same are equal: programs are compiled once for them."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and isinstance(other, Layer) and self._settings == other._settings
+
+    def __hash__(self) -> int:
+        return hash(self._settings)
+
+    @cached_property
+    def _settings(self) -> tuple[Any, ...]:
+        """What it was made of: arrays, numbers and words by what they hold, problems, energies and rails themselves."""
+        found: list[Any] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                found.append((value.shape, value.tobytes()))
+            else:
+                found.append(value if isinstance(value, str | bool | tuple | None) else id(value))
+        return tuple(found)
+
+    @property
+    @abstractmethod
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        """The shapes of one problem's arguments, by name."""
+
+    @property
+    def places(self) -> tuple[int, int]:
+        """The shape (n, 2) of one problem's map."""
+        return self.shapes["rest"][0], 2
+
+    @abstractmethod
+    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
+        """Find one problem's map, or take it as it was found before, and make its derivative.
+
+        Raises
+        ------
+        MapNotFound
+            When there is none.
+        """
+
+    def batch(self, arrays: Mapping[str, Array]) -> tuple[int, ...]:
+        """The axes over which arguments are a batch together.
+
+        Raises
+        ------
+        ValueError
+            When batches do not go together.
+        """
+        leads = {name: array.shape[: array.ndim - len(self.shapes[name])] for name, array in arrays.items()}
+        try:
+            return np.broadcast_shapes(*leads.values())
+        except ValueError:
+            batches = ", ".join(f"{name} {tuple(lead)}" for name, lead in leads.items())
+            raise ValueError(f"batches must go together as NumPy broadcasts them, not {batches}") from None
+
+    def item(self, arrays: Mapping[str, Array], item: tuple[int, ...]) -> dict[str, Array]:
+        """The arguments of one problem of the batch."""
+        own = {}
+        for name, array in arrays.items():
+            lead = array.shape[: array.ndim - len(self.shapes[name])]
+            own[name] = array[
+                tuple(0 if size == 1 else i for i, size in zip(item[len(item) - len(lead) :], lead, strict=True))
+            ]
+        return own
+
+
+@dataclass(frozen=True, eq=False)
+class TensorLayer(Layer):
+    """`quasiharmonic.quasi_harmonic_map` as a function of ``mu``, ``target`` and ``rest``."""
+
+    problem: Problem
+    reference: Reference
+    linear_solver: str
+
+    @cached_property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        problem = self.problem
+        return {"mu": (len(problem.F),), "target": problem.target.shape, "rest": problem.V.shape}
+
+    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
+        problem = posed(self.problem, arrays)
+        return quasi_harmonic_derivative(
+            problem, arrays.get("mu"), reference=self.reference, linear_solver=self.linear_solver
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PolishedLayer(Layer):
+    """`quasiharmonic.solve` with a polish, as a function of ``target`` and ``rest``."""
+
+    problem: Problem
+    polish: str | Energy
+    slide: bool | Rails
+    start: FloatArray | None
+    linear_solver: str
+
+    @cached_property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        return {"target": self.problem.target.shape, "rest": self.problem.V.shape}
+
+    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
+        problem = posed(self.problem, arrays)
+        if uv is None:
+            found = solve(
+                problem, polish=self.polish, slide=self.slide, start=self.start, linear_solver=self.linear_solver
+            )
+            uv = _found(found)
+        return polish_derivative(
+            problem.V,
+            problem.F,
+            uv,
+            fixed=problem.fixed,
+            energy=self.polish,
+            slide=self.slide,
+            linear_solver=self.linear_solver,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FlattenLayer(Layer):
+    """`quasiharmonic.flatten` as a function of ``rest`` and, where vertices are held, ``target``."""
+
+    F: IntArray
+    vertices: tuple[int, int]
+    fixed: IntArray | None
+    energy: str | Energy
+    weights: FloatArray | None
+    start: FloatArray | None
+    linear_solver: str
+
+    @classmethod
+    def of(
+        cls,
+        rest: Any,
+        F: ArrayLike,
+        fixed: ArrayLike | None,
+        target: Any,
+        *,
+        energy: str | Energy,
+        weights: ArrayLike | None,
+        start: ArrayLike | None,
+        solver: str,
+    ) -> FlattenLayer:
+        """From what a caller hands over; of ``rest`` and ``target``, a framework's own arrays, little is looked at."""
+        if (fixed is None) != (target is None):
+            raise ValueError("fixed and target belong together: vertices that are held, and where")
+        shape = tuple(getattr(rest, "shape", ()))
+        if len(shape) < 2 or shape[-1] not in (2, 3):
+            raise ValueError(f"rest must have shape (n, 2) or (n, 3), or that with a batch in front, not {shape}")
+        return cls(
+            index_array("F", F),
+            (shape[-2], shape[-1]),
+            None if fixed is None else index_array("fixed", fixed),
+            energy,
+            None if weights is None else real_array("weights", weights),
+            None if start is None else real_array("start", start),
+            solver,
+        )
+
+    @cached_property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        held = {} if self.fixed is None else {"target": (self.fixed.size, 2)}
+        return {"rest": self.vertices, **held}
+
+    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
+        options: dict[str, Any] = {
+            "energy": self.energy,
+            "weights": self.weights,
+            "linear_solver": self.linear_solver,
+        }
+        V, target = arrays["rest"], arrays.get("target")
+        if uv is None:
+            uv = _found(flatten(V, self.F, fixed=self.fixed, target=target, start=self.start, **options))
+        held = () if self.fixed is None else self.fixed
+        return flatten_derivative(V, self.F, uv, fixed=held, **options)
+
+
+def posed(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
+    """A problem with a target and rest positions of a batch's, where there are such."""
+    target, V = arrays.get("target", problem.target), arrays.get("rest", problem.V)
+    if np.array_equal(V, problem.V):
+        return problem.moved(target)
+    return Problem(V, problem.F, problem.fixed, target, reference=problem.reference)
+
+
+def forth(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray, list[Derivative]]:
+    """The maps of a batch of problems (…, n, 2), and their derivatives.
+
+    Parameters
+    ----------
+    layer : Layer
+    arrays : mapping of str to array
+        The arguments that there are, by name.
+
+    Raises
+    ------
+    MapNotFound, ValueError
+        As one of the problems does, with a note that says which.
+    """
+    lead = layer.batch(arrays)
+    uv, derivatives = np.empty((*lead, *layer.places)), []
+    for item in np.ndindex(lead):
+        try:
+            derivative = layer.derivative(layer.item(arrays, item))
+        except ValueError as error:
+            if lead:
+                error.add_note(f"This is item {', '.join(map(str, item))} of the batch.")
+            raise
+        uv[item] = derivative.uv
+        derivatives.append(derivative)
+    return uv, derivatives
+
+
+def back(
+    layer: Layer, derivatives: Sequence[Derivative], cotangent: FloatArray, wanted: Sequence[str]
+) -> dict[str, Array]:
+    """The gradients of a function of the maps (…, n, 2), by name, each with the whole batch's axes.
+
+    Warns
+    -----
+    DoubtfulDerivative
+        When a derivative has doubts.
+    """
+    lead = cotangent.shape[:-2]
+    out: dict[str, Array] = {
+        name: np.empty((*lead, *layer.shapes[name]), dtype=np.complex128 if name == "mu" else np.float64)
+        for name in wanted
+    }
+    for item, derivative in zip(np.ndindex(lead), derivatives, strict=True):
+        _warn(derivative, item)
+        gradients = derivative.vjp(cotangent[item])
+        for name in wanted:
+            out[name][item] = getattr(gradients, name)
+    return out
+
+
+def along(
+    layer: Layer, derivatives: Sequence[Derivative], lead: tuple[int, ...], tangents: Mapping[str, Array]
+) -> FloatArray:
+    """How the maps of a batch move (…, n, 2) as arguments do."""
+    out = np.empty((*lead, *layer.places))
+    for item, derivative in zip(np.ndindex(lead), derivatives, strict=True):
+        _warn(derivative, item)
+        out[item] = derivative.jvp(**layer.item(tangents, item))
+    return out
+
+
+def summed(gradient: Array, shape: tuple[int, ...]) -> Array:
+    """A gradient with a batch's axes, summed over those that the argument has not, or has but one of."""
+    gradient = gradient.sum(axis=tuple(range(gradient.ndim - len(shape))))
+    short = tuple(i for i, size in enumerate(shape) if size == 1 and gradient.shape[i] != 1)
+    return np.asarray(gradient.sum(axis=short, keepdims=True) if short else gradient)
+
+
+def expected(name: str, shape: tuple[int, ...], one: tuple[int, ...]) -> None:
+    """Raise a ValueError for an argument that is neither one problem's nor a batch of such."""
+    if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
+        raise ValueError(f"{name} must have shape {one}, or that with a batch in front, not {tuple(shape)}")
+
+
+def _found(result: MapResult) -> FloatArray:
+    if not result.injective:
+        raise MapNotFound(result)
+    return result.uv
+
+
+def _warn(derivative: Derivative, item: tuple[int, ...]) -> None:
+    for doubt in derivative.doubts:
+        which = f"item {', '.join(map(str, item))}: " if item else ""
+        warnings.warn(f"{which}{doubt.value}", DoubtfulDerivative, stacklevel=4)

@@ -1,0 +1,135 @@
+"""The derivative of maps that have been polished: boundary held, or sliding along curves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.gradients.derivative import Derivative, Scale, as_rows
+from quasiharmonic.apps.gradients.freedom import Freedom, OnCurves
+from quasiharmonic.apps.gradients.gauge import log_size
+from quasiharmonic.apps.gradients.minimum import Minimum
+from quasiharmonic.apps.gradients.strain import RestStrain
+from quasiharmonic.energies.deformation import positive_weights
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.sliding import lay_boundary
+from quasiharmonic.energies.polishing import at_own_scale, energy_named, injective_array
+from quasiharmonic.geometry.curves.boundary_curves import Rails, Track
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.problem import Domain
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+
+#: Why a map must be injective.
+NOT_FOUND = "there is no derivative of a map that was not found"
+
+
+@takes_mesh
+@takes_mesh
+def polish_derivative(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    fixed: ArrayLike,
+    energy: str | Energy = "symmetric-dirichlet",
+    weights: ArrayLike | None = None,
+    linear_solver: str = "auto",
+    slide: bool | Rails = False,
+) -> Derivative:
+    """Bring a polished map to rest to rounding, and differentiate it by held places and rest positions.
+
+    Parameters
+    ----------
+    V, F, fixed, energy, weights, linear_solver, slide
+        As `quasiharmonic.polish` had them.
+    uv : (n, 2) array
+        The polished map.
+
+    Returns
+    -------
+    Derivative
+        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``.
+
+    Raises
+    ------
+    ValueError
+        As `quasiharmonic.polish`, and as there when ``uv`` is not injective: of a map that was not found there is no
+        derivative.
+
+    Notes
+    -----
+    By implicit differentiation, with the second derivative as it is. An energy of one's own may depend on the rest
+    positions through p and q alone. Where the boundary slides, its curves do not change, nor does the scale of the
+    map; the barrier that keeps edges near curves that are not straight (`quasiharmonic.geometry.curves.deviation`) has
+    the bounds and the weight that it would have in a polish begun at ``uv``, and is taken as keeping them: along such
+    curves derivatives are as a rule good to half a percent and not to rounding, without a doubt that says so. A disk
+    that slides around on a circle, with no vertex pinned, may turn at will, and its derivative is doubtful.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import polish
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(6)
+    >>> rim = np.arange(len(V) - 36, len(V))
+    >>> derivative = polish_derivative(V, F, polish(V, F, V, fixed=rim).uv, fixed=rim)
+    >>> gradients = derivative.vjp(derivative.uv)  # of half the sum of the squares of all places
+    >>> gradients.target.shape, gradients.rest.shape, derivative.reliable
+    ((36, 2), (127, 2), True)
+    """
+    domain = Domain(V, F, fixed)
+    domain.check_boundary_fixed()
+    chosen = energy_named(energy)
+    start = injective_array(domain, uv, NOT_FOUND)
+    track = lay_boundary(slide, domain, start) if slide is not False else None
+    if track is not None:
+        start = track.uv
+    counts = None if weights is None else positive_weights(weights, len(domain.F))
+    measure, exponent = at_own_scale(domain, start, chosen, counts)
+    w = in_units(start, exponent)
+    strain = surface_strain(domain)
+    by_rest = log_surface(strain)
+    if track is None:
+        freedom = Freedom(measure, domain.n, domain.fixed, linear_solver)
+        scale = Scale(-log_size(w, domain.loops), by_rest)
+    else:
+        freedom = OnCurves(measure, track, domain.fixed, domain.loops, exponent, linear_solver)
+        scale = Scale(np.zeros_like(w), by_rest)
+    minimum = Minimum(measure, w, freedom)
+    return Derivative(
+        placed(minimum.w, exponent, np.setdiff1d(domain.fixed, freedom.sliding), start),
+        fixed=domain.fixed,
+        forces=minimum.forces,
+        inverse=minimum,
+        strain=lambda: strain,
+        rest_shape=domain.V.shape,
+        doubts=minimum.doubts,
+        unit=2.0**exponent,
+        on_curves=None if track is None else on_track(track),
+        scale=scale,
+    )
+
+
+def surface_strain(domain: Domain) -> RestStrain:
+    """How triangles change with the rest positions, seen from the side on which they are counterclockwise."""
+    domain.check_areas()
+    return RestStrain(domain.V, domain.F, signed=False)
+
+
+def log_surface(strain: RestStrain) -> FloatArray:
+    """The derivative (n, d) of half the logarithm of a surface's area by the rest positions."""
+    share = (strain.m / strain.m.sum()).astype(np.complex128)
+    return strain.pull(share, np.zeros_like(share))
+
+
+def on_track(track: Track) -> IntArray:
+    """Vertices that are where their curves say: those that slide, and those at corners."""
+    return np.concatenate([chain.vertices for chain in track.chains])
+
+
+def placed(w: ComplexArray, exponent: int, held: IntArray, given: FloatArray) -> FloatArray:
+    """A map out of its units, what is held where it was given to the last bit."""
+    uv: FloatArray = np.ldexp(as_rows(w), exponent)
+    uv[held] = given[held]
+    return uv

@@ -1,0 +1,139 @@
+"""How rest triangles change when vertices of the surface move, and the transpose of that.
+
+A triangle that is laid into the plane, vertex 0 at the origin and vertex 1 on the positive x axis, changes by the
+linear field ``dz = a z + b z̄``: a is its growth, b its shear, and since vertex 1 stays on the axis ``Im (a + b) = 0``.
+A map of it with the derivatives p and q, whose corners stay where they are, then changes by
+
+    dp = −(p a + q b̄),    dq = −(p b + q ā),    and the triangle's area m by  dm = 2 m Re a.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
+
+# As `mesh.reference` corrects angles (§F.1).
+_LEAST_ANGLE = np.pi / 6
+
+
+class Strain(ABC):
+    """The triangles in which gradients are taken, as functions of the rest positions."""
+
+    @abstractmethod
+    def of(self, dV: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """The growth and shear (f,) of each triangle as the vertices (n, d) move."""
+
+    @abstractmethod
+    def pull(self, by_a: ComplexArray, by_b: ComplexArray) -> FloatArray:
+        """The gradient by positions (n, d) of what has these gradients (f,), ``∂/∂Re + i ∂/∂Im``, by a and b."""
+
+
+class RestStrain(Strain):
+    """Of triangles as they lie.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+    F : (f, 3) int64
+        Triangles, none without area.
+    signed : bool
+        Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Those in space never are, nor are those of
+        a planar surface that is seen from its own side (`mesh.shapes`).
+
+    Raises
+    ------
+    ValueError
+        When areas leave the range of doubles; names the triangles.
+
+    Attributes
+    ----------
+    m : (f,) float64
+        Areas.
+    half : (3, f) complex128
+        Half the gradients of the hat functions.
+    """
+
+    def __init__(self, V: FloatArray, F: IntArray, *, signed: bool = True) -> None:
+        self._corners, self._shape = np.ascontiguousarray(F.T), V.shape
+        z1, z2 = rest_frames(V, F)
+        if not signed:
+            z2 = z2.real + 1j * np.abs(z2.imag)
+        self.sides: ComplexArray = np.stack([z1 + 0j, z2 - z1, -z2])
+        with np.errstate(all="ignore"):
+            self.m: FloatArray = 0.5 * z1 * z2.imag
+            self.half: ComplexArray = 0.25j * self.sides[(1, 2, 0), :] / self.m
+        lost = np.flatnonzero(~(np.isfinite(self.m) & np.isfinite(self.half).all(axis=0)))
+        if lost.size:
+            raise ValueError(
+                f"the areas of {named('triangle', 'triangles', lost)} at rest leave the range of doubles: scale the "
+                "surface to about unit size"
+            )
+        # In the triangle's plane, as (d, f): along the first side and across it.
+        coordinates = np.ascontiguousarray(V.T)
+        start, one, two = (coordinates[:, at] for at in self._corners)
+        self._along = (one - start) / z1
+        self._across = (two - start - z2.real * self._along) / z2.imag
+
+    def of(self, dV: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        a, b = np.zeros((2, self.m.size), dtype=np.complex128)
+        coordinates = np.ascontiguousarray(dV.T)
+        for at, g in zip(self._corners, self.half, strict=True):
+            moved = coordinates[:, at]
+            dz = np.sum(moved * self._along, axis=0) + 1j * np.sum(moved * self._across, axis=0)
+            a += g.conj() * dz
+            b += g * dz
+        return a - 1j * (a + b).imag, b
+
+    def pull(self, by_a: ComplexArray, by_b: ComplexArray) -> FloatArray:
+        force: ComplexArray = by_a.real * self.half + (by_b - 1j * by_a.imag) * self.half.conj()
+        at, n = self._corners.ravel(), self._shape[0]
+        columns = zip(self._along, self._across, strict=True)
+        by_axis = (force.real * along + force.imag * across for along, across in columns)
+        return np.stack([np.bincount(at, column.ravel(), minlength=n) for column in by_axis], axis=1)
+
+
+class CorrectedStrain(Strain):
+    """Of triangles whose angles have been corrected (§F.1): vertex 2 is the only one that moves in its frame.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+    F : (f, 3) int64
+        Triangles, none without area.
+    half : (3, f) complex128
+        Half the gradients of the hat functions in the corrected triangles.
+    """
+
+    def __init__(self, V: FloatArray, F: IntArray, half: ComplexArray) -> None:
+        self._rest = RestStrain(V, F)
+        sides, sign = self._rest.sides, np.sign(self._rest.m)
+        angles = sign * np.angle(-sides[(2, 0, 1), :] / sides)
+        raised = np.maximum(angles, _LEAST_ANGLE)
+        total = raised.sum(axis=0)
+        self._share, self._per_angle = raised / total, np.pi / total
+        # By a shear b the side e turns by Im (b ē/e), and an angle is the difference of two directions.
+        turn = sides.conj() / sides
+        self._by_shear: ComplexArray = np.where(angles > _LEAST_ANGLE, sign, 0.0) * (turn[(2, 0, 1), :] - turn)
+        # Vertex 2 lies at sin θ₁ / sin θ₂ e^{iθ₀}.
+        zero, one, two = np.pi * self._share
+        self._cot_one, self._cot_two = 1 / np.tan(one), 1 / np.tan(two)
+        self._z2: ComplexArray = np.sin(one) / np.sin(two) * np.exp(1j * zero)
+        self._g2 = half[2]
+
+    def of(self, dV: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        _, b = self._rest.of(dV)
+        change = (b * self._by_shear).imag
+        zero, one, two = self._per_angle * (change - self._share * change.sum(axis=0))
+        dz: ComplexArray = self._z2 * (self._cot_one * one - self._cot_two * two + 1j * zero)
+        return self._g2.conj() * dz, self._g2 * dz
+
+    def pull(self, by_a: ComplexArray, by_b: ComplexArray) -> FloatArray:
+        by_log: ComplexArray = (by_a * self._g2 + by_b * self._g2.conj()) * self._z2.conj()
+        by_angle = np.stack([by_log.imag, self._cot_one * by_log.real, -self._cot_two * by_log.real])
+        by_change = self._per_angle * (by_angle - np.sum(self._share * by_angle, axis=0))
+        by_shear: ComplexArray = 1j * np.sum(by_change * self._by_shear.conj(), axis=0)
+        return self._rest.pull(np.zeros_like(by_shear), by_shear)

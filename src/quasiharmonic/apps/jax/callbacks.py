@@ -1,0 +1,156 @@
+"""One function of JAX with a gradient of its own for all maps, made by calling back to NumPy."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from threading import Lock
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from quasiharmonic.apps.gradients.derivative import Derivative
+from quasiharmonic.apps.gradients.layers import Array, Layer, back, expected, forth
+from quasiharmonic.util.arrays import FloatArray
+
+# JAX keeps nothing but arrays from one way to the other. The last derivatives are kept here, so many of them; those of
+# others are made again, from maps that are found already.
+_KEPT = 16
+_lock = Lock()
+_recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
+
+
+def applied(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
+    """The maps of a layer's arguments, those that are given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        When one is no array, or of another dtype, device or shape.
+    """
+    given = {name: array for name, array in arguments.items() if array is not None}
+    for name, array in given.items():
+        _check(name, array, layer.shapes[name])
+    # All with as many axes in front, so that one that `jax.vmap` adds is the first of each.
+    axes = {name: np.ndim(array) - len(layer.shapes[name]) for name, array in given.items()}
+    most = max(axes.values(), default=0)
+    arrays = (jnp.expand_dims(array, tuple(range(most - axes[name]))) for name, array in given.items())
+    maps: jax.Array = _map(layer, tuple(given), *arrays)
+    return maps
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A function of a layer's; equal to another of the same, so that JAX compiles and keeps one program for both."""
+
+    function: Callable[..., Any]
+    layer: Layer
+    names: tuple[str, ...]
+
+    def __call__(self, *arrays: Any) -> Any:
+        return self.function(self.layer, self.names, *arrays)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _map(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> jax.Array:
+    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.places), jnp.float64)
+    maps: jax.Array = jax.pure_callback(_Call(_found, layer, names), shape, *arrays, vmap_method="expand_dims")
+    return maps
+
+
+def _forward(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> tuple[jax.Array, tuple[Any, jax.Array]]:
+    uv = _map(layer, names, *arrays)
+    return uv, (arrays, uv)
+
+
+def _backward(
+    layer: Layer, names: tuple[str, ...], kept: tuple[tuple[jax.Array, ...], jax.Array], cotangent: jax.Array
+) -> tuple[jax.Array, ...]:
+    arrays, uv = kept
+    lead = _lead(layer, names, arrays)
+    shapes = [
+        jax.ShapeDtypeStruct((*lead, *layer.shapes[name]), array.dtype)
+        for name, array in zip(names, arrays, strict=True)
+    ]
+    pulled = jax.pure_callback(_Call(_pulled, layer, names), shapes, uv, cotangent, *arrays, vmap_method="expand_dims")
+    return tuple(_summed(gradient, array.shape) for gradient, array in zip(pulled, arrays, strict=True))
+
+
+_map.defvjp(_forward, _backward)
+
+
+def _lead(layer: Layer, names: tuple[str, ...], arrays: tuple[jax.Array, ...]) -> tuple[int, ...]:
+    return layer.batch(dict(zip(names, arrays, strict=True)))
+
+
+def _found(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
+    """The maps, their derivatives kept."""
+    given = _given(names, arrays)
+    uv, derivatives = forth(layer, given)
+    with _lock:
+        for item, derivative in zip(np.ndindex(uv.shape[:-2]), derivatives, strict=True):
+            _recent[_key(layer, layer.item(given, item), uv[item])] = derivative
+        while len(_recent) > _KEPT:
+            _recent.popitem(last=False)
+    return uv
+
+
+def _pulled(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *arrays: Any) -> list[Array]:
+    """The gradients by all arguments, over the whole batch."""
+    given, uv, cotangent = _given(names, arrays), np.asarray(uv), np.asarray(cotangent)
+    lead = np.broadcast_shapes(uv.shape[:-2], cotangent.shape[:-2])
+    uv, cotangent = (np.broadcast_to(array, (*lead, *layer.places)) for array in (uv, cotangent))
+    derivatives = []
+    for item in np.ndindex(lead):
+        own = layer.item(given, item)
+        with _lock:
+            derivative = _recent.get(_key(layer, own, uv[item]))
+        derivatives.append(derivative or layer.derivative(own, uv[item]))
+    found = back(layer, derivatives, cotangent, names)
+    # JAX has ∂/∂Re − i ∂/∂Im.
+    return [found[name].conj() for name in names]
+
+
+def _given(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
+    return {name: np.asarray(array) for name, array in zip(names, arrays, strict=True)}
+
+
+def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer, bytes]:
+    """What a derivative is found by: all that it was made of."""
+    digest = hashlib.blake2b(np.ascontiguousarray(uv).tobytes())
+    for array in own.values():
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return layer, digest.digest()
+
+
+def _summed(gradient: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """A gradient with a batch's axes, summed over those that the argument has not, or has but one of."""
+    gradient = gradient.sum(axis=tuple(range(gradient.ndim - len(shape))))
+    short = tuple(i for i, size in enumerate(shape) if size == 1 and gradient.shape[i] != 1)
+    return gradient.sum(axis=short, keepdims=True) if short else gradient
+
+
+def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
+    if not jax.config.read("jax_enable_x64"):
+        raise TypeError(
+            "maps are in double precision, and JAX is in single: jax.config.update('jax_enable_x64', True) before the "
+            "first array is made"
+        )
+    if not isinstance(array, jax.Array | np.ndarray):
+        raise TypeError(f"{name} must be an array, not {type(array).__name__}")
+    wanted = np.dtype(np.complex128 if name == "mu" else np.float64)
+    if array.dtype != wanted:
+        raise TypeError(f"{name} must be of {wanted}, not {array.dtype}: {name}.astype({str(wanted)!r})")
+    if isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer):
+        elsewhere = [device for device in array.devices() if device.platform != "cpu"]
+        if elsewhere:
+            raise ValueError(
+                f"{name} is on {elsewhere[0]}, and maps are made on the CPU: "
+                f"jax.device_put({name}, jax.devices('cpu')[0])"
+            )
+    expected(name, array.shape, one)

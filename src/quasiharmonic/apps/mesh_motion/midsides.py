@@ -1,0 +1,219 @@
+"""Where the mid-side nodes of six-node triangles go: along with their sides, and aside where an element needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quasiharmonic.geometry.curves.curve import Curve
+from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+from quasiharmonic.geometry.mesh.elements import MIDDLES, SIDES
+from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# What is aimed at where an element is inverted: its least control value over that of the triangle of its corners.
+_MARGIN = 0.1
+# How dear it is to bend, at first and at each further try, and how many steps a try has.
+_DEAR, _TRIES, _STEPS = 1e-2, 8, 30
+# Tried in turn: the rings of elements around inverted ones whose nodes move, None for no more than their mid-side
+# nodes; and where these begin, as a part of the way from where they should be to where the search has left them. Then
+# the best of that is gone on from.
+_ATTEMPTS = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
+_FURTHER = 1, 2, 4, 8
+
+
+def sides(F: IntArray) -> tuple[IntArray, IntArray]:
+    """The mid-side nodes of six-node triangles (f, 6), (s,) ascending, and the ends of the side of each, (s, 2)."""
+    middle, first = np.unique(F[:, MIDDLES], return_index=True)
+    return middle, F[:, SIDES].reshape(-1, 2)[first]
+
+
+def carried(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntArray) -> FloatArray:
+    """Where mid-side nodes come to that go along with their sides, turned and scaled as these are; (s, 2) float64.
+
+    Those of straight sides stay in the same place of them, and where both ends stay so does the node, to the last bit.
+    """
+    z, w = (np.ascontiguousarray(points).view(np.complex128).ravel() for points in (before, after))
+    (a, b), (p, q) = z[ends].T, w[ends].T
+    ratio = np.divide(q - p, b - a, out=np.zeros_like(a), where=a != b)
+    place = 0.5 * (p + q) + ratio * (z[middle] - 0.5 * (a + b))
+    place = np.where((a == p) & (b == q), z[middle], place)
+    return place.view(np.float64).reshape(-1, 2)
+
+
+def followed(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) -> FloatArray:
+    """Put the mid-side nodes that are not held where they are on their sides at rest; (n, 2) float64.
+
+    Parameters
+    ----------
+    F : (f, 6) int64
+    rest, points : (n, 2) float64
+        The mesh at rest, and now.
+    held : (k,) int64
+        Nodes that stay where they are.
+    """
+    middle, ends = sides(F)
+    free = ~np.isin(middle, held)
+    there = points.copy()
+    there[middle[free]] = carried(rest, points, middle[free], ends[free])
+    return there
+
+
+def centred(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Curve]) -> FloatArray:
+    """Put mid-side nodes that have slid along curves into the middle of their sides again; (n, 2) float64.
+
+    Off the middle half of a straight side such a node turns its element over, wherever the others are.
+
+    Parameters
+    ----------
+    F : (f, 6) int64
+    points : (n, 2) float64
+    slid : (k,) int64
+        Nodes, of which others than mid-side ones are passed over.
+    curves : sequence of Curve
+        Each node stays on the one nearest to it.
+    """
+    middle, ends = sides(F)
+    of = np.isin(middle, slid)
+    nodes, half = middle[of], points[ends[of]].mean(axis=1)
+    own = np.argmin([curve.nearest(points[nodes])[1] for curve in curves], axis=0)
+    there = points.copy()
+    for k, curve in enumerate(curves):
+        there[nodes[own == k]] = curve.position(curve.nearest(half[own == k])[0])
+    return there
+
+
+def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntArray) -> FloatArray:
+    """Move nodes aside where elements are inverted, by as little as it takes.
+
+    Parameters
+    ----------
+    F : (f, 6) int64
+    straight : (n, 2) float64
+        The mesh with its mid-side nodes where they should be.
+    searched : (n, 2) float64
+        The mesh with these elsewhere, perhaps at better places.
+    held : (k,) int64
+        Nodes that stay where they are.
+
+    Returns
+    -------
+    (n, 2) float64
+        Elements may be inverted still.
+    """
+    best, bad = straight, inverted_elements(F, straight)
+    for rings, share in (*_ATTEMPTS, *((rings, None) for rings in _FURTHER)):
+        if not bad.size:
+            break
+        if share and searched is straight:
+            continue
+        begin = best if share is None else straight + share * (searched - straight)
+        found = _righted(F, begin, rings, held)
+        left = inverted_elements(F, found)
+        if left.size < bad.size:
+            best, bad = found, left
+    return best
+
+
+def _righted(F: IntArray, points: FloatArray, rings: int | None, held: IntArray) -> FloatArray:
+    """Move nodes around inverted elements, within so many rings of elements; None for their mid-side nodes only."""
+    bad = inverted_elements(F, points)
+    movable = F[bad][:, MIDDLES] if rings is None else F[_around(F, bad, rings)]
+    return _bent(F, points, np.setdiff1d(movable, held))
+
+
+def _around(F: IntArray, which: IntArray, rings: int) -> IntArray:
+    """Elements within some rings of others."""
+    for _ in range(rings):
+        which = np.flatnonzero(np.isin(F[:, :3], F[which, :3]).any(axis=1))
+    return which
+
+
+def _bent(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
+    """Move nodes as little as it takes for control values to be positive.
+
+    Lowers ``μ Σ |xᵢ − x̂ᵢ|²/h² + Σ max(0, margin − cᵢⱼ/c₀)²``, with x̂ the places at first, by Levenberg and Marquardt's
+    steps, μ falling.
+    """
+    if not free.size:
+        return points
+    near = F[np.isin(F, free).any(axis=1)]
+    unit = np.abs(jacobian_coefficients(*_chords(near, points))[:, 0])
+    size = np.sqrt(unit.mean())
+    number = np.full(len(points), -1)
+    number[free] = np.arange(free.size)
+    now = points.copy()
+    dear = _DEAR
+    for _ in range(_TRIES):
+        for _ in range(_STEPS):
+            step = _step(near, now, points, number, unit, size, dear)
+            if step is None:
+                break
+            now = now.copy()
+            now[free] += step
+        if not inverted_elements(near, now).size:
+            break
+        dear *= 0.1
+    return now
+
+
+def _chords(F: IntArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coordinates of the nodes as if all sides were straight, relative to the first."""
+    corners = points[F[:, :3]] - points[F[:, :1]]
+    nodes = np.concatenate([corners, 0.5 * corners[:, SIDES].sum(axis=2)], axis=1)
+    return nodes[..., 0], nodes[..., 1]
+
+
+def _lacking(F: IntArray, points: FloatArray, unit: FloatArray) -> FloatArray:
+    """By how much control values are short of the margin; (f, 6)."""
+    x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
+    return np.maximum(_MARGIN - jacobian_coefficients(x, y) / unit[:, None], 0.0)
+
+
+def _step(
+    F: IntArray,
+    now: FloatArray,
+    first: FloatArray,
+    number: IntArray,
+    unit: FloatArray,
+    size: float,
+    dear: float,
+) -> FloatArray | None:
+    """One step of Levenberg and Marquardt's, (k, 2), or None where none lowers what is to be lowered."""
+    from scipy.sparse import csr_array, dia_array
+    from scipy.sparse.linalg import splu
+
+    free = np.flatnonzero(number >= 0)
+    gone = (now[free] - first[free]) / size
+    lacking = _lacking(F, now, unit)
+    value = dear * (gone**2).sum() + (lacking**2).sum()
+    element, which = np.nonzero(lacking)
+    if not element.size:
+        return None
+    nodes = F[element]
+    x, y = (now[nodes] - now[nodes[:, :1]]).transpose(2, 0, 1)
+    forms = FORMS[which].astype(np.float64)
+    scale = size / unit[element][:, None]
+    slopes = (
+        np.stack([np.einsum("mab,mb->ma", forms, y), -np.einsum("mab,mb->ma", forms, x)], axis=2) * scale[..., None]
+    )
+    column = 2 * number[nodes][..., None] + np.array([0, 1])
+    row = np.broadcast_to(np.arange(len(element))[:, None, None], column.shape)
+    known = np.broadcast_to(number[nodes][..., None] >= 0, column.shape)
+    jacobian = csr_array((slopes[known], (row[known], column[known])), shape=(len(element), 2 * free.size))
+    load = jacobian.T @ lacking[element, which] - dear * gone.ravel()
+    unknowns = 2 * free.size
+    matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), dear), [0]), shape=(unknowns, unknowns))
+    try:
+        direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
+    except RuntimeError:  # singular: elements so bad that being dear is rounded away
+        return None
+    there = now.copy()
+    for halving in range(6):
+        t = 0.5**halving
+        there[free] = now[free] + t * size * direction
+        further = (there[free] - first[free]) / size
+        if dear * (further**2).sum() + (_lacking(F, there, unit) ** 2).sum() < value:
+            return t * size * direction
+    return None

@@ -1,0 +1,227 @@
+"""A planar mesh whose boundary moves, time after time, as that of a simulation does: valid at each, and without drift.
+
+    boundary moves ──Newton, the interior taken along──▶ valid ──a step down the energy──▶ next time
+
+The energy compares with the first mesh, whatever the way that has led to the present one.
+"""
+
+from __future__ import annotations
+
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.energies.newton.boundary_continuation import CarryingDescent
+from quasiharmonic.energies.newton.sliding import SlidingDescent, SlidingSystem, lay_boundary
+from quasiharmonic.energies.polishing import at_own_scale, energy_named
+from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.mesh.elements import check_spread
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.io.adapters.accepts_mesh import made_of_planar_mesh
+from quasiharmonic.io.adapters.objects import MeshLike
+from quasiharmonic.problem import Domain
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_finite,
+    check_range,
+    index_array,
+    map_array,
+    named,
+    triangle_array,
+    true_or_false,
+    whole_number,
+)
+
+# What a step down the energy has to promise, relative to it, and how many may bring the boundary where it goes.
+_TOLERANCE, _STEPS = 1e-4, 25
+
+
+class MovingMesh:
+    """A planar mesh that follows its boundary in small steps.
+
+    For a simulation in which a boundary moves with time: the mesh at each time is that of the time before with the
+    boundary moved and the interior taken along, by one or two factorisations of the size of linear elasticity. `morph`
+    is for a single large displacement.
+
+    Parameters
+    ----------
+    points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
+        The mesh at the start, valid: shapes and sizes of its triangles are what is kept. Every vertex belongs to one.
+    F : (f, 3) array of int
+        Triangles, wound either way.
+    moved : (k,) array of int
+        Vertices that will move, of the boundary or inside. Boundary vertices not among them stay.
+    energy : str or Energy
+        What is kept low; see `quasiharmonic.polish`. The default minds shapes more than sizes.
+    settle : int
+        Newton steps down the energy after each move; 0 saves time and is as valid.
+    slide : bool
+        Let the boundary vertices that are not moved glide along their outline, its corners held; it takes ``settle``
+        at least 1. They follow what the mesh wants, one step behind: moved vertices that come along the same wall stop
+        at them, where `morph` knows better.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+
+    Raises
+    ------
+    ValueError
+        When the input is malformed, a triangle has no area, or an option has no such value.
+
+    Examples
+    --------
+    The hole of a ring that turns by 200°:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import MovingMesh
+    >>> from quasiharmonic.geometry.mesh.topology import boundary_loops
+    >>> from quasiharmonic.surfaces import annulus
+    >>> points, F = annulus(12)
+    >>> walls, body = sorted(boundary_loops(F, len(points)), key=lambda loop: -np.abs(points[loop]).max())
+    >>> mesh = MovingMesh(points, F, body)
+    >>> for angle in np.radians(np.arange(10, 201, 10)):
+    ...     turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
+    ...     there = mesh.advance(points[body] @ turn)
+    >>> bool(np.abs(there[body] - points[body] @ turn).max() == 0)
+    True
+    """
+
+    @overload
+    def __init__(
+        self,
+        points: ArrayLike,
+        F: ArrayLike,
+        moved: ArrayLike,
+        *,
+        energy: str | Energy = "blend",
+        settle: int = 1,
+        slide: bool = False,
+        linear_solver: str = "auto",
+    ) -> None: ...
+    @overload
+    def __init__(
+        self,
+        points: MeshLike,
+        moved: ArrayLike,
+        *,
+        energy: str | Energy = "blend",
+        settle: int = 1,
+        slide: bool = False,
+        linear_solver: str = "auto",
+    ) -> None: ...
+    @made_of_planar_mesh
+    def __init__(
+        self,
+        points: ArrayLike,
+        F: ArrayLike,
+        moved: ArrayLike,
+        *,
+        energy: str | Energy = "blend",
+        settle: int = 1,
+        slide: bool = False,
+        linear_solver: str = "auto",
+    ) -> None:
+        self._points = map_array("points", points)
+        F = triangle_array(F, len(self._points))
+        ratio = mean_ratio(self._points, F)
+        flat = np.flatnonzero(ratio == 0)
+        if flat.size:
+            raise ValueError(f"{named('triangle', 'triangles', flat)} without area: repair the mesh first")
+        F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
+        check_spread(F, len(self._points))
+        self._moved = index_array("moved", moved)
+        if self._moved.ndim != 1:
+            raise ValueError(f"moved must have shape (k,), not {self._moved.shape}")
+        check_range("moved", self._moved, len(self._points))
+        true_or_false("slide", slide)
+        self._energy, self._slide = energy_named(energy), slide
+        whole_number("settle", settle, least=1 if slide else 0)
+        self._settle = settle
+        rest = np.setdiff1d(boundary_edges(F, len(self._points)), self._moved)
+        self._domain = Domain(self._points, F, np.concatenate([self._moved, rest]))
+        self._linear_solver = linear_solver
+        still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
+        # Walls that nothing moves are those of the first mesh for good: gliding vertices do not cut their corners.
+        self._walls = Rails.around(still, self._points, held=self._moved) if slide and still else None
+        # In the mesh's own unit, so that no area leaves the numbers' range.
+        exponent = np.frexp(np.abs(self._points).max())[1]
+        a, b, c = np.ldexp(self._points, -exponent)[self._domain.F].transpose(1, 0, 2)
+        area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        # Small triangles are where a simulation looks closely: each counts the same, whatever its area.
+        self._weights = area.mean() / area
+        deformation, exponent = at_own_scale(self._domain, self._points, self._energy, self._weights)
+        self._descent = CarryingDescent(deformation, self._points, self._domain.fixed, exponent, linear_solver)
+        self._system: SlidingSystem | None = None
+
+    @property
+    def points(self) -> FloatArray:
+        """The mesh at present, (n, 2) float64: every triangle strictly positive, decided exactly. A copy."""
+        return self._points.copy()
+
+    @property
+    def F(self) -> IntArray:
+        """The triangles (f, 3), counterclockwise."""
+        return self._domain.F
+
+    def advance(self, positions: ArrayLike) -> FloatArray:
+        """Move the boundary, and the mesh with it.
+
+        Parameters
+        ----------
+        positions : (k, 2) array
+            Where the moved vertices are next.
+
+        Returns
+        -------
+        (n, 2) float64
+            The mesh there; also kept as ``points``.
+
+        Raises
+        ------
+        ValueError
+            When ``positions`` has another shape or is not finite.
+        RuntimeError
+            When the triangles do not let the boundary arrive. The mesh is then as it was.
+        """
+        there = map_array("positions", positions, self._moved.size, finite=False)
+        check_finite("positions", "row", "rows", there)
+        goal = np.concatenate([there, self._points[self._domain.fixed[self._moved.size :]]])
+        try:
+            # Overflow gives inf or NaN, and a step with either is never accepted.
+            with np.errstate(all="ignore"):
+                share = self._descent.carry(goal, _TOLERANCE, _STEPS)
+            if share < 1:
+                raise RuntimeError(
+                    f"the boundary can be moved there for {share:.1%} of the way only: then triangles leave it no "
+                    "room, or too little for such a step; try shorter ones, or a new mesh"
+                )
+            self._points = self._settled()
+        finally:
+            # From the mesh there, its walls where they have slid to, or after whatever went wrong from the last.
+            self._descent.place(self._points)
+        return self._points.copy()
+
+    def _settled(self) -> FloatArray:
+        """The mesh after some steps down the energy."""
+        with np.errstate(all="ignore"):
+            descent = self._sliding_from(self._descent.positions(self._descent.w)) if self._slide else self._descent
+            for _ in descent.descend(self._settle, _TOLERANCE):
+                pass
+        return descent.positions(descent.w)
+
+    def _sliding_from(self, here: FloatArray) -> SlidingDescent:
+        """A descent from a mesh whose walls slide, by the matrix of the last one while the same vertices do."""
+        domain, rails = self._domain, self._walls
+        mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in domain.loops)
+        if rails is None or mixed:
+            rails = Rails.around(domain.loops, here, held=self._moved)
+        track = lay_boundary(rails, domain, here)
+        deformation, exponent = at_own_scale(domain, track.uv, self._energy, self._weights)
+        descent = SlidingDescent(
+            deformation, track, domain.fixed, domain.loops, exponent, self._linear_solver, self._system
+        )
+        self._system = descent.system
+        return descent

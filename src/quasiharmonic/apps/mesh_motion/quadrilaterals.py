@@ -1,0 +1,70 @@
+"""Quadrilaterals that stay convex: the triangles at all four of their corners are kept positive, by both diagonals."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import MapResult, Stage, Status
+from quasiharmonic.solver.methods.untangling import untangled
+from quasiharmonic.util.arrays import IntArray
+
+# Steps of untangling at most; where it succeeds a few dozen do.
+_STEPS = 300
+
+
+def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linear_solver: str) -> MapResult:
+    """Go on from a map of triangles that halve quadrilaterals to one in which these are convex.
+
+    Parameters
+    ----------
+    problem : Problem
+        The surface at rest, where the quadrilaterals are convex, and what is held.
+    result : MapResult
+        Of the triangles on either side of one diagonal.
+    corners : (t, 3) int64
+        The triangles at all corners.
+    linear_solver : str
+
+    Returns
+    -------
+    MapResult
+        With a stage more where steps were taken; `Status.SETTLED` where corners stay inverted after all, as few as were
+        found.
+    """
+    before = flipped_triangles(corners, result.uv).size
+    if not before:
+        return result
+    began, steps = time.perf_counter(), 0
+    exponent = int(np.frexp(np.abs(result.uv).max())[1])
+    w = in_units(result.uv, exponent)
+    areas = (signed_areas(problem.F, places).sum() for places in (w, in_units(problem.V, 0)))
+    rest = problem.V * np.sqrt(np.divide(*areas))
+    for further in untangled(corners, w, problem.fixed, rest=rest, linear_solver=linear_solver):
+        w, steps = further, steps + 1
+        if steps == _STEPS:
+            break
+    uv = np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
+    uv[problem.fixed] = problem.target
+    after = flipped_triangles(corners, uv).size
+    seconds = time.perf_counter() - began
+    stage = Stage("untangling corners", steps, seconds, (before, after), (np.inf, np.inf), kept=after < before)
+    stages = [*result.stages, stage]
+    if after >= before:
+        return replace(result, status=Status.SETTLED, stages=stages, seconds=result.seconds + seconds)
+    return replace(
+        result,
+        uv=uv,
+        status=Status.SETTLED if after else Status.INJECTIVE,
+        certificate=certify(problem.F, uv, loops=problem.domain.loops),
+        stages=stages,
+        seconds=result.seconds + seconds,
+        diagnosis=None,
+        mu=None,
+    )

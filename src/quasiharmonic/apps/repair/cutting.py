@@ -1,0 +1,62 @@
+"""Closed surfaces, and surfaces with handles, cut open until they fit into the plane."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.opening import opened_along
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array
+
+
+class Opened(NamedTuple):
+    """A surface that was cut open.
+
+    Attributes
+    ----------
+    V : (n + c, d) float64
+        Vertices: the old ones first, then copies of those along the cuts.
+    F : (f, 3) int64
+        The same triangles in the same order; those on one side of a cut refer to the copies.
+    origin : (n + c,) int64
+        The old vertex that each one is or is a copy of.
+    """
+
+    V: FloatArray
+    F: IntArray
+    origin: IntArray
+
+
+@takes_mesh
+def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain: float = np.inf) -> Opened:
+    """Cut a surface along edges into a disk, which has one boundary loop and fits into any outline without holes.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Vertices.
+    F : (f, 3) array of int
+        Triangles of any number of surfaces, each of which becomes a disk. One that is a disk stays as it is.
+    edges : (k, 2) array of int, optional
+        Edges to be cut in any case.
+    gain : float
+        What cuts must be worth beyond those that make a disk, as `quasiharmonic.find_cuts` has it: 0.1
+        for surfaces that are to lie flat with little distortion. By default there are no others.
+
+    Returns
+    -------
+    Opened
+
+    Raises
+    ------
+    ValueError
+        As `quasiharmonic.find_cuts`.
+    """
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    opened, origin = opened_along(F, find_cuts(V, F, edges=edges, gain=gain), len(V))
+    return Opened(V[origin], opened, origin)

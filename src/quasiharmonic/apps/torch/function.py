@@ -1,0 +1,105 @@
+"""One function of PyTorch's autograd for all maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from quasiharmonic.apps.gradients.derivative import Derivative
+from quasiharmonic.apps.gradients.layers import Array, Layer, along, back, expected, forth, summed
+
+_COMPILED = "maps are made by NumPy and SciPy: under torch.compile they are a break in the graph"
+
+
+@torch.compiler.disable(reason=_COMPILED)  # type: ignore[untyped-decorator]
+def applied(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch.Tensor:
+    """The maps of a layer's arguments, those that are given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        When one is no tensor, or of another dtype, device or shape.
+    """
+    given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
+    for name, tensor in given.items():
+        _check(name, tensor, layer.shapes[name])
+    maps: torch.Tensor = _Map.apply(layer, tuple(given), *given.values())[0]
+    return maps
+
+
+class _Map(torch.autograd.Function):  # type: ignore[misc]
+    """From arguments to maps."""
+
+    @staticmethod
+    def forward(
+        layer: Layer, names: tuple[str, ...], *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, Sequence[Derivative]]:
+        """Find the maps, and what is kept for the way back."""
+        arrays = {name: _numpy(tensor) for name, tensor in zip(names, tensors, strict=True)}
+        uv, derivatives = forth(layer, arrays)
+        return torch.from_numpy(uv), derivatives
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
+        """Keep it."""
+        ctx.layer, ctx.names, *tensors = inputs
+        uv, ctx.derivatives = output
+        ctx.shapes, ctx.lead = [tuple(tensor.shape) for tensor in tensors], tuple(uv.shape[:-2])
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, cotangent: torch.Tensor | None, _: None) -> tuple[torch.Tensor | None, ...]:
+        """Gradients by the arguments that need them."""
+        if cotangent is None:
+            return (None,) * (2 + len(ctx.names))
+        needed = [name for name, needs in zip(ctx.names, ctx.needs_input_grad[2:], strict=True) if needs]
+        found = back(ctx.layer, ctx.derivatives, _numpy(cotangent), needed)
+        return (
+            None,
+            None,
+            *(
+                torch.from_numpy(summed(found[name], shape)) if name in found else None
+                for name, shape in zip(ctx.names, ctx.shapes, strict=True)
+            ),
+        )
+
+    @staticmethod
+    def jvp(ctx: Any, _layer: None, _names: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor, None]:
+        """How the maps move."""
+        moved = {
+            name: _numpy(tangent) for name, tangent in zip(ctx.names, tangents, strict=True) if tangent is not None
+        }
+        return torch.from_numpy(along(ctx.layer, ctx.derivatives, ctx.lead, moved)), None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
+        """Refused."""
+        raise NotImplementedError(
+            "a batch of maps is one call, with further axes in front of the arguments: leave torch.func.vmap out"
+        )
+
+
+def _numpy(tensor: torch.Tensor) -> Array:
+    """What a tensor holds; those that stand for others within transforms of `torch.func` hold nothing."""
+    try:
+        # Tensors that are conjugates, or negated parts of such, are so in name only until they are resolved.
+        return tensor.detach().resolve_conj().resolve_neg().numpy()
+    except RuntimeError as error:
+        raise NotImplementedError(
+            "maps are differentiated by backward(), torch.autograd.grad and forward mode, not by torch.func"
+        ) from error
+
+
+def _check(name: str, tensor: Any, one: tuple[int, ...]) -> None:
+    wanted = torch.complex128 if name == "mu" else torch.float64
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}")
+    if tensor.dtype != wanted:
+        raise TypeError(f"{name} must be of {wanted}, not {tensor.dtype}: {name}.to({wanted})")
+    if tensor.device.type != "cpu":
+        raise ValueError(f"{name} is on {tensor.device}, and maps are made on the CPU: {name}.cpu()")
+    expected(name, tuple(tensor.shape), one)

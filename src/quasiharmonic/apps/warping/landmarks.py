@@ -1,0 +1,200 @@
+"""Landmarks of pictures: points and curves that are to go somewhere, and a mesh of the picture that has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_finite, map_array, named, real_array
+
+# At least so many cells along the shorter side of a picture, so that there is a way past landmarks.
+_ACROSS = 6
+
+#: A polyline (a, 2), a ≥ 2, and the one (b, 2) that it goes to.
+CurvePair = tuple[ArrayLike, ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Points of a picture and where they go.
+
+    Attributes
+    ----------
+    before, after : (k, 2) float64
+    weights : (k,) float64
+        What missing costs; infinite where a landmark arrives exactly.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    weights: FloatArray
+
+    @property
+    def hard(self) -> BoolArray:
+        """Which arrive exactly; (k,) bool."""
+        return np.isinf(self.weights)
+
+
+def landmarks_of(
+    landmarks: ArrayLike,
+    moved: ArrayLike,
+    weights: ArrayLike | None,
+    curves: Sequence[CurvePair],
+    step: float,
+    size: IntArray,
+) -> Landmarks:
+    """Check landmarks, and put points onto curves.
+
+    Parameters
+    ----------
+    landmarks, moved, weights, curves
+        As of `quasiharmonic.warp_by_landmarks`.
+    step : float
+        Of points on curves, at most.
+    size : (2,) int64
+        Where the picture's last pixel is, x and y.
+
+    Raises
+    ------
+    ValueError
+        When they are malformed, outside of the picture, or at the same place.
+    """
+    before, after = _points(landmarks, "landmarks"), _points(moved, "moved")
+    if before.shape != after.shape:
+        raise ValueError(f"moved must have as many rows as landmarks, {len(before)}, not {len(after)}")
+    weight = _weights(weights, len(before))
+    _check_inside("landmarks", before, ((before >= 0) & (before <= size)).all(axis=1), size)
+    edge = on_border(before, size)
+    if np.array_equal(before[edge], after[edge]):
+        _check_inside("moved", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
+    soft = np.flatnonzero(edge & ~np.isinf(weight))
+    if soft.size:
+        raise ValueError(f"weights: {named('landmark', 'landmarks', soft)} on the border, where all arrive exactly")
+    _check_apart("landmarks", before)
+    _check_apart("moved", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
+    for number, pair in enumerate(curves):
+        if len(pair) != 2:
+            raise ValueError(f"curve {number} must be two polylines, the one that goes and where to, not {len(pair)}")
+        one, other = _resampled(*pair, f"curve {number}", step)
+        for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
+            _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
+        # A closed curve ends where it began, and curves may meet.
+        new = ~(one[:, None] == before).all(axis=2).any(axis=1)
+        new[-1] &= len(one) < 2 or not np.array_equal(one[0], one[-1])
+        before, after = np.concatenate([before, one[new]]), np.concatenate([after, other[new]])
+        weight = np.concatenate([weight, np.full(np.count_nonzero(new), np.inf)])
+    return Landmarks(before, after, weight)
+
+
+def on_border(points: FloatArray, size: IntArray) -> BoolArray:
+    """Which points (k, 2) are on a picture's border."""
+    edge: BoolArray = ((points == 0) | (points == size)).any(axis=1)
+    return edge
+
+
+def _points(points: ArrayLike, name: str) -> FloatArray:
+    array = real_array(name, points)
+    array = map_array(name, array if array.size else np.empty((0, 2)), finite=False)
+    check_finite(name, "point", "points", array)
+    return array
+
+
+def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
+    """A weight for each of ``k`` landmarks, positive, infinite by default."""
+    array = np.full(k, np.inf) if weights is None else real_array("weights", weights)
+    if array.shape != (k,):
+        raise ValueError(f"weights must have shape ({k},), one for every landmark, not {array.shape}")
+    bad = np.flatnonzero(~(array > 0))
+    if bad.size:
+        raise ValueError(f"the weight is not positive at {named('landmark', 'landmarks', bad)}")
+    return array
+
+
+def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) -> None:
+    """Refuse points at the same place."""
+    _, first, count = np.unique(array, axis=0, return_index=True, return_counts=True)
+    if (count > 1).any():
+        place = array[first[count > 1][0]]
+        same = np.flatnonzero((array == place).all(axis=1))
+        which = same if numbers is None else numbers[same]
+        raise ValueError(f"{name}: {named('point', 'points', which)} are at the same place, {tuple(place.tolist())}")
+
+
+def _resampled(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tuple[FloatArray, FloatArray]:
+    """Points on two polylines at equal parts of their lengths, neither further apart than a step."""
+    lines = [real_array(name, line) for line in (start, end)]
+    for line in lines:
+        if line.ndim != 2 or line.shape[1] != 2 or len(line) < 2:
+            raise ValueError(
+                f"{name} must be two polylines of shape (a, 2), at least two points each, not {line.shape}"
+            )
+        check_finite(name, "point", "points", line)
+    arcs = [np.append(0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))) for line in lines]
+    if min(arc[-1] for arc in arcs) == 0:
+        raise ValueError(f"{name} has no length")
+    parts = np.linspace(0, 1, int(np.ceil(max(arc[-1] for arc in arcs) / step)) + 1)
+    one, other = (
+        np.stack([np.interp(parts * arc[-1], arc, line[:, axis]) for axis in (0, 1)], axis=1)
+        for line, arc in zip(lines, arcs, strict=True)
+    )
+    return one, other
+
+
+def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) -> None:
+    """Refuse landmarks outside of a picture."""
+    outside = np.flatnonzero(~inside)
+    if outside.size:
+        raise ValueError(
+            f"{name}: {named('point', 'points', outside)} not inside the picture, 0 < x < {size[0]} to the right and "
+            f"0 < y < {size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
+        )
+
+
+def carried(border: FloatArray, before: FloatArray, after: FloatArray, size: IntArray) -> FloatArray:
+    """How far points of a picture's border go along with landmarks on it; (m, 2)."""
+    corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=np.float64)
+    given = (corners[:, None] == before).all(axis=2).any(axis=1)
+    knots = np.concatenate([corners[~given], before])
+    way = np.concatenate([np.zeros((np.count_nonzero(~given), 2)), after - before])
+    around = 2.0 * size.sum()
+    at, where = _along(knots, size), _along(border, size)
+    return np.stack([np.interp(where, at, way[:, axis], period=around) for axis in (0, 1)], axis=1)
+
+
+def _along(border: FloatArray, size: IntArray) -> FloatArray:
+    """How far around a picture points of its border are, from the first pixel to the right; (m,)."""
+    (x, y), (width, height) = border.T, size
+    return np.select(
+        [y == 0, x == width, y == height], [x, width + y, 2 * width + height - x], 2 * (width + height) - y
+    )
+
+
+def picture_mesh(landmarks: FloatArray, width: int, height: int, along: int) -> tuple[FloatArray, IntArray]:
+    """Triangulate a picture by a grid that makes room for landmarks, which come last; so many cells along its side."""
+    from scipy.spatial import Delaunay, cKDTree
+
+    spacing = max(width - 1, height - 1) / along
+    size = (width - 1, height - 1)
+    x, y = (np.linspace(0, side, max(_ACROSS, round(side / spacing)) + 1) for side in size)
+    grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
+    sides, landmark_sides = ((p == 0) | (p == size) for p in (grid, landmarks))
+    near = np.zeros(len(grid), dtype=bool)
+    if len(landmarks):
+        near = cKDTree(landmarks).query(grid)[0] < 0.5 * spacing
+    # Points of the border make room only for landmarks that are on it themselves, corners only for one at the corner.
+    if landmark_sides.any():
+        distance = cKDTree(landmarks[landmark_sides.any(axis=1)]).query(grid)[0]
+        near &= ~sides.any(axis=1) | (distance < np.where(sides.all(axis=1), 1e-300, 0.5 * spacing))
+    else:
+        near &= ~sides.any(axis=1)
+    kept = grid[~near]
+    points = np.concatenate([kept, landmarks])
+    F = Delaunay(points).simplices.astype(np.int64)
+    a, b, c = points[F].transpose(1, 0, 2)
+    turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
+    F[turned] = F[turned, ::-1]
+    return points, F

@@ -1,1 +1,0 @@
-"""What a notebook shows of a result: words, and a picture."""

@@ -1,0 +1,457 @@
+"""Deformation energies of a map, per triangle (§11): density, gradient, projected second derivatives.
+
+On a triangle a map is affine and ``w = p z + q z̄ + const`` in complex numbers, with the Wirtinger
+derivatives p and q. Its singular values are ``σ₁ = |p| + |q|`` and ``σ₂ = |p| − |q|``, the second one
+negative where the triangle is inverted, and ``det J = |p|² − |q|²``. An *isotropic* energy, one that
+does not change when triangle or image are turned, is a function ``φ(a, b)`` of ``a = |p|²`` and
+``b = |q|²``, and in (p, q) its second derivative falls apart by itself::
+
+    across p (turning it)      2 φ_a
+    across q (turning it)      2 φ_b                                               ┐ four numbers, no
+    along p and q              ⎡ 2 φ_a + 4a φ_aa      4 √(ab) φ_ab    ⎤            │ eigensolver
+                               ⎣ 4 √(ab) φ_ab         2 φ_b + 4b φ_bb ⎦            ┘ needed
+
+====================  ===================  ============================  ===========
+energy                in singular values   φ, with D = det J = a − b     paper
+====================  ===================  ============================  ===========
+`MIPS`                σ₁/σ₂ + σ₂/σ₁ − 2    4b / D                        §10
+`SymmetricDirichlet`  Σ σᵢ² + σᵢ⁻² − 4     2 (D − 1)²/D + 4b (1 + D⁻²)   §3
+`ARAP`                Σ (σᵢ − 1)²          2 (√a − 1)² + 2b              E₁, §11.1.1
+`AreaPreserving`      (σ₁σ₂ − 1)²          (D − 1)²                      E₂, §11.1.2
+`AreaBarrier`         σ₁σ₂ + 1/(σ₁σ₂) − 2  (D − 1)²/D                    E_a, §10.2
+`MassSpring`          lengths of sides     in `springs`                  E₃, §11.1.3
+====================  ===================  ============================  ===========
+
+All are zero at isometries (MIPS at similarities) and nowhere negative. All but MIPS compare lengths, so
+the map must be brought to the surface's scale first; `DeformationEnergy` does that.
+
+To add an energy, derive from `Isotropic` (three short functions of a and b) or from `Energy`, and let
+`quasiharmonic.energies.derivatives.check_energy` look at it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """The Jacobian of a map on every triangle, as energies read it.
+
+    Attributes
+    ----------
+    p, q : (f,) complex128
+        ``∂w/∂z`` and ``∂w/∂z̄``.
+    det : (f,) float64
+        ``|p|² − |q|²``, as accurate as the caller knows it: for thin triangles the area of the image over
+        the triangle's own has digits that the difference of squares has lost.
+    """
+
+    p: ComplexArray
+    q: ComplexArray
+    det: FloatArray
+
+    @classmethod
+    def of(cls, p: ComplexArray, q: ComplexArray) -> Deformation:
+        """From the derivatives alone."""
+        return cls(p, q, (np.abs(p) - np.abs(q)) * (np.abs(p) + np.abs(q)))
+
+    @cached_property
+    def a(self) -> FloatArray:
+        """``|p|²``."""
+        return self.p.real**2 + self.p.imag**2
+
+    @cached_property
+    def b(self) -> FloatArray:
+        """``|q|²``."""
+        return self.q.real**2 + self.q.imag**2
+
+
+@dataclass(frozen=True)
+class QuadraticForm:
+    """A quadratic form in (dp, dq) on every triangle, in the ten numbers that one has on ℝ⁴.
+
+    ::
+
+        pp |dp|² + qq |dq|² + Re(p2 dp² + q2 dq² + pq dp dq + pq̄ dp conj(dq))
+
+    Attributes
+    ----------
+    pp, qq : (f,) float64
+    p2, q2, pq, pqc : (f,) complex128
+    """
+
+    pp: FloatArray
+    qq: FloatArray
+    p2: ComplexArray
+    q2: ComplexArray
+    pq: ComplexArray
+    pqc: ComplexArray
+
+    def apply(self, dp: ComplexArray, dq: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """The form's matrix times (dp, dq), real and imaginary parts as two reals each."""
+        along_p = self.pp * dp + np.conj(self.p2 * dp) + 0.5 * (np.conj(self.pq * dq) + np.conj(self.pqc) * dq)
+        along_q = self.qq * dq + np.conj(self.q2 * dq) + 0.5 * (np.conj(self.pq * dp) + self.pqc * dp)
+        return along_p, along_q
+
+    def scaled(self, factor: FloatArray) -> QuadraticForm:
+        """The form times a number on every triangle, (f,) float64."""
+        return QuadraticForm(
+            factor * self.pp,
+            factor * self.qq,
+            factor * self.p2,
+            factor * self.q2,
+            factor * self.pq,
+            factor * self.pqc,
+        )
+
+    def matrices(self) -> FloatArray:
+        """The symmetric matrices (f, 4, 4) float64 by Re p, Im p, Re q, Im q."""
+        columns = []
+        for dp, dq in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
+            along_p, along_q = self.apply(np.full(self.p2.shape, dp + 0j), np.full(self.p2.shape, dq + 0j))
+            columns.append([along_p.real, along_p.imag, along_q.real, along_q.imag])
+        return np.moveaxis(np.array(columns), 2, 0)
+
+
+class Energy(ABC):
+    """A deformation energy per unit of rest area.
+
+    Attributes
+    ----------
+    barrier : bool
+        Whether it grows beyond all bounds as a triangle collapses. Such energies are infinite, and have no
+        derivatives, where ``det J ≤ 0``; the others are finite for inverted triangles too.
+    """
+
+    barrier: bool = False
+
+    @abstractmethod
+    def density(self, d: Deformation) -> FloatArray:
+        """The energy per unit of rest area.
+
+        Parameters
+        ----------
+        d : Deformation
+            Jacobians of f triangles, as p = ∂w/∂z and q = ∂w/∂z̄.
+
+        Returns
+        -------
+        (f,) float64
+            Without unit, as the Jacobians are; ``inf`` outside of its domain.
+        """
+
+    @abstractmethod
+    def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
+        """Derivatives of the density by p and q.
+
+        Parameters
+        ----------
+        d : Deformation
+
+        Returns
+        -------
+        by_p, by_q : (f,) complex128
+            ``∂/∂Re + i ∂/∂Im`` of each.
+        """
+
+    def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivative as a quadratic form in (dp, dq).
+
+        Parameters
+        ----------
+        d : Deformation
+        negative : float
+            What becomes of negative eigenvalues: they are multiplied by this. 0 clamps them, which makes
+            the form positive semidefinite; -1 takes absolute values, a more careful choice while the energy
+            is far from quadratic; 1 leaves the second derivative as it is.
+
+        Returns
+        -------
+        QuadraticForm
+            One for each triangle.
+
+        Raises
+        ------
+        NotImplementedError
+            From energies that know first derivatives only; they can be descended, not polished.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no second derivatives")
+
+
+class Isotropic(Energy):
+    """An energy ``φ(a, b)`` of ``a = |p|²`` and ``b = |q|²``; the rest follows from φ's derivatives.
+
+    Singular values enter as ``σ₁² + σ₂² = 2 (a + b)`` and ``σ₁σ₂ = det = a − b``.
+
+    Examples
+    --------
+    A neo-Hookean energy, ``σ₁² + σ₂² − 2 − 2 log σ₁σ₂``, which `quasiharmonic.polish` can lower:
+
+    >>> class NeoHookean(Isotropic):
+    ...     barrier = True
+    ...     def density(self, d):
+    ...         return np.where(d.det > 0, 2 * (d.a + d.b - 1 - np.log(np.abs(d.det))), np.inf)
+    ...     def slopes(self, d):
+    ...         return 2 - 2 / d.det, 2 + 2 / d.det
+    ...     def bends(self, d):
+    ...         return 2 / d.det**2, -2 / d.det**2, 2 / d.det**2
+    >>> from quasiharmonic.energies.derivatives import check_energy
+    >>> check_energy(NeoHookean()).passed
+    True
+    """
+
+    @abstractmethod
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``φ_a, φ_b``."""
+
+    @abstractmethod
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``φ_aa, φ_ab, φ_bb``."""
+
+    def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
+        """Derivatives by p and q."""
+        slope_a, slope_b = self.slopes(d)
+        return 2 * slope_a * d.p, 2 * slope_b * d.q
+
+    def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivative as a quadratic form in (dp, dq)."""
+        slope_a, slope_b = self.slopes(d)
+        aa, ab, bb = self.bends(d)
+        turn_p, turn_q = 2 * slope_a, 2 * slope_b
+        along_p, along_q = turn_p + 4 * d.a * aa, turn_q + 4 * d.b * bb
+        turn_p, turn_q = damped(turn_p, negative), damped(turn_q, negative)
+        along_p, kept, along_q = _filtered(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
+        mixed = 4 * kept * ab
+        # Where p or q vanishes its direction does not matter: along and across are alike.
+        to_p: ComplexArray = np.conj(d.p)
+        to_q: ComplexArray = np.conj(d.q)
+        return QuadraticForm(
+            pp=0.5 * (along_p + turn_p),
+            qq=0.5 * (along_q + turn_q),
+            p2=0.5 * (along_p - turn_p) * inverse(d.a) * to_p**2,
+            q2=0.5 * (along_q - turn_q) * inverse(d.b) * to_q**2,
+            pq=mixed * to_p * to_q,
+            pqc=mixed * to_p * d.q,
+        )
+
+
+def damped(eigenvalue: FloatArray, negative: float) -> FloatArray:
+    """Eigenvalues with the negative ones multiplied by ``negative``."""
+    return np.where(eigenvalue < 0, negative * eigenvalue, eigenvalue)
+
+
+def _filtered(
+    xx: FloatArray, xy: FloatArray, yy: FloatArray, negative: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Symmetric 2×2 matrices with their negative eigenvalues multiplied by ``negative``.
+
+    Returns the diagonal entries, and between them what the off-diagonal entry is multiplied by.
+    """
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    radius = np.sqrt(half**2 + xy**2)
+    # Eigenvalues mean ± radius, projectors ½ (1 ± K/radius) with K the traceless part.
+    upper, lower = damped(mean + radius, negative), damped(mean - radius, negative)
+    centre = 0.5 * (upper + lower)
+    kept = 0.5 * (upper - lower) * inverse(radius)
+    return centre + kept * half, kept, centre - kept * half
+
+
+class MIPS(Isotropic):
+    """``σ₁/σ₂ + σ₂/σ₁ − 2``: conformal, blind to scale (Hormann and Greiner 2000; §10)."""
+
+    barrier = True
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``4 b / D``."""
+        return _where_positive(d.det, 4 * d.b / _positive(d.det))
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``−4b/D², 4a/D²``."""
+        scale = 4 / _positive(d.det) ** 2
+        return -scale * d.b, scale * d.a
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``8b/D³, −4(a + b)/D³, 8a/D³``."""
+        scale = 8 / _positive(d.det) ** 3
+        return scale * d.b, -0.5 * scale * (d.a + d.b), scale * d.a
+
+
+class SymmetricDirichlet(Isotropic):
+    """``σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4``: isometric, as much against shrinking as against stretching."""
+
+    barrier = True
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``2 (D − 1)²/D + 4b (1 + D⁻²)``."""
+        det = _positive(d.det)
+        return _where_positive(d.det, 2 * (det - 1) ** 2 / det + 4 * d.b * (1 + det**-2))
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``2 − 2/D² − 8b/D³`` and ``2 + 6/D² + 8b/D³``."""
+        det = _positive(d.det)
+        shear = 8 * d.b / det**3
+        return 2 - 2 / det**2 - shear, 2 + 6 / det**2 + shear
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``4/D³ + 24b/D⁴, −12/D³ − 24b/D⁴, 20/D³ + 24b/D⁴``."""
+        det = _positive(d.det)
+        cubic = 4 / det**3
+        shear = 24 * d.b / det**4
+        return cubic + shear, -3 * cubic - shear, 5 * cubic + shear
+
+
+class ARAP(Isotropic):
+    """``(σ₁ − 1)² + (σ₂ − 1)²``, as rigid as possible (E₁, §11.1.1).
+
+    With the signed ``σ₂``, that is with the nearest *rotation* (Sorkine and Alexa 2007): an inverted
+    triangle is charged for being inverted. On all others this is the paper's E₁ (`UnsignedARAP`).
+    """
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``2 (√a − 1)² + 2b``."""
+        return 2 * (np.sqrt(d.a) - 1) ** 2 + 2 * d.b
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``2 − 2/√a, 2``; at p = 0, where there is a kink, the pull to either side is left out."""
+        return 2 - 2 * inverse(np.sqrt(d.a)), np.full(d.b.shape, 2.0)
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``a^(−3/2), 0, 0``."""
+        zero = np.zeros(d.b.shape)
+        return inverse(np.sqrt(d.a)) ** 3, zero, zero
+
+
+class UnsignedARAP(Isotropic):
+    """``(σ₁ − 1)² + (σ₂ − 1)²`` with ``σ₂ ≥ 0``: E₁ as §11.1.1 has it.
+
+    With the nearest orthogonal matrix, reflections too: a mirrored triangle costs nothing. On maps without inverted
+    triangles it is `ARAP`.
+    """
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``2 (√c − 1)² + 2e``, c the larger of a and b, e the smaller."""
+        return 2 * (np.sqrt(np.maximum(d.a, d.b)) - 1) ** 2 + 2 * np.minimum(d.a, d.b)
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``2 − 2/√c`` and 2; where a = b there is a ridge, and its side without inversion counts."""
+        upright = d.a >= d.b
+        slope = 2 - 2 * inverse(np.sqrt(np.maximum(d.a, d.b)))
+        return np.where(upright, slope, 2.0), np.where(upright, 2.0, slope)
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``c^(−3/2)`` for the larger one, and zeros."""
+        upright = d.a >= d.b
+        bend = inverse(np.sqrt(np.maximum(d.a, d.b))) ** 3
+        return np.where(upright, bend, 0.0), np.zeros(d.b.shape), np.where(upright, 0.0, bend)
+
+
+class AreaPreserving(Isotropic):
+    """``(σ₁σ₂ − 1)²`` (E₂, §11.1.2)."""
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``(D − 1)²``."""
+        return (d.det - 1) ** 2
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``2 (D − 1), −2 (D − 1)``."""
+        slope = 2 * (d.det - 1)
+        return slope, -slope
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``2, −2, 2``."""
+        two = np.full(d.det.shape, 2.0)
+        return two, -two, two
+
+
+class AreaBarrier(Isotropic):
+    """``det J + 1/det J − 2``: area-preserving, infinite at collapse (Garanzha et al. 2021's E_a; §10.2)."""
+
+    barrier = True
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``(D − 1)²/D``."""
+        det = _positive(d.det)
+        return _where_positive(d.det, (det - 1) ** 2 / det)
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``1 − 1/D²`` and its negative."""
+        slope = 1 - _positive(d.det) ** -2.0
+        return slope, -slope
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``2/D³, −2/D³, 2/D³``."""
+        bend = 2 * _positive(d.det) ** -3.0
+        return bend, -bend, bend
+
+
+class Combination(Isotropic):
+    """A weighted sum of isotropic energies, projected as one.
+
+    Parameters
+    ----------
+    *terms : (float, Isotropic)
+        Positive factors and energies.
+    """
+
+    def __init__(self, *terms: tuple[float, Isotropic]) -> None:
+        self.terms = terms
+        self.barrier = any(energy.barrier for _, energy in terms)
+
+    def density(self, d: Deformation) -> FloatArray:
+        """The sum of the densities."""
+        return np.sum([factor * energy.density(d) for factor, energy in self.terms], axis=0)
+
+    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """The sums of the first derivatives."""
+        a, b = np.sum([factor * np.stack(energy.slopes(d)) for factor, energy in self.terms], axis=0)
+        return a, b
+
+    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The sums of the second derivatives."""
+        aa, ab, bb = np.sum([factor * np.stack(energy.bends(d)) for factor, energy in self.terms], axis=0)
+        return aa, ab, bb
+
+
+def conformal_area_blend(theta: float = 1 / 128) -> Combination:
+    """``(1 − θ) MIPS + θ E_a``: the energy of Garanzha et al. (§10.2), with their θ unless another is given.
+
+    A little of the area term keeps the map's scale from varying without bounds, which MIPS alone allows.
+
+    Parameters
+    ----------
+    theta : float
+        Share θ of the area term ``E_a = D + 1/D − 2``, from 0 to 1.
+
+    Returns
+    -------
+    Combination
+
+    Raises
+    ------
+    ValueError
+        When θ is not in [0, 1].
+    """
+    if not 0 <= theta <= 1:
+        raise ValueError(f"theta must be between 0 and 1, not {theta}")
+    return Combination((1 - theta, MIPS()), (theta, AreaBarrier()))
+
+
+def _positive(det: FloatArray) -> FloatArray:
+    """The determinants, NaN where there is no barrier energy."""
+    return np.where(det > 0, det, np.nan)
+
+
+def _where_positive(det: FloatArray, value: FloatArray) -> FloatArray:
+    return np.where(det > 0, value, np.inf)
+
+
+def inverse(x: FloatArray) -> FloatArray:
+    """``1/x``, and 0 at 0."""
+    return np.where(x > 0, 1 / np.where(x > 0, x, 1), 0.0)

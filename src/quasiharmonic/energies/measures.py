@@ -1,0 +1,371 @@
+"""Distortion of a map, triangle by triangle and summed up (§10, §11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.distances import DistanceError, surface_distances
+from quasiharmonic.energies.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_choice,
+    check_range,
+    counted,
+    map_array,
+    triangle_array,
+    triangle_rows,
+    vertex_array,
+)
+from quasiharmonic.util.display import Displayable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Measures that `Distortion` has for every triangle, in the order in which reports list them.
+MEASURES = (
+    "sigma1",
+    "sigma2",
+    "mips",
+    "conformal",
+    "isometric",
+    "symmetric_dirichlet",
+    "arap",
+    "area_ratio",
+    "shear",
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One measure over the surface; means and quantiles are weighted by rest area.
+
+    Attributes
+    ----------
+    mean, median, p95 : float
+        Mean, and the values below which lies half and 95 % of the area.
+    minimum, maximum : float
+        Over all triangles, however small.
+    lowest, highest : int
+        The triangles where these are attained.
+    """
+
+    mean: float
+    median: float
+    p95: float
+    minimum: float
+    maximum: float
+    lowest: int
+    highest: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, which has no infinity: what is not finite is None."""
+        return {key: value if np.isfinite(value) else None for key, value in vars(self).items()}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Distortion(Displayable):
+    """What a map does to every triangle; made by `distortion`.
+
+    The Jacobian is that of the affine map from the rest triangle, laid into the plane counterclockwise, to
+    its image. Its singular values are *signed*: ``σ₁ ≥ |σ₂|``, and ``σ₂`` has the sign of the image's
+    orientation, decided exactly. So ``det J = σ₁ σ₂``, and a triangle is inverted where ``σ₂ < 0`` and
+    has no area where ``σ₂ = 0``.
+
+    ===================== ================================= ========= ==================================
+    measure (f,) float64  formula                           scaled    where ``σ₂ ≤ 0``
+    ===================== ================================= ========= ==================================
+    `sigma1`, `sigma2`    singular values                   as given  ``σ₂`` signed
+    `mips`                σ₁/σ₂ + σ₂/σ₁ − 2  (§10)          no matter inf
+    `conformal`           σ₁/σ₂                             no matter inf
+    `isometric`           max(σ₁, 1/σ₂)                     yes       inf
+    `symmetric_dirichlet` σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4     yes       inf
+    `arap`                (σ₁ − 1)² + (σ₂ − 1)²             yes       finite, with the signed ``σ₂``
+    `area_ratio`          σ₁ σ₂                             yes       negative or 0
+    `shear`               |μ| = (σ₁ − σ₂)/(σ₁ + σ₂)         no matter 1 or more; inf where it is mirrored
+                                                                      at angles kept, NaN at a point
+    ===================== ================================= ========= ==================================
+
+    *Scaled* measures compare lengths or areas, so they are taken after the map has been scaled, as a
+    whole, to the surface's area: singular values are multiplied by `scale`. What is zero or one for an
+    isometry is so for any similarity then.
+
+    Triangles without area in the rest mesh (`flat`) have no Jacobian: everything is NaN there, and sums
+    and extremes leave them out.
+
+    Attributes
+    ----------
+    share : (f,) float64
+        Rest areas over the surface's area.
+    scale : float
+        ``√(rest area / Σ |image areas|)``; 1 when one of them is zero.
+    sigma1, sigma2 : (f,) float64
+        Singular values of the map as given.
+    beltrami : (f,) complex128
+        ``μ = q/p = (∂w/∂z̄)/(∂w/∂z)``, in the frame whose real axis points from vertex 0 to vertex 1 of
+        the triangle; `shear` is its modulus.
+    flat : (k,) int64
+        Triangles without area in the rest mesh.
+    flipped : (l,) int64
+        Triangles whose image is inverted or has no area, flat ones excepted.
+    V, F, uv : arrays
+        The surface and the map that were measured.
+    distances : DistanceError or None
+        How far distances between vertices are off, where that was asked for.
+    """
+
+    share: FloatArray
+    scale: float
+    sigma1: FloatArray
+    sigma2: FloatArray
+    mips: FloatArray
+    conformal: FloatArray
+    isometric: FloatArray
+    symmetric_dirichlet: FloatArray
+    arap: FloatArray
+    area_ratio: FloatArray
+    shear: FloatArray
+    beltrami: ComplexArray
+    flat: IntArray
+    flipped: IntArray
+    V: FloatArray
+    F: IntArray
+    uv: FloatArray
+    distances: DistanceError | None = None
+
+    def per_triangle(self) -> dict[str, FloatArray]:
+        """Every measure by its name, (f,) float64 each."""
+        return {name: getattr(self, name) for name in MEASURES}
+
+    @overload
+    def summary(self, measure: None = None) -> str: ...
+    @overload
+    def summary(self, measure: str) -> Summary: ...
+    def summary(self, measure: str | None = None) -> str | Summary:
+        """Sum up one measure, or all of them in a table of text.
+
+        Parameters
+        ----------
+        measure : str, optional
+            One of `MEASURES`.
+
+        Returns
+        -------
+        Summary or str
+
+        Raises
+        ------
+        ValueError
+            When there is no such measure, or no triangle on which it is defined.
+        """
+        if measure is None:
+            return self._table()
+        check_choice("measure", measure, MEASURES)
+        values = self.per_triangle()[measure]
+        defined = np.flatnonzero(~np.isnan(values))
+        if not defined.size:
+            raise ValueError(f"{measure} is defined on no triangle")
+        value, share = values[defined], self.share[defined]
+        order = np.argsort(value, kind="stable")
+        below = np.cumsum(share[order])
+        median, p95 = value[order[np.searchsorted(below, [0.5 * below[-1], 0.95 * below[-1]])]].tolist()
+        with np.errstate(invalid="ignore"):  # what is infinite either way has no mean
+            mean = float(np.sum(share / below[-1] * value))
+        return Summary(
+            mean=mean,
+            median=median,
+            p95=p95,
+            minimum=float(value[order[0]]),
+            maximum=float(value[order[-1]]),
+            lowest=int(defined[order[0]]),
+            highest=int(defined[order[-1]]),
+        )
+
+    def _table(self) -> str:
+        """All measures, a line each."""
+        lines = [f"{'':>19} {'median':>10} {'95 %':>10} {'max':>10}"]
+        for name, values in self.per_triangle().items():
+            if not np.isnan(values).all():
+                one = self.summary(name)
+                lines.append(f"{name:>19} {one.median:>10.4g} {one.p95:>10.4g} {one.maximum:>10.4g}")
+        for found, what in ((self.flipped, "inverted or without area"), (self.flat, "without area in the rest mesh")):
+            if found.size:
+                lines.append(f"{len(found):,} of {len(self.F):,} triangles {what}")
+        return "\n".join(lines)
+
+    def short_repr(self) -> str:
+        triangles = counted("triangle", "triangles", len(self.F))
+        if self.flipped.size:
+            return f"{triangles}, {self.flipped.size:,} inverted or without area"
+        if np.isnan(self.isometric).all():
+            return f"{triangles}, all without area in the rest mesh"
+        one = self.summary("isometric")
+        return f"{triangles}, stretch max(σ₁, 1/σ₂) {one.median:.3g} in the median, {one.maximum:.3g} at most"
+
+    def plot(self, measure: str = "isometric") -> Figure:
+        """Draw surface and map coloured by a measure, and its histogram; `quasiharmonic.plot.plot_distortion`."""
+        figure: Figure = self._draw("distortion", measure=measure)
+        return figure
+
+    def to_dict(self) -> dict[str, Any]:
+        """Counts, and the summaries of all measures (None where undefined), for JSON."""
+        summaries = {
+            name: None if np.isnan(values).all() else self.summary(name).to_dict()
+            for name, values in self.per_triangle().items()
+        }
+        return {
+            "scale": self.scale if np.isfinite(self.scale) else None,
+            "flat": int(self.flat.size),
+            "flipped": int(self.flipped.size),
+            **summaries,
+            **({} if self.distances is None else {"distances": self.distances.to_dict()}),
+        }
+
+
+@takes_mesh
+def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None = None) -> Distortion:
+    """Measure what a map does to every triangle of a surface; and, if asked for, to distances farther apart.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles are
+        counterclockwise.
+    F : (f, 3) array of int
+        Triangles. They need not form a surface.
+    uv : (n, 2) array
+        The map, injective or not.
+    rings : int, optional
+        Measure too how far distances between vertices at most so many edges apart are off, along the surface against
+        in the plane: from up to 1,000 vertices drawn at random, always the same, to all others within reach (20 is
+        usual in brain mapping). To judge several maps by one sample, or a larger one, see
+        `quasiharmonic.energies.distances.surface_distances`.
+
+    Returns
+    -------
+    Distortion
+        Every measure per triangle; `Distortion.summary` and `Distortion.to_dict` sum them up.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape, there are no triangles, an index is out of range, or a coordinate
+        is not finite.
+
+    Examples
+    --------
+    A square of side 2 stretched to a rectangle of 6 by 3: after scaling it to the square's area, by √2
+    one way and 1/√2 the other.
+
+    >>> V, F = [[0, 0], [2, 0], [2, 2], [0, 2]], [[0, 1, 2], [0, 2, 3]]
+    >>> found = distortion(V, F, [[0, 0], [6, 0], [6, 3], [0, 3]])
+    >>> found.sigma1.round(12).tolist(), found.sigma2.round(12).tolist()
+    ([3.0, 3.0], [1.5, 1.5])
+    >>> found.conformal.round(12).tolist(), found.mips.round(12).tolist()
+    ([2.0, 2.0], [0.5, 0.5])
+    >>> round(found.summary("isometric").maximum, 6)
+    1.414214
+    """
+    V = vertex_array(V)
+    F, uv = triangle_array(F, len(V)), map_array("uv", uv, len(V))
+    off = None if rings is None else surface_distances(V, F, rings=rings).error(uv)
+    # What leaves the numbers' range in extreme maps becomes inf, 0 or NaN as the formulas have it.
+    with np.errstate(all="ignore"):
+        return replace(_measured(V, F, uv), distances=off)
+
+
+def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
+    """Mean-ratio quality of planar triangles, ``4√3 · area / (a² + b² + c²)`` for edges a, b, c.
+
+    Parameters
+    ----------
+    points : (n, 2) array
+        Finite.
+    F : (f, 3) array of int
+
+    Returns
+    -------
+    (f,) float64
+        1 for an equilateral triangle, 0 for one without area, negative for one wound clockwise. The sign is
+        exact.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape or dtype, ``F`` refers to vertices that there are not, or a triangle's corner
+        is not finite.
+    """
+    places, triangles = map_array("points", points, finite=False), triangle_rows(F)
+    check_range("F", triangles, len(places))
+    corners = places[triangles]
+    sign = orientation(*(corners[:, k] for k in range(3)))
+    sides = corners - np.roll(corners, 1, axis=1)
+    longest = np.abs(sides).max(axis=(1, 2), initial=0.0)
+    # In units of the longest side, so that no square leaves the numbers' range.
+    a, b, c = (sides / np.where(longest > 0, longest, 1.0)[:, None, None]).transpose(1, 0, 2)
+    squares = (a * a).sum(axis=1) + (b * b).sum(axis=1) + (c * c).sum(axis=1)
+    area = np.maximum(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, np.finfo(float).tiny)
+    return np.asarray(sign * 4 * np.sqrt(3) * area / np.where(squares > 0, squares, 1.0))
+
+
+def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
+    shapes = rest_shapes(V, F)
+    exponent = int(np.frexp(np.abs(uv).max(initial=0))[1]) - 1
+    unit = float(np.ldexp(1.0, exponent))
+    w = np.ldexp(uv, -exponent).view(np.complex128).ravel()
+    w0 = w[F[:, 0]]
+    d1, d2 = w[F[:, 1]] - w0, w[F[:, 2]] - w0
+    left, right = d1.real * d2.imag, d1.imag * d2.real
+    area, noise = 0.5 * (left - right), 2.0**-52 * (np.abs(left) + np.abs(right))
+    # Where rounding may have changed the area's sign, the sign is decided exactly.
+    sign = orientation(*(uv[F[:, k]] for k in range(3)))
+    area = np.where(np.abs(area) <= noise, sign * noise, area)
+
+    g = shapes.half_gradients()
+    p, q = d1 * g[1].conj() + d2 * g[2].conj(), d1 * g[1] + d2 * g[2]
+    defined = shapes.m > 0
+    det = area / np.where(defined, shapes.m, np.nan)
+    sigma1 = np.abs(p) + np.abs(q)
+    sigma2 = np.where(sigma1 > 0, det / np.where(sigma1 > 0, sigma1, 1), sigma1)
+    total, image = float(shapes.m.sum()), float(np.abs(area).sum())
+    units = unit / shapes.unit
+    # From the units of computation to the surface's area.
+    scale = float(np.sqrt(total / image)) if image > 0 and total > 0 else units
+    scaled = Deformation(scale * p, scale * q, scale * scale * det)
+    scaled1, scaled2 = scale * sigma1, scale * sigma2
+    beltrami = np.where(p != 0, q / np.where(p != 0, p, 1), np.where(q != 0, np.inf, np.nan))
+    # Comparisons with NaN are false, and would give the barriers' infinity.
+    undefined = np.where(defined, 0.0, np.nan)
+    return Distortion(
+        share=shapes.m / np.float64(total),
+        scale=scale / units if units else np.inf,
+        sigma1=sigma1 * units,
+        sigma2=sigma2 * units,
+        mips=MIPS().density(scaled) + undefined,
+        conformal=_ratio(scaled1, scaled2) + undefined,
+        isometric=np.maximum(scaled1, _ratio(1.0, scaled2)) + undefined,
+        symmetric_dirichlet=SymmetricDirichlet().density(scaled) + undefined,
+        arap=ARAP().density(scaled),
+        area_ratio=scaled.det,
+        shear=np.abs(beltrami) + undefined,
+        beltrami=beltrami + undefined,
+        flat=shapes.flat,
+        flipped=np.flatnonzero(defined & (sign <= 0)),
+        V=V,
+        F=F,
+        uv=uv,
+    )
+
+
+def _ratio(numerator: FloatArray | float, denominator: FloatArray) -> FloatArray:
+    """The quotient, infinite where the denominator is not positive."""
+    positive = denominator > 0
+    return np.where(positive, numerator / np.where(positive, denominator, 1), np.inf)

@@ -1,0 +1,109 @@
+"""Sums of the package's own isotropic energies, in one pass over the triangles: their mean, its derivatives."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from quasiharmonic.energies.energies import (
+    ARAP,
+    MIPS,
+    AreaBarrier,
+    Combination,
+    Deformation,
+    Energy,
+    Isotropic,
+    QuadraticForm,
+    SymmetricDirichlet,
+)
+from quasiharmonic.geometry.mesh.reference import blocks
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.kernels import compiled
+
+#: Of which a mixture is made, in the order of its factors.
+OWN: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
+
+
+def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
+    """The factors of `OWN` of which an energy is the sum, (4,) float64; None where it is something else.
+
+    ``parts`` are the methods that matter: who derives from one of `OWN` and leaves these as they are counts as it.
+    """
+    if type(energy) is not Combination:
+        return _factors(type(energy), parts)
+    factors = np.zeros(len(OWN))
+    for factor, term in energy.terms:
+        part = mixture_of(term, *parts)
+        if part is None:
+            return None
+        factors += factor * part
+    return factors
+
+
+@cache
+def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
+    for energy, factors in zip(OWN, np.eye(len(OWN)), strict=True):
+        own = type(energy)
+        if issubclass(kind, own) and all(getattr(kind, part) is getattr(own, part) for part in parts):
+            return factors
+    return None
+
+
+def energy_of(mixture: FloatArray) -> Isotropic:
+    """The way back: an energy that is the sum."""
+    terms = [(float(factor), energy) for factor, energy in zip(mixture, OWN, strict=True) if factor]
+    return terms[0][1] if len(terms) == 1 and terms[0][0] == 1 else Combination(*terms)
+
+
+@compiled
+def mixed_energy(mixture: FloatArray, p: ComplexArray, q: ComplexArray, det: FloatArray, share: FloatArray) -> float:
+    """The sum of densities times ``share``, all (f,)."""
+    return float(np.sum(share * energy_of(mixture).density(Deformation(p, q, det))))
+
+
+@compiled
+def mixed_slopes(
+    mixture: FloatArray, p: ComplexArray, q: ComplexArray, det: FloatArray, by_p: ComplexArray, by_q: ComplexArray
+) -> None:
+    """Fill in the densities' derivatives by p and q."""
+    energy = energy_of(mixture)
+    for part in blocks(det.size):
+        by_p[part], by_q[part] = energy.gradient(Deformation(p[part], q[part], det[part]))
+
+
+@compiled
+def mixed_curvature(
+    mixture: FloatArray,
+    p: ComplexArray,
+    q: ComplexArray,
+    det: FloatArray,
+    share: FloatArray,
+    negative: float,
+    pp: FloatArray,
+    qq: FloatArray,
+    p2: ComplexArray,
+    q2: ComplexArray,
+    pq: ComplexArray,
+    pqc: ComplexArray,
+) -> None:
+    """Fill in the densities' second derivatives as `Energy.curvature` has them, times ``share``, field by field."""
+    energy = energy_of(mixture)
+    for part in blocks(det.size):
+        form = energy.curvature(Deformation(p[part], q[part], det[part]), negative=negative).scaled(share[part])
+        pp[part], qq[part], p2[part], q2[part], pq[part], pqc[part] = (
+            form.pp,
+            form.qq,
+            form.p2,
+            form.q2,
+            form.pq,
+            form.pqc,
+        )
+
+
+def curvature_of_mixture(mixture: FloatArray, d: Deformation, share: FloatArray, negative: float) -> QuadraticForm:
+    """Second derivatives of the sum of densities times ``share``."""
+    f = d.det.size
+    reals, numbers = np.empty((2, f)), np.empty((4, f), dtype=np.complex128)
+    mixed_curvature(mixture, d.p, d.q, d.det, share, negative, *reals, *numbers)
+    return QuadraticForm(*reals, *numbers)

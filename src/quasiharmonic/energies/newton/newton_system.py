@@ -1,0 +1,254 @@
+"""Second derivatives of a deformation energy in vertex positions: assembly, factorisation, solve.
+
+The pattern of the matrix is that of the mesh's edges in 2×2 blocks and never changes, so it is found and
+analysed once. An assembly turns the triangles' quadratic forms into blocks and adds these up into the
+values that the factorisation reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.energies.energies import QuadraticForm
+from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
+from quasiharmonic.linsolve.pattern import stiffness_pattern
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
+from quasiharmonic.util.kernels import compiled
+from quasiharmonic.util.progress import still_at_it
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+# Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
+_CHUNK = 8192
+
+
+class NewtonSystem:
+    """The matrix of ``Σⱼ formⱼ(dp, dq)`` by the positions of the free vertices.
+
+    Unknowns alternate between the x and the y of the free vertices, in ascending order.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles.
+    g : (3, f) complex128
+        Half the gradients of the hat functions: ``dp = Σ conj(gᵢ) dwᵢ`` and ``dq = Σ gᵢ dwᵢ``.
+    n : int
+        Number of vertices.
+    fixed : (k,) int
+        Vertices that do not move.
+    linear_solver : str
+        A name of `quasiharmonic.linsolve`, or ``"auto"``.
+
+    Attributes
+    ----------
+    free : (n - k,) int64
+        The vertices that do, ascending.
+    """
+
+    def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
+        is_free = np.ones(n, dtype=bool)
+        is_free[fixed] = False
+        self.free = np.flatnonzero(is_free)
+        place = np.full(n, -1, dtype=np.int32)
+        place[self.free] = np.arange(self.free.size)
+        self.take_gradients(g)
+        self._pattern(F, place)
+        self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
+
+    def take_gradients(self, g: ComplexArray) -> None:
+        """Have other gradients (3, f) of the hat functions on the same triangles, as another scale gives them."""
+        self._g = np.ascontiguousarray(g, dtype=np.complex128)
+
+    def _pattern(self, F: IntArray, place: NDArray[np.int32]) -> None:
+        """Where the blocks go."""
+        size = self.free.size
+        edges = stiffness_pattern(F, place, size)
+        row, column = edges.row, edges.column
+        # Row 2i holds xx and xy of the diagonal block and then of the others, row 2i + 1 yy and then yx, yy.
+        degree = np.bincount(row, minlength=size)
+        upper = np.append(0, np.cumsum(4 * degree + 3))
+        lower = upper[:-1] + 2 * degree + 2
+        nth = np.arange(row.size) - np.append(0, np.cumsum(degree))[row]
+        self._corner_slots = np.stack([upper[:-1], upper[:-1] + 1, lower])
+        xx, yx = upper[row] + 2 + 2 * nth, lower[row] + 1 + 2 * nth
+        self._side_slots = np.stack([xx, xx + 1, yx, yx + 1])
+        self._indptr = np.append(np.stack([upper[:-1], lower], axis=1).ravel(), upper[-1]).astype(np.int32)
+        self._indices = np.empty(upper[-1], dtype=np.int32)
+        own = 2 * np.arange(size)
+        self._indices[self._corner_slots] = own, own + 1, own + 1
+        self._indices[self._side_slots] = 2 * column, 2 * column + 1, 2 * column, 2 * column + 1
+        self._first = self._indptr[:-1]
+
+        # By triangle: the first entries of both rows of the blocks of its sides, from lower to higher free vertex, and
+        # of its corners. What belongs to a fixed vertex goes where nobody looks, behind the matrix.
+        self._sums = np.empty(upper[-1] + 2)
+        self._values = self._sums[:-2]
+        corner = place[F.T]
+        self._turns = np.where(corner <= corner[(1, 2, 0), :], 1.0, -1.0)
+        self._slots = np.full((2, 2, *corner.shape), upper[-1], dtype=np.int32)
+        of_sides, of_corners = self._slots.reshape(2, 2, -1)
+        nth_side = np.repeat(np.arange(row.size), np.diff(edges.offsets))
+        of_sides[0, edges.halves], of_sides[1, edges.halves] = xx[nth_side], yx[nth_side]
+        free = np.flatnonzero(corner.ravel() >= 0)
+        of = corner.ravel()[free]
+        of_corners[0, free], of_corners[1, free] = upper[of], lower[of] - 1
+
+    def assemble(self, form: QuadraticForm) -> None:
+        """Add up the triangles' quadratic forms.
+
+        Parameters
+        ----------
+        form : QuadraticForm
+            On every triangle, with its area and weight in it.
+        """
+        still_at_it()
+        pp, qq = (np.ascontiguousarray(field, dtype=np.float64) for field in (form.pp, form.qq))
+        rest = form.p2, form.q2, form.pq, form.pqc
+        p2, q2, pq, pqc = (np.ascontiguousarray(field, dtype=np.complex128) for field in rest)
+        add_up(pp, qq, p2, q2, pq, pqc, self._g, self._slots, self._turns, self._sums)
+        self._diagonal = self._values[self._first]
+
+    def add_blocks(self, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> None:
+        """Add a symmetric 2×2 block at every free vertex to the assembled matrix; (n - k,) float64 each."""
+        for slot, part in zip(self._corner_slots, (xx, xy, yy), strict=True):
+            self._values[slot] += part
+        self._diagonal = self._values[self._first]
+
+    @property
+    def diagonal(self) -> FloatArray:
+        """The assembled matrix's, (2 (n - k),) float64."""
+        return self._diagonal
+
+    def matrix(self) -> csr_array:
+        """The assembled matrix, both of its triangles; for study and tests."""
+        from scipy.sparse import csr_array, triu
+
+        size = self._first.size
+        upper = csr_array((self._values.copy(), self._indices, self._indptr), shape=(size, size))
+        return csr_array(upper + triu(upper, k=1).T)
+
+    def factor(self, shift: float = 0.0) -> None:
+        """Factor the assembled matrix.
+
+        Parameters
+        ----------
+        shift : float
+            Fraction by which the diagonal is raised. Measured on the diagonal, it means the same to
+            triangles of any size.
+
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When the matrix, as rounded, is not positive definite.
+        """
+        diagonal = self._diagonal * (1 + shift)
+        # A vertex whose triangles leave it free to move gets a one of its own.
+        self._values[self._first] = np.where(diagonal > 0, diagonal, 1)
+        self.solver.factor(self._values)
+
+    def solve(self, load: ComplexArray) -> ComplexArray:
+        """Solve for the displacements of the free vertices under a load on them; (n - k,) complex128.
+
+        Raises
+        ------
+        quasiharmonic.linsolve.NotPositiveDefinite
+            When the solution has no correct digits.
+        """
+        return self.solver.solve(np.ascontiguousarray(load).view(np.float64)).view(np.complex128)
+
+    def descent(
+        self,
+        gradient: ComplexArray,
+        shifts: Sequence[float],
+        solve: Callable[[ComplexArray], ComplexArray] | None = None,
+    ) -> tuple[ComplexArray, float, int] | None:
+        """Newton's direction by the assembled matrix, its diagonal raised as much as a factorisation needs.
+
+        Parameters
+        ----------
+        gradient : (n - k,) complex128
+            By the free vertices' positions.
+        shifts : sequence of float
+            Fractions by which the diagonal is raised, tried in turn.
+        solve : callable, optional
+            From a load to the displacements under it, with the matrix factored; `solve` by default.
+
+        Returns
+        -------
+        direction : (n - k,) complex128
+        promise : float
+            The rate at which the energy falls along it (the squared decrement); not negative.
+        number : int
+            Of the shift that did. Instead of all three, None where no shift leaves a positive definite matrix.
+        """
+        for number, shift in enumerate(shifts):
+            try:
+                self.factor(shift)
+                direction = (solve or self.solve)(-gradient)
+            except NotPositiveDefinite:
+                continue
+            promise = -work(gradient, direction)
+            if promise >= 0:
+                return direction, promise, number
+        return None
+
+    def solve_diagonal(self, load: ComplexArray) -> ComplexArray:
+        """The load divided by the matrix's diagonal: what is left when no factorisation exists."""
+        diagonal = np.where(self._diagonal > 0, self._diagonal, 1)
+        return (np.ascontiguousarray(load).view(np.float64) / diagonal).view(np.complex128)
+
+
+@compiled
+def add_up(
+    pp: FloatArray,
+    qq: FloatArray,
+    p2: ComplexArray,
+    q2: ComplexArray,
+    pq: ComplexArray,
+    pqc: ComplexArray,
+    g: ComplexArray,
+    slots: NDArray[np.int32],
+    turns: FloatArray,
+    values: FloatArray,
+) -> None:
+    """Fill in the entries of a matrix to which triangles' quadratic forms add up.
+
+    Parameters
+    ----------
+    pp, qq, p2, q2, pq, pqc : (f,)
+        The forms.
+    g : (3, f) complex128
+        Half the gradients of the hat functions.
+    slots : (2, 2, 3, f) int32
+        Where rows of blocks begin in ``values``: of the triangles' sides and of their corners, upper rows and lower.
+    turns : (3, f) float64
+        Of the sides: 1, or -1 where they run from the higher vertex to the lower, and the block is transposed.
+    values : float64
+        The first entries of corners' lower rows, which are below the diagonal, are not in it.
+    """
+    # With dp and dq written out, the form is the real part of Σ Mᵢⱼ conj(dwᵢ) dwⱼ + Nᵢⱼ dwᵢ dwⱼ.
+    values[:] = 0
+    for start in range(0, pp.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        mean, turn = pp[part] + qq[part], turns[:, part] * (pp[part] - qq[part])
+        total, rest, twice, turned = p2[part] + q2[part], p2[part] - q2[part], pq[part], pqc[part]
+        here = g[:, part]
+        for (upper, lower), there in zip(slots[..., part], (here[(1, 2, 0), :], here), strict=True):
+            square, product = here * there.conj(), here * there
+            even = mean * square.real + turned.real * product.real + turned.imag * product.imag
+            odd = twice.real * square.real + total.real * product.real + rest.imag * product.imag
+            cross = rest.real * product.imag - total.imag * product.real - twice.imag * square.real
+            np.add.at(values, upper.ravel(), (even + odd).ravel())
+            np.add.at(values, lower.ravel() + 1, (even - odd).ravel())
+            if there is here:
+                np.add.at(values, upper.ravel() + 1, cross.ravel())
+            else:
+                twist = turn * square.imag
+                np.add.at(values, upper.ravel() + 1, (cross - twist).ravel())
+                np.add.at(values, lower.ravel(), (cross + twist).ravel())

@@ -1,0 +1,317 @@
+"""Newton steps in the places of free vertices and the arc lengths of sliding ones.
+
+A vertex that slides has one unknown, a length δ along its curve: to first order it moves by ``δ τ``, with τ the unit
+tangent, and to second order by ``½ κ δ² iτ`` to the side. With P the matrix that takes unknowns to displacements, g the
+energy's gradient by positions and H its second derivative::
+
+    gradient  Pᵀ g        Hessian  Pᵀ H P + diag(κ g · iτ)
+
+The unknown across the curve keeps its row and column, emptied, so that the pattern is that of the mesh. A step is laid
+back onto the curve by going the length δ along it.
+
+What is descended is the energy and a little of a barrier that keeps the boundary's edges near the curves
+(`quasiharmonic.geometry.curves.deviation`).
+
+At a kink the energy has two slopes. If it falls to neither side the vertex rests there for this step; if it falls to
+one, that is where it may go. Where a step over kinks leads nowhere, one that stops at them does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Deformation, QuadraticForm, damped
+from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
+from quasiharmonic.energies.newton.newton_descent import FRACTION, HALVINGS, SHIFTS, NewtonDescent, in_units
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.geometry.curves.boundary_curves import Rails, Track, rails_of
+from quasiharmonic.geometry.curves.deviation import Straying
+from quasiharmonic.geometry.exact.certificate import flipped_triangles, is_injective
+from quasiharmonic.geometry.exact.loops import judge_loops
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.problem.result import Status
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
+
+# Of the energy at hand: the weight of the barrier.
+_WEIGHT = 1e-2
+
+
+def lay_boundary(slide: bool | Rails, domain: Domain, uv: FloatArray) -> Track:
+    """Put the boundary of an injective map onto the curves it is to slide along.
+
+    Raises
+    ------
+    ValueError
+        As `Rails.lay`; when triangles are inverted by the way onto the curves.
+    """
+    track = rails_of(slide, domain.loops, uv).lay(domain.loops, uv)
+    flipped = flipped_triangles(domain.F, track.uv)
+    if flipped.size:
+        raise ValueError(
+            f"with the boundary on the curves to slide along, {named('triangle', 'triangles', flipped)} inverted or "
+            "without area: let it be there from the start (injective_map with slide, or qhm map --slide)"
+        )
+    return track
+
+
+def moved_onto(slide: bool | Rails, problem: Problem) -> Problem:
+    """The problem with its boundary's target on the curves that it is to slide along."""
+    places = np.zeros((problem.n, 2))
+    places[problem.fixed] = problem.target
+    loops = problem.domain.loops
+    track = rails_of(slide, loops, places).lay(loops, places)
+    return problem.moved(track.uv[problem.fixed])
+
+
+#: A map in units, lengths along the curves, the map's Jacobians, and its energy without the barrier.
+_State: TypeAlias = tuple[ComplexArray, FloatArray, Deformation, float]
+
+
+class SlidingSystem(NewtonSystem):
+    """The matrix of Newton's steps in which some vertices have one unknown, the length along their curve.
+
+    Parameters
+    ----------
+    F, g, n, fixed, linear_solver
+        As of `NewtonSystem`; ``fixed`` without those that slide.
+    sliding : (k,) int64
+        Vertices that do.
+
+    Attributes
+    ----------
+    sliding : (k,) int64
+        As given, in their order.
+    """
+
+    def __init__(
+        self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str, sliding: IntArray
+    ) -> None:
+        super().__init__(F, g, n, fixed, linear_solver)
+        size = self.free.size
+        self.sliding = sliding
+        self.at: IntArray = np.searchsorted(self.free, sliding)
+        place = np.full(size, -1)
+        place[self.at] = np.arange(sliding.size)
+        row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
+        ends = place[row // 2], place[self._indices[self._side_slots[0]] // 2]
+        # Blocks of which a row, or a column, belongs to a sliding vertex, and to which.
+        self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
+        self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
+        self._row = row // 2
+        self.tangent: ComplexArray = np.zeros(sliding.size, dtype=np.complex128)
+        self.bend: FloatArray = np.zeros(sliding.size)
+        self._coupled: IntArray = np.empty(0, dtype=np.int64)
+        self.coupling: FloatArray = np.zeros(0)
+
+    def couple(self, pairs: IntArray) -> None:
+        """Name pairs (e, 2) of sliding vertices, each an edge of the mesh, between whose unknowns ``coupling`` is."""
+        low, high = np.sort(self.at[pairs], axis=1).T
+        column = self._indices[self._side_slots[0]] // 2
+        size = self.free.size
+        keys = self._row * size + column
+        self._coupled = self._side_slots[0, np.searchsorted(keys, low * size + high)]
+        self.coupling = np.zeros(len(pairs))
+
+    def assemble(self, form: QuadraticForm) -> None:
+        """Add up the triangles' forms and pass to the unknowns along ``tangent``; ``bend`` is added on the diagonal."""
+        super().assemble(form)
+        values, slots = self._values, self._side_slots
+        x, y = self.tangent.real, self.tangent.imag
+        xx, xy, yx, yy = slots[:, self._by_row]
+        a, b = x[self._of_row], y[self._of_row]
+        values[xx], values[xy] = a * values[xx] + b * values[yx], a * values[xy] + b * values[yy]
+        values[yx] = values[yy] = 0
+        xx, xy, yx, yy = slots[:, self._by_column]
+        a, b = x[self._of_column], y[self._of_column]
+        values[xx], values[yx] = a * values[xx] + b * values[xy], a * values[yx] + b * values[yy]
+        values[xy] = values[yy] = 0
+        xx, xy, yy = self._corner_slots[:, self.at]
+        along = x * x * values[xx] + 2 * x * y * values[xy] + y * y * values[yy]
+        values[xx] = np.where(self.tangent == 0, 0, along + self.bend)
+        values[xy] = values[yy] = 0
+        values[self._coupled] += self.coupling
+        self._diagonal = values[self._first]
+
+
+class SlidingDescent(NewtonDescent):
+    """As `NewtonDescent`, with boundary vertices on curves.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+    track : Track
+        The map, and what slides where.
+    fixed : (k,) int64
+        Vertices that stay where they are, but for those that slide.
+    loops : sequence of (l,) int64
+        The boundary, which may not come to meet itself.
+    exponent : int
+    linear_solver : str
+        As of `NewtonDescent`.
+    system : SlidingSystem, optional
+        Of an earlier descent on the same triangles with the same ``fixed``: used again if the same vertices slide.
+
+    Attributes
+    ----------
+    straying, weight : Straying, float
+        The barrier and its factor, in the energy's units.
+    forces : (k,) float64
+        What the curves' bends add to the second derivative by each sliding vertex's length, in units.
+    """
+
+    system: SlidingSystem
+
+    def __init__(
+        self,
+        energy: DeformationEnergy,
+        track: Track,
+        fixed: IntArray,
+        loops: Sequence[IntArray],
+        exponent: int,
+        linear_solver: str,
+        system: SlidingSystem | None = None,
+    ) -> None:
+        self._earlier = system
+        self._track, self._s, self._loops = track, track.s, list(loops)
+        self.straying = Straying(track, self._loops)
+        super().__init__(energy, track.uv, np.setdiff1d(fixed, track.vertices), exponent, linear_solver)
+        self._energies = self.value, self.value
+        self._weigh()
+        self.first = self.value
+        both = (self.straying.pairs >= 0).all(axis=1)
+        self._both = np.flatnonzero(both)
+        self.system.couple(self.straying.pairs[both])
+        # A map that is injective and no more may overlap itself further.
+        self._simple = not judge_loops(self._loops, track.uv)[1]
+
+    def _system(self, n: int, linear_solver: str) -> SlidingSystem:
+        if self._earlier is not None and np.array_equal(self._earlier.sliding, self._track.vertices):
+            self._earlier.take_gradients(self.energy.g)
+            return self._earlier
+        return SlidingSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver, sliding=self._track.vertices)
+
+    @property
+    def energies(self) -> tuple[float, float]:
+        """The mean energy at the start and now, without the barrier."""
+        return self._energies
+
+    def _weigh(self) -> None:
+        """Give the barrier its part of the energy at hand, which only falls."""
+        self.weight = _WEIGHT * self._energies[1]
+        self.value = self._energies[1] + self.weight * self.straying.value(self._s)
+
+    def step(self, tolerance: float) -> Status | None:
+        """Take one step; a status where there is no other to take."""
+        self._weigh()
+        return super().step(tolerance)
+
+    def gradient(self) -> ComplexArray:
+        """By the unknowns: of a sliding vertex the real part counts, and the imaginary one is zero."""
+        pull = self.energy.gradient_of(self._deformation, self.w.size)
+        at, system = pull[self._track.vertices], self.system
+        slopes, self._bends = self._barrier()
+        kink = self._track.at_kink(self._s)
+        ahead, curvature = self._track.frame(self._s, np.ones(at.size, dtype=bool))
+        back, curvature_back = self._track.frame(self._s, ~kink)
+        slope, slope_back = _along(ahead, at) + slopes, _along(back, at) + slopes
+        # Of the sides to which the energy falls, the steeper one.
+        turned = kink & (slope_back > np.maximum(-slope, 0))
+        rests = kink & (slope >= 0) & (slope_back <= 0)
+        tangent = np.where(rests, 0, np.where(turned, back, ahead))
+        system.tangent = tangent
+        self.forces = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * 2.0**self.exponent
+        # A vertex leaves a kink by the side it was given only.
+        self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
+        gradient = pull[system.free]
+        gradient[system.at] = np.where(tangent == 0, 0, _along(tangent, at) + slopes)
+        return gradient
+
+    def _barrier(self) -> tuple[FloatArray, FloatArray]:
+        """The barrier's derivatives: by the sliding vertices' lengths, in units, and edge by edge (e, 2, 2)."""
+        by_ends, by_both = self.straying.derivatives(self._s)
+        unit = self.weight * 2.0**self.exponent
+        slopes = np.zeros(self._s.size)
+        for end in (0, 1):
+            number = self.straying.pairs[:, end]
+            np.add.at(slopes, number[number >= 0], unit * by_ends[number >= 0, end])
+        return slopes, unit * 2.0**self.exponent * by_both
+
+    def _direction(
+        self, gradient: ComplexArray, negative: float, shifts: tuple[float, ...] = SHIFTS
+    ) -> tuple[ComplexArray, float, bool]:
+        system = self.system
+        system.bend = damped(self.forces, negative)
+        for end in (0, 1):
+            number = self.straying.pairs[:, end]
+            np.add.at(system.bend, number[number >= 0], self._bends[number >= 0, end, end])
+        moves = (system.tangent[self.straying.pairs[self._both]] != 0).all(axis=1)
+        system.coupling = np.where(moves, self._bends[self._both, 0, 1], 0)
+        direction, promise, newton = super()._direction(gradient, negative, shifts)
+        wrong = direction[system.at].real * self._side < 0
+        if wrong.any():
+            promise += float(np.sum((gradient[system.at] * direction[system.at]).real[wrong]))
+            direction[system.at[wrong]] = 0
+        return direction, promise, newton
+
+    def _search(self, direction: ComplexArray, promise: float) -> bool:
+        """Move along a direction, as far as is good; False where no step lowers the energy enough."""
+        if not promise > 0:
+            return False
+        at, vertices = self.system.at, self._track.vertices
+        full = np.zeros_like(self.w)
+        full[self.system.free] = direction
+        full[vertices] = self.system.tangent * direction[at].real
+        along = np.ldexp(direction[at].real, self.exponent)
+        limit = FRACTION * float(self.energy.steps_to_collapse(self.w, full).min())
+        start, s = self.w, self._s
+
+        def going(stops: Sequence[bool]) -> Trial[_State]:
+            """Lay a step back onto the curves, over kinks or stopping at them."""
+
+            def trial(t: float, bound: float) -> tuple[float, _State | None]:
+                value, there = np.inf, None
+                for stop in stops:
+                    value, there = self._laid(start + t * full, s, t * along, bound, stop=stop)
+                    if there is not None:
+                        break
+                return value, there
+
+            return trial
+
+        taken = backtrack(going((False, True)), self.value, promise, longest=min(1.0, limit), tries=HALVINGS)
+        if taken is None:
+            return False
+        self._cut = taken.t < 1
+        _, self.value, (self.w, self._s, self._deformation, energy) = extend(going((False,)), taken, limit)
+        self._energies = self._energies[0], energy
+        return True
+
+    def _laid(
+        self, w: ComplexArray, s: FloatArray, step: FloatArray, bound: float, *, stop: bool
+    ) -> tuple[float, _State | None]:
+        """The energy with the boundary moved along its curves, and the state there if that is good."""
+        there = self._track.moved(s, step, stop=stop)
+        if stop and np.array_equal(there, self._track.moved(s, step)):
+            return np.inf, None  # no kink in the way, and this has been tried
+        barrier = self.weight * self.straying.value(there)
+        if barrier == np.inf or not self._track.in_order(there):
+            return np.inf, None
+        w[self._track.vertices] = in_units(self._track.position(there), self.exponent)
+        deformation = self.energy.deform(w)
+        energy = self.energy.value_of(deformation)
+        value = energy + barrier
+        if not value < bound:
+            return value, None
+        uv = self.positions(w)
+        if not is_injective(self.energy.F, uv) or (self._simple and judge_loops(self._loops, uv)[1]):
+            return value, None
+        return value, (w, there, deformation, energy)
+
+
+def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
+    """Components of vectors along unit tangents."""
+    return tangent.real * vector.real + tangent.imag * vector.imag

@@ -1,1 +1,0 @@
-"""Deformation energies: densities, their integral over a surface, and Newton steps down it."""

@@ -1,0 +1,5 @@
+"""Triangle meshes, exact predicates and the certificate, plane curves, coarsening, and example surfaces.
+
+The package builds on `util`. Start reading in `mesh.topology` for meshes, and in `exact.certificate` for the decision
+whether a map is injective.
+"""

@@ -1,0 +1,210 @@
+"""From a map of a coarse mesh to one of the fine mesh: vertices are put back in the reverse order of their removal.
+
+Each goes where its triangles are best shaped, which is in the middle of its ring where that is convex, and next
+to the apex where nothing else is left. If the coarse map is injective, so is the fine one, but for rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.geometry.coarsening.levels import Coarsening
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.kernels import compiled
+from quasiharmonic.util.progress import still_at_it
+
+# A triangle's squared sides over twice its area are 2√3 = 3.5 when it is equilateral. Below this on average a vertex
+# has a good place.
+_GOOD = 8.0
+# Places to try otherwise, besides the ring's middle: so far from the apex towards it, and straight into the ring, in
+# units of the distance to the nearest side; and what is tried where none of these will do. The last one is sure to.
+_TOWARDS_MIDDLE, _INWARDS = (0.75, 0.5), (2.0, 1.0, 0.5)
+_LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS = (0.25, 0.1), (8.0, 4.0, 0.25)
+# Rings at a time: what is in work stays in the cache.
+_RINGS = 1024
+
+
+def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> ComplexArray:
+    """Carry a map from the coarse mesh to the fine one.
+
+    Parameters
+    ----------
+    w : (n,) complex128
+        ``u + i v``, of which the values at the coarse mesh's vertices are read.
+    coarsening : Coarsening
+    held : (n,) bool
+        Vertices that are not moved.
+
+    Returns
+    -------
+    (n,) complex128
+        Equal to ``w`` at held vertices. Others are moved on the way, to smooth the map, as far as no triangle
+        is inverted by it.
+    """
+    w = w.copy()
+    for number in reversed(range(len(coarsening.rounds))):
+        for vertices, rings in coarsening.rounds[number]:
+            still_at_it()
+            w[vertices] = places(w.take(rings))
+        if number in coarsening.levels:
+            smooth(w, coarsening.levels[number], held)
+    return w
+
+
+def places(ring: ComplexArray) -> ComplexArray:
+    """Where to put a vertex into each ring; (r,) from (r, d), the apex first."""
+    place = np.empty(len(ring), dtype=np.complex128)
+    find_places(np.ascontiguousarray(ring), place)
+    return place
+
+
+@compiled
+def find_places(ring: ComplexArray, place: ComplexArray) -> None:
+    """Fill in where to put a vertex (r,) into each ring (r, d), the apex first."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for start in range(0, len(ring), _RINGS):
+            some = ring[start : start + _RINGS]
+            # Corner by corner: rows are too short for NumPy to be quick along them. And in real numbers, products of
+            # which are rounded alike everywhere, as those of complex ones are not.
+            corners = np.ascontiguousarray(some.view(np.float64).reshape(*some.shape, 2).transpose(1, 2, 0))
+            place.view(np.float64).reshape(-1, 2)[start : start + _RINGS] = _best(corners).T
+
+
+def _best(ring: FloatArray) -> FloatArray:
+    """Places for rings (d, 2, r), the apex first; (2, r)."""
+    place = _sum(ring) / len(ring)
+    shape = _shape(place[None], ring)[0]
+    poor = np.flatnonzero(~(shape < _GOOD * len(ring)))
+    for towards, inwards in (
+        (_TOWARDS_MIDDLE, _INWARDS),
+        (_LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS),
+    ):
+        if not poor.size:
+            break
+        around = ring.take(poor, axis=2)
+        candidates = _candidates(around, place.take(poor, axis=1), towards, inwards)
+        shapes = _shape(candidates, around)
+        best = shapes.argmin(axis=0)
+        lowest = shapes[best, np.arange(poor.size)]
+        better = np.flatnonzero(lowest < shape.take(poor))
+        at, best = poor.take(better), best.take(better)
+        place[0, at], place[1, at] = candidates[best, 0, better], candidates[best, 1, better]
+        shape[at] = lowest.take(better)
+        poor = poor[np.isinf(shape.take(poor))]
+    return place
+
+
+def _candidates(
+    ring: FloatArray, middle: FloatArray, towards: tuple[float, ...], inwards: tuple[float, ...]
+) -> FloatArray:
+    """Places (c, 2, r) that rings (d, 2, r), whose middles are given, may be seen from."""
+    apex = ring[0]
+    arm_x, arm_y = ((ring[1:] - apex)[:, i] for i in (0, 1))
+    length = _length(arm_x, arm_y)
+    right_x, right_y, left_x, left_y = arm_x[:-1], arm_y[:-1], arm_x[1:], arm_y[1:]
+    turn_x = right_x * left_x + right_y * left_y
+    turn_y = right_x * left_y - right_y * left_x
+    room = (turn_y / _length(left_x - right_x, left_y - right_y)).min(axis=0)
+    # A fan of positive triangles turns from the first arm to the last; half that turn leads inwards. Half of a
+    # triangle's part of it is where the sum of both its arms' unit vectors points.
+    size = length[1:] * length[:-1]
+    turn_x /= size
+    turn_x += 1
+    turn_y /= size
+    unit = _length(turn_x, turn_y)
+    turn_x /= unit
+    turn_y /= unit
+    x, y = turn_x[0], turn_y[0]
+    for by_x, by_y in zip(turn_x[1:], turn_y[1:], strict=True):
+        x, y = x * by_x - y * by_y, x * by_y + y * by_x
+    room /= length[0]
+    first_x, first_y = room * arm_x[0], room * arm_y[0]
+    step = np.stack([first_x * x - first_y * y, first_x * y + first_y * x])
+    places = np.concatenate([np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)])
+    places += apex
+    return places
+
+
+def _length(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Of vectors."""
+    square = x * x
+    square += y * y
+    return np.sqrt(square, out=square)
+
+
+def _shape(place: FloatArray, ring: FloatArray) -> FloatArray:
+    """Squared sides over twice the area, summed over the triangles around each vertex; infinite if one is inverted.
+
+    Parameters
+    ----------
+    place : (c, 2, r) float64
+    ring : (d, 2, r) float64
+    """
+    x, y = (np.concatenate([ring[-1:, i], ring[:, i]])[:, None] - place[:, i] for i in (0, 1))
+    square = x * x
+    square += y * y
+    # |a|² + |b|² + |b − a|² = 2 (|a|² + |b|² − a·b), and the area is half of a × b.
+    area = x[:-1] * y[1:]
+    area -= y[:-1] * x[1:]
+    shape = square[:-1] + square[1:]
+    shape -= x[:-1] * x[1:]
+    shape -= y[:-1] * y[1:]
+    shape /= area
+    total = 2 * _sum(shape)
+    total[~(area.min(axis=0) > 0)] = np.inf
+    return total
+
+
+def _sum(terms: FloatArray) -> FloatArray:
+    """Along the first axis, one after another, as NumPy does it unless there is one number in each."""
+    total: FloatArray = terms[0].copy()
+    for term in terms[1:]:
+        total += term
+    return total
+
+
+@compiled
+def smooth(w: ComplexArray, F: IntArray, held: BoolArray) -> None:
+    """Move every vertex to the middle of its neighbours, and those back that invert a triangle; in place.
+
+    Parameters
+    ----------
+    w : (n,) complex128
+    F : (f, 3) int64
+    held : (n,) bool
+        Vertices that are not moved.
+    """
+    from scipy.sparse import csr_array
+
+    # Of an interior vertex every neighbour is once the head of a half-edge.
+    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
+    degree = np.bincount(tail, minlength=w.size)
+    moving = np.flatnonzero((degree > 0) & ~held)
+    new = w.copy()
+    for to, of in ((new.real, w.real), (new.imag, w.imag)):
+        to[moving] = np.bincount(tail, of.take(head), w.size)[moving] / degree[moving]
+    del degree, head
+    inverted = np.flatnonzero(~positive(new, F))
+    if inverted.size:
+        table = (np.ones(F.size, dtype=np.int8), tail, np.arange(0, F.size + 1, 3))
+        of_vertex = csr_array(table, shape=(len(F), w.size)).tocsc()
+    back = np.zeros(w.size, dtype=bool)
+    while inverted.size:
+        corners = np.unique(F[inverted])
+        corners = corners[~back[corners]]
+        back[corners] = True
+        new[corners] = w[corners]
+        # Only what is around those that have just gone back may be inverted now and was not before.
+        around = of_vertex[:, corners].indices
+        inverted = around[~positive(new, F[around])]
+    w[:] = new
+
+
+def positive(w: ComplexArray, T: IntArray) -> BoolArray:
+    """Whether triangles (t, 3) of a map are positive, in floating point; (t,) bool."""
+    corners = w.take(T)
+    x, y = corners.real, corners.imag
+    area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
+    area -= (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
+    positive: BoolArray = area > 0
+    return positive

@@ -1,0 +1,195 @@
+"""One round of coarsening: which vertices go, and the triangles that fill the rings they leave.
+
+No two vertices that go are neighbours, and no fan brings in an edge that ends at a held vertex, that is there already,
+or that another fan brings in too. So the vertices may be taken out, and put back, in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.kernels import compiled
+
+#: Vertices with more neighbours stay until they have lost some.
+MOST_NEIGHBOURS = 8
+# Passes in which vertices are chosen for a round.
+_PASSES = 3
+# How much a neighbour counts in the order of removal, in which a random number from 0 to 1 counts too.
+_PER_NEIGHBOUR = 0.35
+
+
+def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Room for vertices, rings and degrees of a round; vertices that are no neighbours have no triangle in common."""
+    f = T.shape[1]
+    vertices, rings, of_degree = (np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
+    return vertices, rings, of_degree
+
+
+@compiled
+def remove_vertices(
+    T: IntArray, free: BoolArray, dice: FloatArray, vertices: IntArray, rings: IntArray, of_degree: IntArray
+) -> None:
+    """Choose the vertices that one round takes out.
+
+    Parameters
+    ----------
+    T : (3, f) int64
+        Triangles, corner by corner.
+    free : (n,) bool
+        Vertices that may go, and between which there may be new edges; all interior.
+    dice : (n,) float64
+        From 0 to 1, for the order of removal.
+    vertices : (f // 3,) int64
+        Filled with those that go, as far as there are any: by degree, and those of one degree in ascending order.
+    rings : (f,) int64
+        Filled with their neighbours, vertex after vertex, each ring counterclockwise from its apex.
+    of_degree : (MOST_NEIGHBOURS + 1,) int64
+        Filled with how many of the vertices have so many neighbours.
+    """
+    degree = np.bincount(T.ravel(), minlength=free.size)
+    chosen = _independent(T, free, degree, dice)
+    # A fan takes edges from the apex's neighbours and gives them to the apex: best if that has few.
+    burden = np.where(free, degree + dice, np.inf)
+    candidates = []
+    for some, around in _rings(T, chosen, degree):
+        around = _from_apex(around, burden)
+        fits = free.take(around[0]) & free.take(around[2:-1]).all(axis=0)
+        candidates.append((some.compress(fits), around.compress(fits, axis=1)))
+    of_degree[:] = 0
+    if not candidates:
+        return
+    new = _bring_new_edges(T, free.size, [around for _, around in candidates])
+    begin = done = 0
+    for (some, around), taken in zip(candidates, new, strict=True):
+        d, r = len(around), int(taken.sum())
+        of_degree[d] = r
+        vertices[done : done + r] = some.compress(taken)
+        rings[begin : begin + d * r].reshape(r, d).T[:] = around.compress(taken, axis=1)
+        begin, done = begin + d * r, done + r
+
+
+@compiled
+def fill_rings(T: IntArray, there: BoolArray, rings: IntArray, of_degree: IntArray, filled: IntArray) -> None:
+    """Fill in the triangles after a round: those of T (3, f) whose corners are all there, and the fans of the rings."""
+    kept = there.take(T[0])
+    for corner in T[1:]:
+        kept &= there.take(corner)
+    parts = [T.compress(kept, axis=1)]
+    for some in by_degree(rings, of_degree):
+        r, d = some.shape
+        fans = np.empty((3, d - 2, r), dtype=np.int64)
+        fans[0], fans[1], fans[2] = some.T[0], some.T[1:-1], some.T[2:]
+        parts.append(fans.reshape(3, -1))
+    np.concatenate(parts, axis=1, out=filled)
+
+
+def by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
+    """Rings that lie one after another, as arrays (r, d), for every d of which there are any."""
+    begin = 0
+    for d, r in enumerate(of_degree.tolist()):
+        if r:
+            yield rings[begin : begin + d * r].reshape(r, d)
+            begin += d * r
+
+
+def _independent(T: IntArray, free: BoolArray, degree: IntArray, dice: FloatArray) -> BoolArray:
+    """A set of free vertices of few neighbours, no two of them neighbours."""
+    order = np.where(free & (degree > 0) & (degree <= MOST_NEIGHBOURS), dice + _PER_NEIGHBOUR * degree, np.inf)
+    chosen = np.zeros(order.size, dtype=bool)
+    # A vertex that comes first in all its triangles is chosen. Further passes over the triangles that have no chosen
+    # corner, where neighbours of chosen ones no longer count, find half as many again.
+    for _ in range(_PASSES):
+        first, soonest = T[0], order.take(T[0])
+        for corner in T[1:]:
+            at = order.take(corner)
+            first = np.where(at < soonest, corner, first)
+            soonest = np.minimum(at, soonest)
+        now = (np.bincount(first, minlength=order.size) == degree) & np.isfinite(order)
+        chosen |= now
+        near = now.take(first)
+        order[T.compress(near, axis=1)] = np.inf
+        T = T.compress(~near, axis=1)
+    return chosen
+
+
+def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Chosen vertices, all interior and no two neighbours, with their rings, degree by degree.
+
+    Yields
+    ------
+    vertices : (r,) int64
+    rings : (d, r) int64
+        Neighbours counterclockwise.
+    """
+    from scipy.sparse import csr_array
+
+    vertices = np.flatnonzero(chosen)
+    of_degree = degree[vertices].astype(np.uint8)
+    vertices = vertices[np.argsort(of_degree, kind="stable")]
+    number = np.full(chosen.size, -1, dtype=np.int32)
+    number[vertices] = np.arange(vertices.size)
+    columns = [number.take(corner) for corner in T]
+    places = [np.flatnonzero(column >= 0) for column in columns]
+    columns = [column.take(place) for column, place in zip(columns, places, strict=True)]
+    # Turning the table of entries and vertices on its side sorts by vertex, in a fifth of a sort's time.
+    entries = sum(place.size for place in places)
+    table = (np.ones(entries, dtype=np.int8), np.concatenate(columns), np.arange(entries + 1, dtype=np.int32))
+    order = csr_array(table, shape=(entries, vertices.size)).tocsc().indices
+    del number, columns, table
+    tail, head = (
+        np.concatenate([T[(corner + step) % 3].take(place) for corner, place in enumerate(places)]).take(order)
+        for step in (1, 2)
+    )
+    del places, order
+    begin = done = 0
+    for d, count in enumerate(np.bincount(of_degree, minlength=MOST_NEIGHBOURS + 1).tolist()):
+        if d < 3 or not count:
+            continue
+        tails, heads = (np.ascontiguousarray(part[begin : begin + d * count].reshape(-1, d).T) for part in (tail, head))
+        rings = np.empty_like(tails)
+        rings[0], rings[1] = tails[0], heads[0]
+        for i in range(2, d):
+            # The triangle whose tail is the last vertex found has the next one for its head.
+            rings[i] = (heads[1:] * (tails[1:] == rings[i - 1])).sum(axis=0)
+        yield vertices[done : done + count], rings
+        begin, done = begin + d * count, done + count
+
+
+def _from_apex(rings: IntArray, burden: FloatArray) -> IntArray:
+    """Rings (d, r) turned so that they begin with the vertex of least burden."""
+    d, r = rings.shape
+    turn = burden.take(rings).argmin(axis=0)
+    turned: IntArray = rings.take((turn + np.arange(d)[:, None]) % d * r + np.arange(r))
+    return turned
+
+
+def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[BoolArray]:
+    """Which fans of rings (d, r) bring in only edges that are not there, and that no fan before them claims."""
+    apex = np.concatenate([rings[0].repeat(len(rings) - 3) for rings in candidates])
+    other = np.concatenate([rings[2:-1].T.ravel() for rings in candidates])
+    claims = edge_keys(apex, other, n)
+    # Edges that are there, of which at most a few are claimed: those from an apex to a vertex that is to have one.
+    tails, heads = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    tails[apex], heads[other] = True, True
+    there = []
+    for tail, head in zip(T, T[(1, 2, 0), :], strict=True):
+        at = np.flatnonzero(tails.take(tail) & heads.take(head))
+        there.append(edge_keys(tail.take(at), head.take(at), n))
+    # Sorted together, with a claim of an edge after the edge.
+    keys = 2 * np.concatenate([*there, claims])
+    keys[keys.size - claims.size :] += 1
+    keys.sort()
+    step, is_claim = np.diff(keys), (keys[1:] & 1).astype(bool)
+    lost = np.isin(claims, keys[1:][is_claim & (step == 1)] >> 1)
+    repeated = np.flatnonzero(np.isin(claims, keys[1:][is_claim & (step == 0)] >> 1))
+    _, first = np.unique(claims[repeated], return_index=True)
+    lost[np.delete(repeated, first)] = True
+    size = [rings.shape[1] for rings in candidates]
+    claimed = np.repeat([len(rings) - 3 for rings in candidates], size)
+    good = np.ones(claimed.size, dtype=bool)
+    good[np.arange(claimed.size).repeat(claimed)[lost]] = False
+    return np.split(good, np.cumsum(size)[:-1])

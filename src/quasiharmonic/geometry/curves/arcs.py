@@ -1,0 +1,206 @@
+"""What curves are made of: lines, Bézier curves and elliptic arcs; their points in twice the digits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.exact.predicates import two_product, two_sum
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, check_finite, real_array
+
+# The longest arc, so that few nodes integrate its length to rounding.
+_LONGEST_ARC = np.pi / 4
+# Radians by which a chord's piece bends.
+_FLAT = 0.1
+# Of its size: a curve slower than this stands still. It does so between its ends where that is at least this far from
+# both in its parameter.
+SLOW, _INSIDE = 1e-9, 1e-6
+# Nodes of Gauss' formula for a length.
+_NODES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """An elliptic arc ``centre + a cos θ + b sin θ`` from one angle to another.
+
+    Attributes
+    ----------
+    centre, a, b : (2,) float
+        ``a`` and ``b`` of equal length and at right angles make a circle; any others an ellipse.
+    first, last : float
+        Radians; the arc runs clockwise where ``last`` is the smaller.
+    """
+
+    centre: ArrayLike
+    a: ArrayLike
+    b: ArrayLike
+    first: float
+    last: float
+
+    def transformed(self, matrix: FloatArray, shift: FloatArray) -> Arc:
+        """The arc after ``x → matrix @ x + shift``, an elliptic arc again."""
+        centre, a, b = (matrix @ np.asarray(x, dtype=np.float64) for x in (self.centre, self.a, self.b))
+        return Arc(centre + shift, a, b, self.first, self.last)
+
+
+class Piece(NamedTuple):
+    """A piece as curves keep it.
+
+    Attributes
+    ----------
+    degree : int
+        Of a Bézier curve; 0 for an arc.
+    control : (4,) complex128
+        Control points, or centre and axes; zeros behind.
+    angles : (float, float)
+        Of an arc.
+    within : bool
+        Whether it is a later part of an arc.
+    """
+
+    degree: int
+    control: ComplexArray
+    angles: tuple[float, float]
+    within: bool
+
+
+def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
+    """Piece ``i`` of a curve, checked; long arcs in several, Bézier curves that turn on the spot in two or three."""
+    if isinstance(piece, Arc):
+        rows = [real_array(f"piece {i} of the curve", x) for x in (piece.centre, piece.a, piece.b)]
+        if any(row.shape != (2,) for row in rows):
+            raise ValueError(f"piece {i} of the curve: an arc has a centre and two axes of shape (2,)")
+        control, ends = np.stack(rows), (float(piece.first), float(piece.last))
+    else:
+        control, ends = real_array(f"piece {i} of the curve", piece), (0.0, 0.0)
+        if control.ndim != 2 or control.shape[1] != 2 or not 2 <= len(control) <= 4:
+            raise ValueError(f"piece {i} of the curve must have shape (2, 2), (3, 2) or (4, 2), not {control.shape}")
+    if not (np.isfinite(control).all() and np.isfinite(ends).all()):
+        raise ValueError(f"piece {i} of the curve is not finite")
+    if not isinstance(piece, Arc):
+        return [
+            Piece(len(control) - 1, _four(between(control, *span)), ends, False)
+            for span in pairwise([0.0, *_cusps(control), 1.0])
+        ]
+    four = _four(control)
+    steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
+    angles = np.linspace(*ends, steps + 1).tolist()
+    return [Piece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
+
+
+def _four(control: FloatArray) -> ComplexArray:
+    """Control points, or centre and axes (k, 2), as `Piece` has them."""
+    four = np.zeros(4, dtype=np.complex128)
+    four[: len(control)] = as_complex(control)
+    return four
+
+
+def _cusps(control: FloatArray) -> list[float]:
+    """Parameters within a Bézier curve where its speed is zero, ascending: where it turns back, or comes to a point.
+
+    There both coordinates of the derivative vanish: a complex polynomial has a real root.
+    """
+    points = as_complex(control - control[0])
+    if len(points) < 3:
+        return []
+    if len(points) == 3:
+        by_power = [points[1] - points[0], points[0] - 2 * points[1] + points[2]]
+    else:
+        third = points[3] - points[0] + 3 * (points[1] - points[2])
+        by_power = [points[1] - points[0], 2 * (points[0] - 2 * points[1] + points[2]), third]
+    roots = np.roots(by_power[::-1]).real
+    inner = np.unique(roots[(roots > _INSIDE) & (roots < 1 - _INSIDE)])
+    speed = np.abs(np.polynomial.polynomial.polyval(inner, by_power))
+    return [float(t) for t in inner[speed <= SLOW * np.abs(points).max()]]
+
+
+def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
+    """The straight lines between points."""
+    array = real_array("points", points)
+    least = 3 if closed else 2
+    if array.ndim != 2 or array.shape[1] != 2 or len(array) < least:
+        raise ValueError(f"points must have shape (k, 2) with k at least {least}, not {array.shape}")
+    check_finite("points", "row", "rows", array)
+    ends = np.concatenate([array, array[:1]]) if closed else array
+    return list(np.stack([ends[:-1], ends[1:]], axis=1))
+
+
+def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
+    """Chords into which a piece is taken apart so that each bends little."""
+    if degree == 1:
+        return 1
+    if degree == 0:
+        return int(max(1, np.ceil(abs(angles[1] - angles[0]) / _FLAT)))
+    sides = np.diff(control[: degree + 1])
+    sides = sides[sides != 0]
+    bends = np.abs(np.angle(sides[1:] / sides[:-1])).sum()
+    # The handles' bends are spread unevenly over the parameter.
+    return int(max(4, 2 * np.ceil(bends / _FLAT)))
+
+
+def between(control: FloatArray, t: float, u: float) -> FloatArray:
+    """The control points (degree + 1, 2) of a Bézier curve's part from one parameter to another.
+
+    They are the values of its blossom, de Casteljau's construction with a parameter of its own in each round: k of them
+    are ``u`` and the others ``t``.
+    """
+    if (t, u) == (0.0, 1.0):
+        return control
+    degree, found = len(control) - 1, []
+    for k in range(degree + 1):
+        points = control
+        for share in [u] * k + [t] * (degree - k):
+            points = (1 - share) * points[:-1] + share * points[1:]
+        found.append(points[0])
+    return np.array(found)
+
+
+def as_complex(points: ArrayLike) -> ComplexArray:
+    """Points (k, 2) as complex numbers (k,)."""
+    return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
+
+
+def angle_at(angles: FloatArray, t: FloatArray) -> FloatArray:
+    """Angles on arcs (k, 2) at parameters from 0 to 1."""
+    return angles[:, 0] + t * (angles[:, 1] - angles[:, 0])
+
+
+def on_bezier(control: FloatArray, t: FloatArray) -> FloatArray:
+    """De Casteljau's construction in twice the digits, rounded; control (k, degree + 1, 2), t (k,)."""
+    t = t[:, None]
+    high, low = np.moveaxis(control, 1, 0), np.zeros((control.shape[1], len(t), 2))
+    u, u_low = two_sum(np.ones_like(t), -t)
+    while len(high) > 1:
+        left, left_low = two_product(u, high[:-1])
+        right, right_low = two_product(t, high[1:])
+        total, lost = two_sum(left, right)
+        low = lost + left_low + right_low + (u_low * high[:-1] + u * low[:-1] + t * low[1:])
+        high, low = two_sum(total, low)
+    return np.asarray(high[0])
+
+
+def on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
+    """``centre + a cos θ + b sin θ`` in twice the digits, rounded; control (k, 4, 2), angle (k,)."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    # A cosine and a sine as rounded lie off the unit circle; put back onto it they belong to an angle beside the one
+    # that was meant, which nobody minds.
+    (cc, cc_low), (ss, ss_low) = two_product(cos, cos), two_product(sin, sin)
+    square, square_low = two_sum(cc, ss)
+    off = ((square - 1) + (square_low + cc_low + ss_low)) / 2
+    centre, a, b = control[:, 0], control[:, 1], control[:, 2]
+    (along_a, a_low), (along_b, b_low) = two_product(cos, a), two_product(sin, b)
+    one, one_low = two_sum(along_a, along_b)
+    two, two_low = two_sum(one, centre)
+    return np.asarray(two + (two_low + one_low + a_low + b_low - off * one))
+
+
+@cache
+def gauss() -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights of Gauss' formula on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    return (nodes + 1) / 2, weights / 2

@@ -1,0 +1,338 @@
+"""Which boundary vertices slide, along which curve, and in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.curves.arcs import as_complex
+from quasiharmonic.geometry.curves.curve import Curve
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    kind_of,
+    loop_arrays,
+    named,
+)
+
+# Of the largest coordinate: a vertex this near to its place is there, and keeps every bit.
+_THERE = 2.0**-51
+
+
+class Rails:
+    """The outline that boundary vertices slide along: what ``slide=`` takes.
+
+    Vertices at corners stay, the others glide between them in their order. A vertex not quite on its curve is moved
+    onto it first, and the one nearest to a corner onto the corner, if it is within ``tolerance`` of it. A corner
+    that no vertex is so near to is not kept.
+
+    Parameters
+    ----------
+    curves : sequence of Curve or (k, 2) float, or one of these
+        Contours, or single sides; arrays are closed polygons.
+    on : mapping from int to int, optional
+        Boundary vertices that are told their curve, by its number. All others are on the curve nearest to them, or, if
+        none is near, stay where they are.
+    held : sequence of int
+        Boundary vertices that stay although they could slide.
+    corner_angle : float
+        Degrees by which a curve turns at a corner, at the least. The ends of an open curve are corners too; a closed
+        one without any holds nothing, so that all its vertices may go around.
+    tolerance : float
+        How far off its curve a vertex may be, as a share of the larger side of all curves.
+
+    Raises
+    ------
+    ValueError
+        When there is no curve, one is malformed (see `Curve`), or a number is out of range.
+
+    Examples
+    --------
+    The vertices of a disk's boundary may go around on the circle; of a square, those on its sides slide:
+
+    >>> round_ = Rails([Curve.circle()])
+    >>> square = Rails([[(0, 0), (1, 0), (1, 1), (0, 1)]])
+    """
+
+    def __init__(
+        self,
+        curves: Iterable[Curve | ArrayLike] | Curve,
+        *,
+        on: Mapping[int, int] | None = None,
+        held: ArrayLike = (),
+        corner_angle: float = 20.0,
+        tolerance: float = 1e-3,
+    ) -> None:
+        if isinstance(curves, Curve) or (isinstance(curves, np.ndarray) and curves.ndim == 2):
+            curves = [curves]
+        if not isinstance(curves, Iterable):
+            raise ValueError(f"curves must be a Curve, a polygon (k, 2) or a list of those, not {kind_of(curves)}")
+        self.curves = [curve if isinstance(curve, Curve) else Curve.polygon(curve) for curve in curves]
+        if not self.curves:
+            raise ValueError("there is no curve to slide along")
+        on = {} if on is None else on
+        if not isinstance(on, Mapping):
+            raise ValueError(f"on must say which vertex is on which curve, as in {{12: 0}}, and is {type(on).__name__}")
+        vertices, numbers = index_array("on", list(on)), index_array("on", list(on.values()))
+        check_range("on", numbers, len(self.curves), "curve", "curves")
+        self.on: dict[int, int] = dict(zip(vertices.tolist(), numbers.tolist(), strict=True))
+        self.held = index_array("held", held).ravel()
+        if not 0 <= corner_angle <= 180:
+            raise ValueError(f"corner_angle is between 0 and 180 degrees, not {corner_angle}")
+        if not 0 <= tolerance < 1:
+            raise ValueError(f"tolerance is between 0 and 1, not {tolerance}")
+        self.corner_angle, self.tolerance = float(corner_angle), float(tolerance)
+
+    @classmethod
+    def around(cls, loops: Sequence[IntArray], uv: FloatArray, *, held: ArrayLike = ()) -> Rails:
+        """The polygons of boundary loops in a map (n, 2), each vertex told its own."""
+        loops = loop_arrays(loops, len(uv))
+        on = {int(v): k for k, loop in enumerate(loops) for v in loop}
+        return cls([uv[loop] for loop in loops], on=on, held=held)
+
+    def holding(self, vertices: IntArray) -> Rails:
+        """The same with further vertices that stay, unless they are told a curve."""
+        return self._with(self.on, np.union1d(self.held, np.setdiff1d(vertices, index_array("on", list(self.on)))))
+
+    def among(self, used: IntArray) -> Rails:
+        """The same for a mesh of some of the vertices, ascending."""
+        known = np.concatenate([index_array("on", list(self.on)), self.held])
+        absent = np.setdiff1d(known, used)
+        if absent.size:
+            raise ValueError(f"{named('vertex', 'vertices', absent)} of the rails in no triangle")
+        on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
+        return self._with(on, np.searchsorted(used, self.held))
+
+    def _with(self, on: Mapping[int, int], held: IntArray) -> Rails:
+        return Rails(self.curves, on=on, held=held, corner_angle=self.corner_angle, tolerance=self.tolerance)
+
+    def lay(self, loops: Sequence[IntArray], uv: FloatArray) -> Track:
+        """Find every boundary vertex its place.
+
+        Parameters
+        ----------
+        loops : list of (l,) int64
+            Boundary loops.
+        uv : (n, 2) float64
+            A map; only its boundary is looked at.
+
+        Raises
+        ------
+        ValueError
+            When a vertex is told a curve that it is not on, or is not on the boundary; when none is on any curve; when
+            two are in one place, or follow each other otherwise than along the curve.
+        """
+        boundary = np.concatenate(loops)
+        curve, s = self._found(boundary, uv)
+        corners = [self._corners(one, uv[boundary]) for one in self.curves]
+        slides = ~np.isin(boundary, self.held)
+        slides[[member for taken in corners for member in taken]] = False
+        places, chains = uv.copy(), []
+        for k, (one, taken) in enumerate(zip(self.curves, corners, strict=True)):
+            at_corners = np.array(list(taken), dtype=np.int64)
+            members = np.union1d(np.flatnonzero(curve == k), at_corners)
+            if not members.size:
+                continue
+            along = s.copy()
+            along[at_corners] = list(taken.values())
+            members = members[np.argsort(along[members], kind="stable")]
+            chain = Chain(one, boundary[members], along[members], slides[members])
+            _check_order(chain, k, loops, len(uv))
+            moves = (slides[members] | np.isin(members, at_corners)) & ~np.isin(chain.vertices, self.held)
+            _move(places, chain.vertices[moves], one.position(chain.s[moves]))
+            chains.append(chain)
+        return Track(chains, places)
+
+    def off(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
+        """The boundary vertices that are on no curve, and stay; raises as `lay` does for those told a curve."""
+        boundary = np.concatenate(loops)
+        curve, _ = self._found(boundary, uv)
+        return boundary[curve < 0]
+
+    def _corners(self, one: Curve, places: FloatArray) -> dict[int, float]:
+        """The rows of the boundary's places (b, 2) that are at corners of a curve, and where these are along it.
+
+        A corner has the vertex nearest to it, be it on this curve or another, and a vertex one corner.
+        """
+        marks = one.corners(self.corner_angle)
+        found = []
+        for mark, corner in zip(marks, one.position(marks), strict=True):
+            away = np.abs(as_complex(places - corner))
+            found.append((float(away.min()), int(np.argmin(away)), float(mark)))
+        taken: dict[int, float] = {}
+        for distance, member, mark in sorted(found):
+            if distance <= self.tolerance * one.size:
+                taken.setdefault(member, mark)
+        return taken
+
+    def _found(self, boundary: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The curve of each boundary vertex, -1 for none, and where along it."""
+        told = index_array("on", list(self.on))
+        check_range("on", told, len(uv))
+        check_range("held", self.held, len(uv))
+        inner = np.setdiff1d(told, boundary)
+        if inner.size:
+            raise ValueError(f"{named('vertex', 'vertices', inner)} told a curve, but not on the boundary")
+        only = np.array([self.on.get(int(v), -1) for v in boundary])
+        allowed = self.tolerance * max(one.size for one in self.curves)
+        curve, s, least = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)
+        for k, one in enumerate(self.curves):
+            asked = np.flatnonzero((only < 0) | (only == k))
+            where, away = one.nearest(uv[boundary[asked]])
+            far = (away > allowed) & (only[asked] == k)
+            if far.any():
+                raise ValueError(
+                    f"{named('vertex', 'vertices', boundary[asked[far]])} told to be on curve {k}, but off it by "
+                    f"{away[far].max():.3g} at most, where {allowed:.3g} is mended"
+                )
+            near = (away <= allowed) & (away < least[asked])
+            found = asked[near]
+            curve[found], s[found], least[found] = k, where[near], away[near]
+        if (curve < 0).all():
+            raise ValueError(
+                f"no boundary vertex is within {allowed:.3g} of the curves to slide along: are they drawn at another "
+                "scale, or elsewhere?"
+            )
+        return curve, s
+
+
+def rails_of(slide: bool | Rails, loops: Sequence[IntArray], uv: FloatArray) -> Rails:
+    """What ``slide=`` means: `Rails` themselves, or True for the polygons of the boundary as it is."""
+    if isinstance(slide, Rails):
+        return slide
+    if slide is True:
+        return Rails.around(loops, uv)
+    raise ValueError(f"slide must be True or Rails, not {kind_of(slide)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """The vertices on one curve, in order along it.
+
+    Attributes
+    ----------
+    curve : Curve
+    vertices : (k,) int64
+    s : (k,) float64
+        Where they are at first, increasing.
+    sliding : (k,) bool
+        Whether they may go elsewhere.
+    """
+
+    curve: Curve
+    vertices: IntArray
+    s: FloatArray
+    sliding: BoolArray
+
+    def every(self, s: FloatArray) -> FloatArray:
+        """Where all vertices are with the sliding ones at ``s``."""
+        every = self.s.copy()
+        every[self.sliding] = s
+        return every
+
+    def in_order(self, s: FloatArray) -> bool:
+        """Whether the vertices are in their order still with the sliding ones at ``s``."""
+        every = self.every(s)
+        backwards = np.diff(every) <= 0
+        if not self.curve.closed:
+            return not backwards.any()
+        # Around a closed curve the order begins anew once.
+        return int(backwards.sum()) + int(every[0] <= every[-1]) == 1
+
+
+class Track:
+    """The vertices that slide, and all that is asked of their curves at once.
+
+    Parameters
+    ----------
+    chains : list of Chain
+    uv : (n, 2) float64
+        The map with its boundary on the curves.
+
+    Attributes
+    ----------
+    chains : list of Chain
+    uv : (n, 2) float64
+    vertices : (k,) int64
+        Those that slide, curve by curve.
+    s : (k,) float64
+        Where they are at first.
+    """
+
+    def __init__(self, chains: Sequence[Chain], uv: FloatArray) -> None:
+        self.uv = uv
+        self.chains = list(chains)
+        self._ends = np.cumsum([0, *(int(chain.sliding.sum()) for chain in chains)])
+        self.vertices = np.concatenate([chain.vertices[chain.sliding] for chain in chains])
+        self.s = np.concatenate([chain.s[chain.sliding] for chain in chains])
+
+    def every(self, s: FloatArray) -> list[FloatArray]:
+        """Where all vertices of each chain are with the sliding ones at ``s``."""
+        return [chain.every(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
+
+    def position(self, s: FloatArray) -> FloatArray:
+        """Places of the sliding vertices; (k, 2) float64."""
+        return np.concatenate([curve.position(s[part]) for curve, part in self._parts()])
+
+    def frame(self, s: FloatArray, forward: BoolArray) -> tuple[ComplexArray, FloatArray]:
+        """Tangents and curvatures, as `Curve.frame` has them; no tangent where an open curve has ended."""
+        tangent, curvature = np.empty(s.size, dtype=np.complex128), np.empty(s.size)
+        for curve, part in self._parts():
+            tangent[part], curvature[part] = curve.frame(s[part], forward[part])
+            tangent[part][curve.barred(s[part], forward[part])] = 0
+        return tangent, curvature
+
+    def moved(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
+        """Places after a step along the curves, as `Curve.moved` has it."""
+        return np.concatenate([curve.moved(s[part], step[part], stop=stop) for curve, part in self._parts()])
+
+    def at_kink(self, s: FloatArray) -> BoolArray:
+        """Who is at a kink, or at the end of an open curve."""
+        return np.concatenate([np.isin(s[part], curve.stops) for curve, part in self._parts()])
+
+    def in_order(self, s: FloatArray) -> bool:
+        """Whether on every curve the vertices are in their order, and none in one place."""
+        return all(chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True))
+
+    def _parts(self) -> list[tuple[Curve, slice]]:
+        ends = self._ends.tolist()
+        return [
+            (chain.curve, slice(first, last)) for chain, first, last in zip(self.chains, ends, ends[1:], strict=False)
+        ]
+
+
+def _move(places: FloatArray, vertices: IntArray, there: FloatArray) -> None:
+    """Put vertices into their places, but for those that are there up to rounding."""
+    off = np.abs(places[vertices] - there) > _THERE * np.abs(there).max(initial=0)
+    moves = off.any(axis=1)
+    places[vertices[moves]] = there[moves]
+
+
+def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> None:
+    """Raise when vertices are in one place, or neighbours along the boundary are none along the curve."""
+    count = chain.vertices.size
+    same = np.flatnonzero(np.diff(chain.s) <= 0)
+    if same.size:
+        i, j = chain.vertices[same[0]], chain.vertices[same[0] + 1]
+        raise ValueError(f"boundary vertices {i} and {j} are at one place of curve {k}: they could not slide in order")
+    rank = np.full(n, -1)
+    rank[chain.vertices] = np.arange(count)
+    for loop in loops:
+        here, there = rank[loop], rank[np.roll(loop, -1)]
+        apart = np.abs(here - there)
+        if chain.curve.closed:
+            apart = np.minimum(apart, count - apart)
+        wrong = np.flatnonzero((here >= 0) & (there >= 0) & (apart > 1))
+        if wrong.size:
+            i, j = loop[wrong[0]], np.roll(loop, -1)[wrong[0]]
+            raise ValueError(
+                f"boundary vertices {i} and {j} follow each other around the surface but not along curve {k}: put them "
+                "in order, or, where curves come close, tell vertices theirs (Rails, on=)"
+            )

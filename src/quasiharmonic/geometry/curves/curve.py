@@ -1,0 +1,444 @@
+"""Curves that vertices slide along: lines, Bézier curves and elliptic arcs, joined, and measured by their length.
+
+A place on a curve is the length of the way there, ``s``. Positions are evaluated in twice the digits and rounded
+once, so that what slides is on the curve as well as doubles can say it. At a *joint*, where two pieces meet, the curve
+may turn: by an angle that makes it a corner, or by less, which is a kink; there it has a direction on either side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.curves.arcs import (
+    SLOW,
+    Arc,
+    angle_at,
+    as_complex,
+    between,
+    chords,
+    gauss,
+    on_bezier,
+    on_ellipse,
+    parts,
+    straight,
+)
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+# Coordinates between these have squares, and products of four, that neither overflow nor vanish.
+_LARGEST, _SMALLEST = 1e75, 1e-75
+# Ends nearer than this share of the curve's size meet.
+_MEET = 1e-9
+# Bends of fewer radians than this are passed like none at all: what they change in a descent is beyond its tolerance.
+_KINK = 1e-3
+# Where a piece stands still its direction is taken from so short a chord, in its parameter.
+_CHORD = 1e-5
+# Distances between points and chords computed at a time.
+_PAIRS = 1 << 20
+# Lengths below this share of the curve's size are rounding.
+_SNAP = 1e-13
+# Parameters of each piece in the table of lengths.
+_TABLE = 32
+# From how far within a piece its end is searched for.
+_INWARD = 1e-2
+# A parameter that moves by no more than this is at rest.
+_RESTS = 1e-15
+# Steps of the searches for a parameter by length, and by distance.
+_MOST_STEPS, _REFINEMENTS = 60, 40
+
+
+class Curve:
+    """A path of pieces, each of which begins where the one before ends.
+
+    Parameters
+    ----------
+    pieces : sequence of (degree + 1, 2) float or Arc
+        Lines and Bézier curves of degree 1 to 3 by their control points, and elliptic arcs. Pieces without length
+        are left out. The curve is closed if it ends where it begins.
+
+    Raises
+    ------
+    ValueError
+        When a piece is none of these, not finite, or does not begin where the one before ends; when the curve has no
+        length, or coordinates so large or small that their products leave the numbers' range.
+
+    Attributes
+    ----------
+    closed : bool
+    length : float
+    size : float
+        The larger side of the box around its control points.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> square = Curve.polygon([(0, 0), (2, 0), (2, 2), (0, 2)])
+    >>> square.closed, square.length, square.corners(20.0).tolist()
+    (True, 8.0, [0.0, 2.0, 4.0, 6.0])
+    >>> square.position(np.array([0.5, 3.0])).tolist()
+    [[0.5, 0.0], [2.0, 1.0]]
+    """
+
+    def __init__(self, pieces: Sequence[ArrayLike | Arc]) -> None:
+        found = [part for i, piece in enumerate(pieces) for part in parts(i, piece)]
+        if not found:
+            raise ValueError("a curve has at least one piece")
+        self._degree = np.array([part.degree for part in found])
+        self._control = np.stack([part.control for part in found])
+        self._angles = np.array([part.angles for part in found])
+        # An arc is taken apart for the sake of its length; where it is, is no joint.
+        self._within = np.array([part.within for part in found])
+        self._measure()
+        self._join()
+
+    @classmethod
+    def contour(cls, pieces: Sequence[ArrayLike | Arc]) -> Curve:
+        """The pieces, and if they do not end where they begin a straight line from there to here."""
+        curve = cls(pieces)
+        if curve.closed:
+            return curve
+        ends = curve.position(np.array([curve.length, 0.0]))
+        return cls([*pieces, ends])
+
+    @classmethod
+    def polygon(cls, points: ArrayLike) -> Curve:
+        """The closed polygon through (k, 2) points."""
+        return cls(straight(points, closed=True))
+
+    @classmethod
+    def polyline(cls, points: ArrayLike) -> Curve:
+        """The open polyline through (k, 2) points."""
+        return cls(straight(points, closed=False))
+
+    @classmethod
+    def circle(cls, radius: float = 1.0, centre: ArrayLike = (0.0, 0.0)) -> Curve:
+        """The circle, counterclockwise from its rightmost point."""
+        return cls([Arc(centre, (radius, 0.0), (0.0, radius), 0.0, 2 * np.pi)])
+
+    def transformed(self, matrix: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> Curve:
+        """The curve after ``x → matrix @ x + shift``; ``matrix`` (2, 2) or a number, ``shift`` (2,)."""
+        matrix = np.asarray(matrix, dtype=np.float64) * (np.eye(2) if np.ndim(matrix) == 0 else 1.0)
+        offset = np.asarray(shift, dtype=np.float64)
+        return Curve(
+            [
+                piece.transformed(matrix, offset) if isinstance(piece, Arc) else piece @ matrix.T + offset
+                for piece in self.section(0.0, self.length)
+            ]
+        )
+
+    def section(self, start: float, end: float) -> list[FloatArray | Arc]:
+        """The pieces from one length along the curve to another; on from its beginning if ``end`` is not beyond."""
+        m = self._degree.size
+        (first, last), (begin, stop) = self.place(np.array([start, end]))
+        last += m if end <= start else 0
+        found: list[FloatArray | Arc] = []
+        for k in range(first, last + 1):
+            t, u = begin if k == first else 0.0, stop if k == last else 1.0
+            if t == u:
+                continue
+            points = self._control[k % m].view(np.float64).reshape(-1, 2)
+            if self._degree[k % m]:
+                found.append(between(points[: self._degree[k % m] + 1], t, u))
+                continue
+            angles = angle_at(self._angles[[k % m, k % m]], np.array([t, u])).tolist()
+            before = found[-1] if found and self._within[k % m] else None
+            if isinstance(before, Arc):
+                found[-1] = replace(before, last=angles[1])
+            else:
+                found.append(Arc(points[0], points[1], points[2], *angles))
+        return found
+
+    def sides(self, angle: float) -> list[Curve]:
+        """The curves from one corner to the next, the first corner's first; the curve itself where it has none.
+
+        ``angle`` as `corners` has it.
+        """
+        marks = self.corners(angle)
+        ends = np.roll(marks, -1) if self.closed else marks[1:]
+        return [Curve(self.section(*pair)) for pair in zip(marks, ends, strict=False)] or [self]
+
+    def position(self, s: FloatArray) -> FloatArray:
+        """Points at lengths (k,) along the curve, rounded once from twice the digits; (k, 2) float64."""
+        piece, t = self.place(np.asarray(s, dtype=np.float64))
+        found = np.empty((t.size, 2))
+        for degree in np.unique(self._degree[piece]):
+            which = self._degree[piece] == degree
+            control = self._control[piece[which]].view(np.float64).reshape(-1, 4, 2)
+            if degree:
+                found[which] = on_bezier(control[:, : degree + 1], t[which])
+            else:
+                found[which] = on_ellipse(control, angle_at(self._angles[piece[which]], t[which]))
+        return found
+
+    def sampled(self, s: FloatArray, *, exactly: bool = False) -> tuple[ComplexArray, ComplexArray]:
+        """Points and unit tangents at lengths of any shape.
+
+        From a table at about these lengths: quick, for measures of shape. Or exactly at them, so that the tangents are
+        the points' derivatives to rounding.
+        """
+        if self.closed:
+            s = np.mod(s, self.length)
+        if exactly:
+            piece, t = self.place(s.ravel())
+        else:
+            at = np.interp(s.ravel(), *self._table)
+            piece = np.clip(at.astype(np.int64), 0, self._degree.size - 1)
+            t = at - piece
+        return self._point(piece, t).reshape(s.shape), self._direction(piece, t)[0].reshape(s.shape)
+
+    def frame(self, s: FloatArray, forward: BoolArray) -> tuple[ComplexArray, FloatArray]:
+        """Direction and curvature.
+
+        Parameters
+        ----------
+        s : (k,) float64
+        forward : (k,) bool
+            At a joint: of the piece that begins there, and not of the one that ends.
+
+        Returns
+        -------
+        tangent : (k,) complex128
+            Of length 1, with the curve.
+        curvature : (k,) float64
+            Positive where the curve turns to the left.
+        """
+        piece, t = self.place(s)
+        back = ~forward & (s == self._starts[piece])
+        if not self.closed:
+            back &= piece > 0
+        piece = np.where(back, (piece - 1) % self._degree.size, piece)
+        return self._direction(piece, np.where(back, 1.0, t))
+
+    def moved(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
+        """Go along the curve, around if it is closed, to its end if it is not.
+
+        Parameters
+        ----------
+        s, step : (k,) float64
+            Where from and how far.
+        stop : bool
+            Go no further than to the next kink.
+        """
+        found = s + step
+        if stop and self.stops.size:
+            ahead = self.stops[np.searchsorted(self.stops, s, side="right") % self.stops.size]
+            behind = self.stops[np.searchsorted(self.stops, s, side="left") - 1]
+            room = np.where(step > 0, ahead - s, s - behind)
+            room = np.where(room > 0, room, room + self.length)
+            found = np.where((step != 0) & (np.abs(step) >= room), np.where(step > 0, ahead, behind), found)
+        if not self.closed:
+            return np.clip(found, 0.0, self.length)
+        around = np.mod(found, self.length)
+        return np.where(around < self.length, around, 0.0)
+
+    def barred(self, s: FloatArray, forward: BoolArray) -> BoolArray:
+        """Where an open curve has come to its end."""
+        return np.where(forward, s >= self.length, s <= 0) & (not self.closed)
+
+    def corners(self, angle: float) -> FloatArray:
+        """Where the curve turns by at least so many degrees, and its ends if it has any; ascending."""
+        marks = self._starts[:-1][(np.abs(self._turn) >= np.radians(angle)) & ~self._within]
+        return marks if self.closed else np.unique(np.append(marks, (0.0, self.length)))
+
+    def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where along the curve points (k, 2) are nearest to it, and how far from it; (k,) float64 each.
+
+        Exact for points on the curve up to rounding, where it does not meet itself; for others as near as chords tell.
+        """
+        z = as_complex(points)
+        chord, share = self._nearest_chord(z)
+        here, at = self._chord_piece[chord], self._chord_first[chord] + share * self._chord_width[chord]
+        best = np.full(z.size, np.inf)
+        piece, t = here, at
+        # Chords stray from the curve, so near a joint the other piece may be the one; not quite from its end, where it
+        # might stand still.
+        for other in (0, -1, 1):
+            candidate = here + other
+            candidate = candidate % self._degree.size if self.closed else np.clip(candidate, 0, self._degree.size - 1)
+            begin = np.where(candidate == here, at, _INWARD if other > 0 else 1 - _INWARD)
+            found, away = self._refined(candidate, begin, z)
+            better = away < best
+            piece, t = np.where(better, candidate, piece), np.where(better, found, t)
+            best = np.minimum(best, away)
+        s = self._starts[piece] + self._way(piece, t)
+        # A joint is a joint to the last bit.
+        joint = np.concatenate([piece, (piece + 1) % self._degree.size if self.closed else piece + 1])
+        for s_joint in joint.reshape(2, -1):
+            goal = self._starts[s_joint]
+            off = np.abs(s - goal)
+            off = np.minimum(off, self.length - off) if self.closed else off
+            s = np.where(off <= _SNAP * self.size, goal, s)
+        return np.where(s < self.length, s, 0.0) if self.closed else s, best
+
+    def _measure(self) -> None:
+        """The pieces as powers of the parameter, chords to find nearest points on, and where the pieces begin."""
+        a, b, c, d = self._control.T
+        by_degree = [(a, 0 * a, 0 * a, 0 * a), (a, b - a, 0 * a, 0 * a), (a, 2 * (b - a), a - 2 * b + c, 0 * a)]
+        by_degree.append((a, 3 * (b - a), 3 * (a - 2 * b + c), d - a + 3 * (b - c)))
+        self._powers = np.stack([np.choose(self._degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
+        count = np.array([chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
+        self._chord_piece = np.repeat(np.arange(count.size), count)
+        nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        self._chord_width = 1.0 / count[self._chord_piece]
+        self._chord_first = nth * self._chord_width
+        self._chord_tail = self._point(self._chord_piece, self._chord_first)
+        self._chord_head = self._point(self._chord_piece, (nth + 1) * self._chord_width)
+        every = np.concatenate([self._chord_tail, self._chord_head])
+        self.size = float(max(np.ptp(every.real), np.ptp(every.imag)))
+        if not (self.size > _SMALLEST and np.abs(every).max() < _LARGEST):
+            raise ValueError(
+                f"a curve of size {self.size:.3g} around {every[0]:.3g} leaves the range that can be computed in "
+                f"({_SMALLEST:.0e} to {_LARGEST:.0e}): scale the drawing"
+            )
+        lengths = self._way(np.arange(count.size), np.ones(count.size))
+        kept = lengths > _SNAP * self.size
+        if not kept.all():
+            self._degree, self._control = self._degree[kept], self._control[kept]
+            self._angles, self._within = self._angles[kept], self._within[kept]
+            self._measure()
+            return
+        self._starts = np.concatenate([[0.0], np.cumsum(lengths)])
+        self.length = float(self._starts[-1])
+        # Lengths at which pieces and their parameters are known: piece 3, t = 0.25 is 3.25.
+        piece, nth = np.divmod(np.arange(_TABLE * lengths.size), _TABLE)
+        way = self._starts[piece] + self._way(piece, nth / _TABLE)
+        self._table = np.append(way, self.length), np.append(piece + nth / _TABLE, float(lengths.size))
+
+    def _join(self) -> None:
+        """See that pieces meet, whether the curve is closed, and how it turns at its joints."""
+        m = self._degree.size
+        every = np.arange(m)
+        heads, tails = self._point(every, np.ones(m)), self._point(every, np.zeros(m))
+        apart = np.abs(heads - np.roll(tails, -1)) > _MEET * self.size
+        if apart[:-1].any():
+            k = int(np.argmax(apart[:-1]))
+            raise ValueError(
+                f"pieces {k} and {k + 1} of the curve (those without length left out) do not meet: "
+                f"{heads[k]:.6g} and {tails[k + 1]:.6g}"
+            )
+        self.closed = not apart[-1]
+        ahead, _ = self._direction(every, np.zeros(m))
+        before = np.roll(self._direction(every, np.ones(m))[0], 1)
+        self._turn = np.angle(ahead / before)
+        if not self.closed:
+            self._turn[0] = 0.0
+        self.stops = self.corners(np.degrees(_KINK))
+
+    def place(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Pieces and parameters, from 0 to 1, at lengths along the curve."""
+        piece = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, self._degree.size - 1)
+        whole = self._starts[piece + 1] - self._starts[piece]
+        way = np.clip(s - self._starts[piece], 0.0, whole)
+        # The table is a good guess, but its last bits may lie beyond the piece.
+        guess = np.clip(np.interp(s, *self._table) - piece, 1e-3, 1 - 1e-3)
+        t = np.where((self._degree[piece] == 1) | (way <= 0) | (way >= whole), way / whole, guess)
+        open_ = np.flatnonzero((self._degree[piece] != 1) & (t > 0) & (t < 1))
+        low, high = np.zeros(open_.size), np.ones(open_.size)
+        # Newton's steps, or halves where these leave what is known to hold the parameter.
+        for _ in range(_MOST_STEPS):
+            if not open_.size:
+                break
+            here = t[open_]
+            excess = self._way(piece[open_], here) - way[open_]
+            low, high = np.where(excess < 0, here, low), np.where(excess < 0, high, here)
+            speed = np.abs(self._derivatives(piece[open_], here)[0])
+            with np.errstate(all="ignore"):
+                there = here - excess / speed
+            there = np.where((there > low) & (there < high), there, 0.5 * (low + high))
+            t[open_] = np.where(excess == 0, here, there)
+            going = np.abs(t[open_] - here) > 4e-16
+            open_, low, high = open_[going], low[going], high[going]
+        return piece, t
+
+    def _way(self, piece: IntArray, t: FloatArray) -> FloatArray:
+        """Length of pieces from their beginning to a parameter; by Gauss' formula where they are curved."""
+        found = np.abs(self._control[piece, 1] - self._control[piece, 0]) * t
+        curved = np.flatnonzero(self._degree[piece] != 1)
+        if curved.size:
+            nodes, weights = gauss()
+            which, until = np.repeat(piece[curved], nodes.size), t[curved]
+            speed = np.abs(self._derivatives(which, (until[:, None] * nodes).ravel())[0])
+            found[curved] = until * (speed.reshape(-1, nodes.size) @ weights)
+        return found
+
+    def _point(self, piece: IntArray, t: FloatArray) -> ComplexArray:
+        """Points in plain doubles."""
+        a, b, c, d = self._powers[piece].T
+        found: ComplexArray = a + t * (b + t * (c + t * d))
+        for arc, cos, sin in self._on_arcs(piece, t):
+            centre, along, across, _ = self._control[piece[arc]].T
+            found[arc] = centre + along * cos + across * sin
+        return found
+
+    def _derivatives(self, piece: IntArray, t: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """First and second derivatives by the parameter."""
+        _, b, c, d = self._powers[piece].T
+        first: ComplexArray = b + t * (2 * c + 3 * t * d)
+        second: ComplexArray = 2 * c + 6 * t * d
+        for arc, cos, sin in self._on_arcs(piece, t):
+            _, along, across, _ = self._control[piece[arc]].T
+            span = self._angles[piece[arc], 1] - self._angles[piece[arc], 0]
+            first[arc] = span * (across * cos - along * sin)
+            second[arc] = -(span**2) * (along * cos + across * sin)
+        return first, second
+
+    def _on_arcs(self, piece: IntArray, t: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Which of some places are on arcs, if any is, and the cosines and sines there."""
+        arc = np.flatnonzero(self._degree[piece] == 0)
+        if arc.size:
+            angle = angle_at(self._angles[piece[arc]], t[arc])
+            yield arc, np.cos(angle), np.sin(angle)
+
+    def _direction(self, piece: IntArray, t: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Unit tangents and curvatures."""
+        first, second = self._derivatives(piece, t)
+        speed = np.abs(first)
+        # Where handles coincide with ends the speed is 0, and a short chord says where it goes.
+        slow = speed <= SLOW * np.abs(self._control[piece]).max(axis=1).clip(self.size)
+        if slow.any():
+            step = np.where(t < 0.5, _CHORD, -_CHORD)
+            chord = (self._point(piece, t + step) - self._point(piece, t)) / step
+            first = np.where(slow, chord, first)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            curvature = (first.conj() * second).imag / np.abs(first) ** 3
+        return first / np.abs(first), np.where(slow, 0.0, curvature)
+
+    def _nearest_chord(self, z: ComplexArray) -> tuple[IntArray, FloatArray]:
+        """The chord nearest to each point, and how far along it that is, from 0 to 1."""
+        side = self._chord_head - self._chord_tail
+        chord, share = np.empty(z.size, dtype=np.int64), np.empty(z.size)
+        portion = max(1, _PAIRS // side.size)
+        for start in range(0, z.size, portion):
+            part = slice(start, start + portion)
+            away = z[part, None] - self._chord_tail
+            along = np.clip((away / side).real, 0.0, 1.0)
+            chord[part] = np.argmin(np.abs(away - along * side), axis=1)
+            share[part] = np.take_along_axis(along, chord[part, None], axis=1)[:, 0]
+        return chord, share
+
+    def _refined(self, piece: IntArray, t: FloatArray, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """The parameter of the piece's point nearest to each of some points, by Newton's method, and the distance."""
+        t, least = t.copy(), np.abs(self._point(piece, t) - z)
+        best, going = t.copy(), np.arange(z.size)
+        for _ in range(_REFINEMENTS):
+            at, here = piece[going], t[going]
+            away = self._point(at, here) - z[going]
+            first, second = self._derivatives(at, here)
+            slope = (away.conj() * first).real
+            square = np.abs(first) ** 2
+            bend = square + (away.conj() * second).real
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = slope / np.where(bend > 0.5 * square, bend, square)
+            there = np.clip(here - np.nan_to_num(step), 0.0, 1.0)
+            found = np.abs(self._point(at, there) - z[going])
+            better = found < least[going]
+            best[going[better]], least[going[better]] = there[better], found[better]
+            t[going] = there
+            # Most rest after four steps; next to where a piece stands still they take ten times as many.
+            going = going[np.abs(there - here) > _RESTS]
+            if not going.size:
+                break
+        return best, least

@@ -1,0 +1,162 @@
+"""How far the boundary's edges stray from the curves that their ends slide along, kept in bounds.
+
+Vertices that slide would leave a bend that costs energy, and the edge between the last two would cut it off: the
+polygon of the boundary would no longer be the outline. So an edge may stray from its stretch of the curve no further
+than the worst one does at the start, or once every vertex has gone halfway to the next, and a fifth as far again. On K
+points of the stretch, at distances dₖ from the edge's line,
+
+    m = Σₖ dₖ² / K        barrier = −log(1 − m/M) − m/M        with M the bound,
+
+which is next to nothing until m comes close to M. Second derivatives are those of Gauss and Newton, never negative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.geometry.curves.boundary_curves import Chain, Track
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Where along the stretch, as shares of it.
+_SHARES = np.arange(1, 8) / 8
+# How far an edge may stray, in units of the worst at the start.
+_ALLOWED = 1.2
+# Squares of distances below this share of the curve's size squared are rounding: the curve is straight there.
+_STRAIGHT = 1e-18
+
+
+class Straying:
+    """The barrier of all edges between neighbours on a curve, by the sliding vertices' lengths.
+
+    Parameters
+    ----------
+    track : Track
+    loops : sequence of (l,) int64
+        Boundary loops.
+    exactly : bool
+        Take points of the curves exactly at their lengths, and not quickly at about these: slopes are then the
+        derivatives of values to rounding.
+
+    Attributes
+    ----------
+    pairs : (e, 2) int64
+        The sliding vertices at the edges' ends, as positions in ``track.vertices``; -1 for one that is held.
+    """
+
+    def __init__(self, track: Track, loops: Sequence[IntArray], *, exactly: bool = False) -> None:
+        following = {int(i): int(j) for loop in loops for i, j in zip(loop, np.roll(loop, -1), strict=True)}
+        number = {int(v): k for k, v in enumerate(track.vertices)}
+        self._track, self._exactly = track, exactly
+        self._edges: list[tuple[int, IntArray, IntArray]] = []
+        self._bounds: list[float] = []
+        pairs = []
+        for k, chain in enumerate(track.chains):
+            ahead = np.roll(np.arange(chain.s.size), -1)
+            tail = np.flatnonzero(
+                [
+                    following.get(int(i)) == j or following.get(int(j)) == i
+                    for i, j in zip(chain.vertices, chain.vertices[ahead], strict=True)
+                ]
+            )
+            if not chain.curve.closed:
+                tail = tail[tail < chain.s.size - 1]
+            head = ahead[tail]
+            bound = _ALLOWED**2 * _worst(chain, tail, head)
+            kept = chain.sliding[tail] | chain.sliding[head]
+            if bound <= _STRAIGHT * chain.curve.size**2 or not kept.any():
+                continue
+            self._edges.append((k, tail[kept], head[kept]))
+            self._bounds.append(bound)
+            ends = np.stack([chain.vertices[tail[kept]], chain.vertices[head[kept]]], axis=1)
+            pairs += [[number.get(i, -1), number.get(j, -1)] for i, j in ends.tolist()]
+        self.pairs: IntArray = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+    def value(self, s: FloatArray) -> float:
+        """The barrier's mean over the edges; ``inf`` where one strays too far."""
+        total = sum(float(_barrier(share)[0].sum()) for share, _, _ in self._shares(s))
+        return total / max(len(self.pairs), 1)
+
+    def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """First and second derivatives of the mean by the lengths at each edge's ends.
+
+        Returns
+        -------
+        slope : (e, 2) float64
+        bend : (e, 2, 2) float64
+            Positive semidefinite.
+        """
+        slopes, bends = [np.empty((0, 2))], [np.empty((0, 2, 2))]
+        for share, by_ends, by_both in self._shares(s):
+            _, first, second = _barrier(share)
+            slopes.append(first[:, None] * by_ends)
+            bends.append(
+                first[:, None, None] * by_both + second[:, None, None] * by_ends[:, :, None] * by_ends[:, None, :]
+            )
+        count = max(len(self.pairs), 1)
+        return np.concatenate(slopes) / count, np.concatenate(bends) / count
+
+    def _shares(self, s: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """``m/M`` of the edges on each curve, and its first and second derivatives by the ends' lengths."""
+        found, every = [], self._track.every(s)
+        for (k, tail, head), bound in zip(self._edges, self._bounds, strict=True):
+            share, by_ends, by_both = _strayed(
+                self._track.chains[k], every[k][tail], every[k][head], exactly=self._exactly
+            )
+            found.append((share / bound, by_ends / bound, by_both / bound))
+        return found
+
+
+def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
+    """The most that an edge strays, squared: at the start, or with sliding vertices halfway to the next."""
+    if not tail.size:
+        return 0.0
+    here, there = chain.s[tail], chain.s[head]
+    found = _strayed(chain, here, there)[0].max()
+    middle = here + 0.5 * ((there - here) % chain.curve.length)
+    # Only edges that follow each other at a vertex that slides have a middle edge; a corner is not cut off.
+    order = {int(i): k for k, i in enumerate(tail)}
+    links = [(order[int(i)], k) for k, i in enumerate(tail) for i in [head[k]] if int(i) in order and chain.sliding[i]]
+    if links:
+        before, after = (middle[k] % chain.curve.length for k in np.array(links).T[::-1])
+        found = max(found, _strayed(chain, before, after)[0].max())
+    return float(found)
+
+
+def _strayed(
+    chain: Chain, begin: FloatArray, end: FloatArray, *, exactly: bool = False
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean squares of distances between stretches (e,) of a curve and their chords, with derivatives by both ends."""
+    curve = chain.curve
+    gap = (end - begin) % curve.length if curve.closed else end - begin
+    shares = np.concatenate([[0.0], _SHARES, [1.0]])
+    along = begin[:, None] + gap[:, None] * shares
+    points, tangents = curve.sampled(along, exactly=exactly)
+    side = points[:, -1] - points[:, 0]
+    normal = 1j * side / np.abs(side)
+    local = (points[:, 1:-1] - points[:, :1]) / side[:, None]
+    away = local.imag * np.abs(side)[:, None]
+
+    def across(vectors: NDArray[np.complex128]) -> FloatArray:
+        return np.asarray((vectors * normal.conj()[:, None]).real)
+
+    own = across(tangents[:, 1:-1])
+    by_begin = (1 - _SHARES) * own - (1 - local.real) * across(tangents[:, :1])
+    by_end = _SHARES * own - local.real * across(tangents[:, -1:])
+    by_ends = np.stack([by_begin, by_end], axis=1)
+    count = _SHARES.size
+    return (
+        (away**2).sum(axis=1) / count,
+        2 * (away[:, None] * by_ends).sum(axis=2) / count,
+        2 * by_ends @ by_ends.swapaxes(1, 2) / count,
+    )
+
+
+def _barrier(share: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``−log(1 − x) − x`` with its first two derivatives."""
+    room = 1 - share
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.where(room > 0, -np.log1p(-np.minimum(share, 1)) - share, np.inf)
+    return value, share / room, 1 / room**2

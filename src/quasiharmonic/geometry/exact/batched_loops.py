@@ -1,0 +1,69 @@
+"""Exact verdicts on many small maps at once, for less than each would cost alone.
+
+Most maps that are judged are good ones of a surface with one boundary loop. That these are bijective is said by two
+exact tests, of triangles and of pairs of boundary edges, that many maps can share: if all triangles are positive and
+the only loop is simple, there is nothing else to ask (`certify`). What is any different is handed to that, map by map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.certificate import Certificate, certify, flipped_triangles
+from quasiharmonic.geometry.exact.loops import simple_loops
+from quasiharmonic.util.arrays import FloatArray, IntArray, unchangeable
+
+
+def certify_each(
+    F: Sequence[IntArray], uv: Sequence[FloatArray], loops: Sequence[Sequence[IntArray]]
+) -> list[Certificate]:
+    """Judge maps exactly, each by itself: what `certify` says of each.
+
+    Parameters
+    ----------
+    F : sequence of (f, 3) int64
+        Triangles of each surface.
+    uv : sequence of (n, 2) float64
+        Places of its vertices.
+    loops : sequence of sequences of (l,) int64
+        Its boundary loops, as `boundary_loops` gives them; taken on trust.
+
+    Returns
+    -------
+    list of Certificate
+    """
+    if not F:
+        return []
+    vertices = np.cumsum([0, *map(len, uv)])
+    triangles = np.cumsum([0, *map(len, F)])
+    places = np.concatenate(uv)
+    good = np.array([len(rims) == 1 for rims in loops]) & (np.diff(triangles) > 0)
+    bad = flipped_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), places)
+    good[np.searchsorted(triangles, bad, side="right") - 1] = False
+    alone = np.flatnonzero(good)
+    if alone.size:
+        rims = [loops[k][0] + vertices[k] for k in alone.tolist()]
+        good[alone] = simple_loops(rims, places)
+    return [
+        _bijective(F[k], uv[k], loops[k]) if good[k] else certify(F[k], uv[k], loops=loops[k]) for k in range(len(F))
+    ]
+
+
+def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certificate:
+    """The verdict on a map of which nothing bad is to be said."""
+    none = np.empty(0, dtype=np.int64)
+    return Certificate(
+        triangles=len(F),
+        flipped=none,
+        degenerate=none.copy(),
+        nonfinite=none.copy(),
+        bijective=True,
+        reasons=(),
+        loops=tuple(loop.copy() for loop in loops),
+        crossings=np.empty((0, 4), dtype=np.int64),
+        overwound=none.copy(),
+        F=unchangeable(F),
+        uv=uv.copy(),
+    )

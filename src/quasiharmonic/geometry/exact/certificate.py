@@ -1,0 +1,306 @@
+"""Exact verdict on a map of a triangle mesh into the plane.
+
+A map is *injective* here when every triangle is strictly positive, which is decided exactly on the
+coordinates as stored. It is *bijective* onto its image when, in addition, no two points of the
+surface share a place. That is read off the boundary alone:
+
+    Let all triangles of a compact oriented surface be positive. Around a point of the plane that is
+    on no edge's image, the boundary's image winds as often as the point has preimages: both are the
+    degree of the map there [1]_. So the map is bijective if and only if the images of the boundary
+    loops are simple and mutually disjoint and wind 0 or 1 times around every point off them.
+
+    (*Only if*: a bijective map keeps loops simple and apart, and no point has two preimages. *If*:
+    almost no point has two preimages. Two points of the surface at one place, of which one is
+    interior, would have neighbourhoods whose images overlap in an open set, all of it covered twice;
+    two boundary points at one place are excluded by the loops being simple and disjoint. For the
+    same reason the triangles around an interior vertex wind around it once: where they wind twice,
+    as positive triangles can, the points nearby are covered twice.)
+
+Nothing in this asks how many components the surface has, nor its genus: a surface that cannot lie in
+the plane fails the test. For loops that are simple and disjoint the winding numbers are a matter of
+nesting: with none or two or four loops around it a loop must run counterclockwise, with one or three
+clockwise. For a connected surface this leaves one counterclockwise loop around all others. Which of
+its loops that is does not matter; an annulus turned inside out is as bijective as before.
+
+References
+----------
+.. [1] Y. Lipman, Bijective mappings of meshes with boundary and the degree in mesh processing.
+   SIAM Journal on Imaging Sciences 7 (2014).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.geometry.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
+from quasiharmonic.geometry.exact.triangles import overwound_vertices, triangle_signs
+from quasiharmonic.geometry.mesh.topology import edges, trace_loops
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    ReadOnly,
+    check_range,
+    counted,
+    loop_arrays,
+    map_array,
+    named,
+    own_triangles,
+    true_or_false,
+)
+from quasiharmonic.util.display import Displayable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(ReadOnly, Displayable):
+    """What was decided exactly about a map; made by `certify`.
+
+    Attributes
+    ----------
+    triangles : int
+        Number of triangles judged.
+    flipped, degenerate, nonfinite : (k,) int64
+        Ascending indices of the triangles that are clockwise, that have exactly no area (a repeated
+        vertex included), and that have a NaN or infinite coordinate and so no orientation.
+    bijective : bool or None
+        Whether the map is injective and covers no point twice; None when it was not asked for.
+    reasons : tuple of Reason
+        Why the map is not bijective. The loops are judged also where triangles are flipped.
+    loops : tuple of (l,) int64
+        Boundary vertices, loop by loop, the surface to the left.
+    crossings : (m, 4) int64
+        Rows ``i, j, k, l``: the boundary edges ``i → j`` and ``k → l`` share a point that they should
+        not share. At most 1000 are listed.
+    overwound : (k,) int64
+        Vertices, all triangles around them positive, whose angles add up to more than 2π. Around an interior vertex
+        they then wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
+    F : (f, 3) int64
+    uv : (n, 2) float64
+        What was judged: the certificate's own copies. No array here is writeable.
+
+    Notes
+    -----
+    Where all triangles around a vertex are positive, the map is locally injective at it if and only if their angles add
+    up to 2π, around an interior vertex, or to less than 2π, at a boundary vertex. Around an interior vertex the sum is
+    a multiple of 2π. At a boundary vertex it may be 2π exactly: then the two boundary edges there lie on each other,
+    which `crossings` has, and the vertex is not overwound. This is decided exactly; where the boundary was not judged
+    (`bijective` is None), or the mesh is not a surface, `overwound` is empty.
+    """
+
+    triangles: int
+    flipped: IntArray
+    degenerate: IntArray
+    nonfinite: IntArray
+    bijective: bool | None
+    reasons: tuple[Reason, ...]
+    loops: tuple[IntArray, ...]
+    crossings: IntArray
+    overwound: IntArray
+    F: IntArray
+    uv: FloatArray
+
+    def __post_init__(self) -> None:
+        self._seal()
+
+    def _read_only(self) -> tuple[NDArray[Any], ...]:
+        return (
+            self.F,
+            self.uv,
+            self.flipped,
+            self.degenerate,
+            self.nonfinite,
+            self.crossings,
+            self.overwound,
+            *self.loops,
+        )
+
+    @property
+    def injective(self) -> bool:
+        """Whether there are triangles and every one is strictly positive."""
+        return self.triangles > 0 and not (self.flipped.size or self.degenerate.size or self.nonfinite.size)
+
+    def summary(self) -> str:
+        """Say in a sentence or two what is certified, or what is wrong and where."""
+        further = [r.text for r in self.reasons if r.kind is not Obstacle.NOT_INJECTIVE]
+        if self.injective:
+            all_of_them = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
+            said = f"Injective: {all_of_them} positive."
+        elif self.triangles:
+            counted = _counted(self.flipped, self.degenerate, self.nonfinite)
+            said = f"Not injective: of {self.triangles} triangles, {counted}."
+        else:
+            return "Not injective: there are no triangles."
+        if self.bijective:
+            return f"{said} Bijective: the boundary does not meet itself, and no point is covered twice."
+        if not further:
+            return said
+        more = f"; and {len(further) - 3} more" if len(further) > 3 else ""
+        return f"{said} Not bijective{'' if self.injective else ' either'}: {'; '.join(further[:3])}{more}."
+
+    def short_repr(self) -> str:
+        bad = self.flipped.size + self.degenerate.size + self.nonfinite.size
+        triangles = counted("triangle", "triangles", self.triangles)
+        if bad or not self.triangles:
+            return f"not injective, {bad:,} of {triangles} not positive"
+        also = {True: " and bijective", False: ", not bijective", None: ""}[self.bijective]
+        return f"injective{also}, {triangles}"
+
+    def plot(self) -> Figure:
+        """Draw the map that was judged, triangles that are not positive in red, boundary edges that meet marked."""
+        figure: Figure = self._draw("certificate")
+        return figure
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in plain Python types, fit for JSON; of a loop, its first vertex and its length."""
+        return {
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "triangles": self.triangles,
+            "flipped": self.flipped.tolist(),
+            "degenerate": self.degenerate.tolist(),
+            "nonfinite": self.nonfinite.tolist(),
+            "reasons": [{"kind": r.kind.value, "text": r.text, "loops": list(r.loops)} for r in self.reasons],
+            "loops": [{"start": int(loop[0]), "length": len(loop)} for loop in self.loops],
+            "crossings": self.crossings.tolist(),
+            "overwound": self.overwound.tolist(),
+            "summary": self.summary(),
+        }
+
+
+def certify(
+    F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[ArrayLike] | None = None
+) -> Certificate:
+    """Decide whether the map of an array of triangles is injective and bijective; as `quasiharmonic.certify`."""
+    true_or_false("boundary", boundary)
+    F, uv = _taken(F, uv)
+    given = None if loops is None else loop_arrays(loops, len(uv))
+    if given == [] and len(F):
+        raise ValueError("loops has no boundary loop: leave it out to have the loops found")
+    sign, nonfinite = triangle_signs(F, uv)
+    flipped = degenerate = np.empty(0, dtype=np.int64)
+    reasons: list[Reason] = []
+    if not len(F):
+        reasons.append(Reason(Obstacle.NO_TRIANGLES, "there are no triangles"))
+    elif sign.min() <= 0:
+        flipped = np.flatnonzero(sign < 0)
+        degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
+        text = f"of {len(F)} triangles, {_counted(flipped, degenerate, nonfinite)}"
+        reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
+    known: list[IntArray] = []
+    crossings, overwound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
+    if boundary and len(F):
+        known, broken = _loops(F, len(uv)) if given is None else (given, [])
+        reasons += broken
+        # If all triangles are positive and the only loop is simple, then it encloses the sum of their areas, so it runs
+        # counterclockwise and winds once around what it encloses, and nothing is left to ask.
+        plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
+        if not broken and not plain:
+            overwound = overwound_vertices(F, uv, sign, known)
+            if np.isfinite(uv[np.concatenate(known)]).all():
+                crossings, found = judge_loops(known, uv)
+                reasons += found
+        if overwound.size:
+            text = f"triangles wind more than once around {named('vertex', 'vertices', overwound)}"
+            reasons.append(Reason(Obstacle.OVERWOUND, text))
+    return Certificate(
+        triangles=len(F),
+        flipped=flipped,
+        degenerate=degenerate,
+        nonfinite=nonfinite,
+        bijective=not reasons if boundary else None,
+        reasons=tuple(reasons),
+        loops=tuple(known),
+        crossings=crossings,
+        overwound=overwound,
+        F=F,
+        uv=uv,
+    )
+
+
+def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
+    """Whether every triangle of an array is strictly positive; as `quasiharmonic.is_injective`."""
+    F, uv = _taken(F, uv)
+    return len(F) > 0 and bool(triangle_signs(F, uv)[0].min() > 0)
+
+
+def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
+    """The triangles of an array that are not strictly positive; as `quasiharmonic.flipped_triangles`."""
+    return np.flatnonzero(triangle_signs(*_taken(F, uv))[0] <= 0)
+
+
+def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
+    """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
+    triangles = own_triangles(F)
+    given = getattr(uv, "uv", uv)
+    places = map_array("uv", given, finite=False)
+    rounded = _rounded(given, places)
+    if rounded.size:
+        # A vertex that is not there is the plainer mistake.
+        check_range("F", triangles, len(places))
+        raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rounded)}")
+    return triangles, places
+
+
+def _rounded(given: ArrayLike, places: FloatArray) -> IntArray:
+    """Vertices whose places (n, 2) may not be what was given: of other types double does not have all values."""
+    stored = np.asarray(given)
+    if stored.dtype.kind == "f" and stored.dtype.itemsize > 8:
+        return np.flatnonzero(((places != stored) & ~np.isnan(places)).any(axis=1))
+    if stored.dtype.kind == "f" and not isinstance(given, list | tuple):
+        return np.empty(0, dtype=np.int64)
+    large = np.argwhere(np.abs(places) >= 2.0**53)
+    if stored.dtype.kind == "f":
+        # Of integers and floats in one list NumPy makes doubles, and rounds the integers.
+        kept = [at for at in large.tolist() if _is_rounded(given, places, *at)]
+        large = np.array(kept, dtype=np.int64).reshape(-1, 2)
+    return np.unique(large[:, 0])
+
+
+def _is_rounded(given: Any, places: FloatArray, vertex: int, axis: int) -> bool:
+    """Whether a number in nested lists is another than the double that was made of it."""
+    number = given[vertex][axis]
+    return not isinstance(number, float | np.floating) and int(number) != int(places[vertex, axis])
+
+
+def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
+    """Count and name the triangles that are not positive, by what is wrong with them."""
+    return ", ".join(
+        f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({listed(bad.tolist())})"
+        for bad, what in ((flipped, "flipped"), (degenerate, "degenerate"), (nonfinite, "not finite"))
+        if bad.size
+    )
+
+
+def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
+    """Boundary loops, or why there are none to be judged."""
+    parts, repeated = edges(F, n), np.empty(0, dtype=np.int64)
+    # An edge from a vertex to itself is never between two triangles that traverse it in opposite directions.
+    if any((some[:, 0] == some[:, 1]).any() for some in (parts.boundary, parts.inconsistent, parts.nonmanifold)):
+        repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
+    wrong = (
+        (repeated.tolist(), "triangles repeat a vertex"),
+        (_dashed(parts.nonmanifold), "edges are in three or more triangles"),
+        (_dashed(parts.inconsistent), "edges are traversed twice in the same direction"),
+    )
+    broken = [f"{what} ({listed(found)})" for found, what in wrong if found]
+    if not broken:
+        try:
+            loops = trace_loops(parts.boundary)
+        except ValueError as error:
+            broken = [str(error)]
+    if broken:
+        return [], [Reason(Obstacle.NOT_A_SURFACE, f"the mesh is not a surface: {text}") for text in broken]
+    if not loops:
+        return [], [Reason(Obstacle.NO_BOUNDARY, "the surface has no boundary")]
+    return loops, []
+
+
+def _dashed(pairs: IntArray) -> list[str]:
+    return [f"{i}–{j}" for i, j in pairs.tolist()]

@@ -1,0 +1,327 @@
+"""Triangles between given points that have given segments among their edges: constrained Delaunay triangulation.
+
+    Qhull's Delaunay triangles ──valid, exactly?──▶ yes ──▶ segments that are missing, brought in by flips [1]_
+                                      └──▶ no ──▶ one point after the other [2]_ ──▶ the same
+
+    A polygon without further points: any triangles within it, by a sweep ──▶ flips.
+
+Every triangle handed back is strictly positive, decided exactly. Delaunay's criterion is decided in floating point:
+where it is lost in rounding, either diagonal will do.
+
+References
+----------
+.. [1] S. W. Sloan, A fast algorithm for generating constrained Delaunay triangulations. Computers & Structures 47
+   (1993).
+.. [2] C. L. Lawson, Software for C¹ surface interpolation. Mathematical Software III (1977).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.exact.triangles import triangle_signs
+from quasiharmonic.geometry.exact.triangulation import triangulate
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Rounding of an orientation and of an in-circle determinant relative to the sum of their terms' magnitudes, with room.
+_FLAT, _ROUND = 4e-16, 2e-15
+
+
+class BlockedError(ValueError):
+    """A segment passes through a point that is not one of its ends.
+
+    Attributes
+    ----------
+    point : int
+    """
+
+    def __init__(self, tail: int, head: int, point: int) -> None:
+        super().__init__(f"the segment from point {tail} to point {head} passes through point {point}")
+        self.point = point
+
+
+def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray) -> IntArray:
+    """Triangulate points within a convex polygon, with given segments among the edges.
+
+    Parameters
+    ----------
+    points : (n, 2) float64
+        Pairwise distinct, of magnitude about one.
+    segments : (s, 2) int64
+        Pairs of points. They have at most ends in common.
+    hull : (h,) int64
+        Corners of the convex polygon around all other points, counterclockwise, every corner strictly convex.
+
+    Returns
+    -------
+    (t, 3) int64
+        Counterclockwise, every point a corner of at least one.
+
+    Raises
+    ------
+    BlockedError
+        When a segment passes through a point.
+    ValueError
+        When points coincide, or one is outside the polygon.
+    """
+    F = by_qhull(points)
+    triangulation = None
+    if not _covers(F, points, hull):
+        triangulation = Triangulation.of_points(points, hull)
+        F = triangulation.triangles()
+    n = len(points)
+    required = edge_keys(segments[:, 0], segments[:, 1], n)
+    tails, heads = F.ravel(), np.roll(F, -1, axis=1).ravel()
+    missing = segments[~np.isin(required, edge_keys(tails, heads, n))]
+    if not len(missing):
+        return F
+    triangulation = triangulation or Triangulation(points, F)
+    triangulation.keep(segments)
+    for tail, head in missing.tolist():
+        triangulation.recover(tail, head)
+    return triangulation.triangles()
+
+
+def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
+    """Triangulate a simple polygon without further points.
+
+    Meant for up to a few hundred corners, all of whose steps are Python's.
+
+    Parameters
+    ----------
+    points : (k, 2) float64
+        Its corners.
+
+    Returns
+    -------
+    (k - 2, 3) int64 or None
+        Counterclockwise. None where the polygon runs clockwise.
+    """
+    corners = _whole(points)
+    if sum(corners[k - 1][0] * y - x * corners[k - 1][1] for k, (x, y) in enumerate(corners)) < 0:
+        return None
+    made = Triangulation(points, np.array(triangulate(corners), dtype=np.int64))
+    sides = np.arange(len(points))
+    made.keep(np.stack([sides, np.roll(sides, -1)], axis=1))
+    made.legalise()
+    return made.triangles()
+
+
+def _whole(points: FloatArray) -> list[tuple[int, int]]:
+    """Points scaled by a power of two such that they are whole numbers, exactly."""
+    ratios = [value.as_integer_ratio() for value in points.ravel().tolist()]
+    finest = max(denominator for _, denominator in ratios)
+    whole = [numerator * (finest // denominator) for numerator, denominator in ratios]
+    return list(zip(whole[::2], whole[1::2], strict=True))
+
+
+def by_qhull(points: FloatArray) -> IntArray:
+    """Delaunay triangles as Qhull finds them, counterclockwise as far as they have a sense."""
+    from scipy.spatial import Delaunay, QhullError
+
+    try:
+        # Near the origin it sees more digits; whether it saw right is decided on the points as given.
+        F: IntArray = Delaunay(points - points.mean(axis=0)).simplices.astype(np.int64)
+    except QhullError:
+        return np.empty((0, 3), dtype=np.int64)
+    sign, _ = triangle_signs(F, np.ascontiguousarray(points, dtype=np.float64))
+    # What has no area lies on the hull, between points on a line.
+    F, sign = F[sign != 0], sign[sign != 0]
+    F[sign < 0] = F[sign < 0, ::-1]
+    return F
+
+
+def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
+    """Whether positive triangles cover a polygon once, using all points: it is their boundary."""
+    if not len(F) or not np.bincount(F.ravel(), minlength=len(points)).all():
+        return False
+    found = edges(F, len(points))
+    if found.nonmanifold.size or found.inconsistent.size or len(found.boundary) != len(hull):
+        return False
+    around = edge_keys(hull, np.roll(hull, -1), len(points))
+    there = edge_keys(found.boundary[:, 0], found.boundary[:, 1], len(points))
+    return bool(np.array_equal(np.sort(around), np.sort(there)))
+
+
+class Triangulation:
+    """Triangles of a convex polygon that are flipped one by one.
+
+    Parameters
+    ----------
+    points : (n, 2) float64
+    F : (t, 3) int64
+        Strictly positive triangles that cover a convex polygon once.
+    """
+
+    def __init__(self, points: FloatArray, F: IntArray) -> None:
+        self._array = points
+        self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
+        tails, heads, apexes = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.roll(F, -2, axis=1).ravel()
+        # The third corner of the triangle to the left of a half-edge, and a half-edge from every point.
+        self._apex = dict(zip(zip(tails.tolist(), heads.tolist(), strict=True), apexes.tolist(), strict=True))
+        self._some = dict(zip(tails.tolist(), heads.tolist(), strict=True))
+        self._kept: set[tuple[int, int]] = set()
+
+    @classmethod
+    def of_points(cls, points: FloatArray, hull: IntArray) -> Triangulation:
+        """Insert one point after the other into a convex polygon, whose corners are ``hull``."""
+        fan = np.stack([np.full(len(hull) - 2, hull[0]), hull[1:-1], hull[2:]], axis=1)
+        made = cls(points, fan)
+        made.legalise()
+        inner = np.setdiff1d(np.arange(len(points)), hull)
+        at = int(hull[0])
+        for point in inner[_along_curve(points[inner])].tolist():
+            made._insert(point, at)
+            at = point
+        return made
+
+    def triangles(self) -> IntArray:
+        """All triangles, (t, 3) int64, each from its smallest corner."""
+        found = [(a, b, c) for (a, b), c in self._apex.items() if a < b and a < c]
+        return np.array(found, dtype=np.int64).reshape(-1, 3)
+
+    def keep(self, segments: IntArray) -> None:
+        """Name segments that Delaunay's criterion must not remove again."""
+        pairs = [(a, b) for a, b in segments.tolist()]
+        self._kept.update(pairs)
+        self._kept.update((b, a) for a, b in pairs)
+
+    def legalise(self) -> None:
+        """Flip edges until Delaunay's criterion holds everywhere."""
+        self._legalise(list(self._apex))
+
+    def recover(self, tail: int, head: int) -> None:
+        """Make a segment an edge, by flipping what crosses it."""
+        crossing = deque(self._crossed(tail, head))
+        made = []
+        while crossing:
+            p, q = crossing.popleft()
+            if not self._flippable(p, q):
+                crossing.append((p, q))
+                continue
+            left, right = self._flip(p, q)
+            if {left, right}.isdisjoint((tail, head)) and (
+                self._turn(tail, head, left) > 0 > self._turn(tail, head, right)
+                or self._turn(tail, head, left) < 0 < self._turn(tail, head, right)
+            ):
+                crossing.append((left, right))
+            else:
+                made.append((left, right))
+        self._legalise(made)
+
+    def _crossed(self, tail: int, head: int) -> list[tuple[int, int]]:
+        """Edges across a segment, from its tail on, the first end to the right of it."""
+        if (tail, head) in self._apex or (head, tail) in self._apex:
+            return []
+        right = self._some[tail]
+        while True:
+            left = self._apex[tail, right]
+            if self._turn(tail, head, right) < 0 < self._turn(tail, head, left):
+                break
+            if self._turn(tail, head, left) == 0 and self._ahead(tail, head, left):
+                raise BlockedError(tail, head, left)
+            right = left
+        found = [(right, left)]
+        while (ahead := self._apex[left, right]) != head:
+            side = self._turn(tail, head, ahead)
+            if side == 0:
+                raise BlockedError(tail, head, ahead)
+            right, left = (right, ahead) if side > 0 else (ahead, left)
+            found.append((right, left))
+        return found
+
+    def _insert(self, point: int, at: int) -> None:
+        """Split what a point lies in, a triangle or an edge; the search starts ``at`` another."""
+        a = at
+        b = self._some[a]
+        c = self._apex[a, b]
+        # Across any side that has the point on its right; in Delaunay triangles this ends.
+        while True:
+            for tail, head in ((a, b), (b, c), (c, a)):
+                if self._turn(tail, head, point) < 0:
+                    if (head, tail) not in self._apex:
+                        raise ValueError(f"point {point} is outside the polygon")
+                    a, b, c = head, tail, self._apex[head, tail]
+                    break
+            else:
+                break
+        on = [(tail, head) for tail, head in ((a, b), (b, c), (c, a)) if self._turn(tail, head, point) == 0]
+        if len(on) > 1:
+            raise ValueError(f"point {point} coincides with another")
+        around = [(a, b), (b, c), (c, a)]
+        for tail, head in on:
+            if (head, tail) not in self._apex:
+                raise ValueError(f"point {point} is on the polygon's outline")
+            across = self._apex.pop((head, tail))
+            del self._apex[tail, head]
+            around = [edge for edge in around if edge != (tail, head)] + [(tail, across), (across, head)]
+        for tail, head in around:
+            self._apex[tail, head] = point
+            self._apex[head, point] = tail
+            self._apex[point, tail] = head
+            self._some[tail] = head
+        self._some[point] = around[0][0]
+        self._legalise(around)
+
+    def _legalise(self, suspects: Iterable[tuple[int, int]]) -> None:
+        """Flip edges, and those around them in turn, until Delaunay's criterion holds as far as one can tell."""
+        waiting = list(suspects)
+        while waiting:
+            p, q = waiting.pop()
+            if (p, q) not in self._apex or (q, p) not in self._apex or (p, q) in self._kept:
+                continue
+            if self._in_circle(p, q) and self._flippable(p, q):
+                left, right = self._flip(p, q)
+                waiting += [(p, right), (right, q), (q, left), (left, p)]
+
+    def _flippable(self, p: int, q: int) -> bool:
+        """Whether the triangles on both sides of an edge make a strictly convex quadrangle."""
+        left, right = self._apex[p, q], self._apex[q, p]
+        return self._turn(left, right, q) > 0 and self._turn(right, left, p) > 0
+
+    def _flip(self, p: int, q: int) -> tuple[int, int]:
+        """Replace an edge by the other diagonal; its ends."""
+        left, right = self._apex.pop((p, q)), self._apex.pop((q, p))
+        for a, b, c in ((right, q, left), (left, p, right)):
+            self._apex[a, b], self._apex[b, c], self._apex[c, a] = c, a, b
+        self._some[p], self._some[q] = right, left
+        return left, right
+
+    def _ahead(self, tail: int, head: int, point: int) -> bool:
+        x, y = self._x, self._y
+        along = (x[head] - x[tail]) * (x[point] - x[tail]) + (y[head] - y[tail]) * (y[point] - y[tail])
+        return along > 0
+
+    def _turn(self, a: int, b: int, c: int) -> float:
+        """A number with the sign of the orientation of three points, exactly."""
+        x, y = self._x, self._y
+        left = (x[a] - x[c]) * (y[b] - y[c])
+        right = (y[a] - y[c]) * (x[b] - x[c])
+        if abs(left - right) > _FLAT * (abs(left) + abs(right)) + 1e-300:
+            return left - right
+        return float(orientation(self._array[a], self._array[b], self._array[c]))
+
+    def _in_circle(self, p: int, q: int) -> bool:
+        """Whether the point across an edge is surely inside the circle around the triangle to the edge's left."""
+        x, y = self._x, self._y
+        a, d = self._apex[p, q], self._apex[q, p]
+        px, py, qx, qy, ax, ay = x[p] - x[d], y[p] - y[d], x[q] - x[d], y[q] - y[d], x[a] - x[d], y[a] - y[d]
+        pp, qq, aa = px * px + py * py, qx * qx + qy * qy, ax * ax + ay * ay
+        det = pp * (qx * ay - qy * ax) + qq * (ax * py - ay * px) + aa * (px * qy - py * qx)
+        size = (
+            pp * (abs(qx * ay) + abs(qy * ax)) + qq * (abs(ax * py) + abs(ay * px)) + aa * (abs(px * qy) + abs(py * qx))
+        )
+        return det > _ROUND * size
+
+
+def _along_curve(points: FloatArray) -> IntArray:
+    """An order in which points near each other follow each other: row by row, to and fro."""
+    rows = max(int(np.sqrt(len(points) / 2)), 1)
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    row = np.minimum(((points[:, 1] - low[1]) / max(extent[1], 1e-300) * rows).astype(np.int64), rows - 1)
+    return np.lexsort((np.where(row % 2, -points[:, 0], points[:, 0]), row))

@@ -1,0 +1,98 @@
+"""Which elements are inverted somewhere, decided exactly on the coordinates of their nodes as stored.
+
+- A triangle of three nodes: where it is not counterclockwise.
+- A quadrilateral: where one of the four triangles at its corners is not; the bilinear map onto it has its least
+  Jacobian determinant at a corner, so nothing else is to be asked.
+- A triangle of six nodes: where the Jacobian determinant of its quadratic map is not positive everywhere, sides and
+  corners included.
+
+That determinant is a quadratic form in barycentric coordinates (`quasiharmonic.geometry.mesh.second_order`), to be
+positive where these are not negative: the symmetric matrix C of its control values has to be *strictly copositive*.
+Positive control values are enough, those at the corners are necessary; what is between is decided too, without
+subdivision [1]_ [2]_: along the sides by ``cᵢⱼ ≥ 0`` or ``cᵢⱼ² < cᵢᵢ cⱼⱼ``, and then C fails if and only if ``det C ≤
+0`` while a column of its adjugate is positive, which points to a minimum inside. All of it is a matter of integers.
+
+References
+----------
+.. [1] R. W. Cottle, G. J. Habetler, C. E. Lemke, On classes of copositive matrices. Linear Algebra and its Applications
+   3 (1970).
+.. [2] K. P. Hadeler, On copositive matrices. Linear Algebra and its Applications 49 (1983).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows
+from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
+from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+
+# Of the product of the extents: differences of coordinates, products and at most 36 terms lose a unit each, 2⁻⁵³.
+_RELATIVE_BOUND = 64 * 2.0**-53 * float(np.abs(FORMS).sum(axis=(1, 2)).max())
+# What products of numbers of magnitude one or less may lose to underflow, and more.
+_UNDERFLOW_BOUND = 2.0**-1000
+
+
+def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
+    """Find the elements that are inverted, or have no area, somewhere.
+
+    Parameters
+    ----------
+    F : (f, 3), (f, 4) or (f, 6) array of int
+        As `quasiharmonic.geometry.mesh.elements` has them.
+    points : (n, 2) array
+
+    Returns
+    -------
+    (k,) int64
+        Ascending; those with a coordinate that is not finite too.
+
+    Raises
+    ------
+    ValueError
+        When an array has the wrong shape or dtype, or ``F`` refers to nodes that there are not.
+    """
+    points = map_array("points", points, finite=False)
+    F = element_rows(F, len(points))
+    if F.shape[1] == 6:
+        return _curved(points[F])
+    triangles, of = (F, np.arange(len(F))) if F.shape[1] == 3 else corner_triangles(F)
+    sign, _ = orientation_or_nonfinite(*(points[triangles[:, k]] for k in range(3)))
+    return np.unique(of[sign <= 0])
+
+
+def _curved(nodes: FloatArray) -> IntArray:
+    """Of second-order triangles (f, 6, 2)."""
+    with np.errstate(all="ignore"):
+        place = nodes - nodes[:, :1]
+        exponent = np.frexp(np.abs(place).max(axis=(1, 2)))[1]
+        place = np.ldexp(place, -exponent[:, None, None])
+        extent = np.abs(place).max(axis=1).prod(axis=1)
+        values = jacobian_coefficients(place[..., 0], place[..., 1])
+        bound = (_RELATIVE_BOUND * extent + _UNDERFLOW_BOUND)[:, None]
+        good, bad = (values > bound).all(axis=1), (values[:, :3] < -bound).any(axis=1)
+    # What is not finite is neither.
+    for k in np.flatnonzero(~good & ~bad).tolist():
+        bad[k] = not (np.isfinite(nodes[k]).all() and _positive_everywhere(nodes[k]))
+    return np.flatnonzero(bad)
+
+
+def _positive_everywhere(nodes: FloatArray) -> bool:
+    """Whether the Jacobian determinant of one element (6, 2) is positive on all of it, in integer arithmetic."""
+    ratios = [value.as_integer_ratio() for value in nodes.ravel().tolist()]
+    unit = max(denominator for _, denominator in ratios)  # all are powers of two
+    whole = [numerator * (unit // denominator) for numerator, denominator in ratios]
+    x, y = whole[::2], whole[1::2]
+    a, b, c, ab, bc, ca = (
+        sum(s * p * q for row, p in zip(form, x, strict=True) for s, q in zip(row, y, strict=True))
+        for form in FORMS.tolist()
+    )
+    if min(a, b, c) <= 0:
+        return False
+    if any(side <= 0 and side * side >= p * q for side, p, q in ((ab, a, b), (bc, b, c), (ca, c, a))):
+        return False
+    column = b * c - bc * bc, bc * ca - ab * c, ab * bc - b * ca
+    det = a * column[0] + ab * column[1] + ca * column[2]
+    return not (det <= 0 and min(column) > 0)

@@ -1,0 +1,381 @@
+"""Closed curves in the plane, such as a map's boundary loops: whether they cross, how they nest and wind.
+
+Everything is decided exactly. What keeps the curves from bounding a region that is covered once is
+reported as a list of `Reason`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.geometry.exact.predicates import (
+    SegmentRelation,
+    box_pairs_within,
+    orientation,
+    segment_relation,
+    sure_orientation,
+)
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.kernels import compiled
+
+SignArray = NDArray[np.int8]
+
+# Pairs of boundary edges listed at most; a collapsed boundary has billions.
+_MOST_CROSSINGS = 1000
+# Pairs of an edge and a point at the same height that are looked at together.
+PAIR_CHUNK = 1 << 18
+
+
+class Obstacle(StrEnum):
+    """What keeps a map from being bijective."""
+
+    NO_TRIANGLES = "no triangles"
+    NOT_INJECTIVE = "not injective"
+    NOT_A_SURFACE = "not a surface"
+    NO_BOUNDARY = "no boundary"
+    SELF_INTERSECTION = "self-intersection"
+    INTERSECTION = "intersection"
+    WINDING = "winding"
+    NESTING = "nesting"
+    OVERWOUND = "overwound"
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One reason why a map is not bijective.
+
+    Attributes
+    ----------
+    kind : Obstacle
+        What is wrong.
+    text : str
+        What is wrong and where, in words.
+    loops : tuple of int
+        The boundary loops concerned, as indices into `Certificate.loops`.
+    """
+
+    kind: Obstacle
+    text: str
+    loops: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return self.text
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Pairs of segments that meet where they should not.
+
+    Attributes
+    ----------
+    pairs : (c, 2) int64
+        Indices of segments, the smaller first.
+    relation : (c,) int8
+        Values of `SegmentRelation`, none of them DISJOINT.
+    complete : bool
+        False when there are more pairs than were collected.
+    """
+
+    pairs: IntArray
+    relation: SignArray
+    complete: bool
+
+
+def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
+    """Find all segments that have more in common than an end.
+
+    Parameters
+    ----------
+    positions : (n, 2) float64
+        Points; finite where ``ends`` uses them.
+    ends : (m, 2) int64
+        Segments as pairs of points. The same point twice is a point.
+    most : int
+        Pairs to collect at most.
+
+    Returns
+    -------
+    Contacts
+        Pairs without a common end that meet, and pairs with one that overlap.
+    """
+    tail, head = np.array(ends.T, order="C")
+    p, q = positions[tail], positions[head]
+    found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
+    number = 0
+    for i, j in _doubtful(positions, tail, head, np.array([0, len(ends)])):
+        relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
+        near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
+        i, j, relation = i[near], j[near], relation[near]
+        joined = (tail[i] == tail[j]) | (tail[i] == head[j]) | (head[i] == tail[j]) | (head[i] == head[j])
+        bad = ~joined | (relation == SegmentRelation.OVERLAPPING)
+        found.append(np.stack([i[bad], j[bad]], axis=1))
+        relations.append(relation[bad])
+        number += len(found[-1])
+        if number > most:
+            break
+    return Contacts(np.concatenate(found)[:most], np.concatenate(relations)[:most], number <= most)
+
+
+def _doubtful(
+    places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray
+) -> Iterable[tuple[IntArray, IntArray]]:
+    """Pairs of segments to decide exactly, in portions: those of `doubtful_pairs`, and more where there are many."""
+    # As a rule there are none or a few; where a boundary has collapsed, billions.
+    pairs = np.empty((len(tails), 2), dtype=np.int64)
+    number = doubtful_pairs(np.ascontiguousarray(places, dtype=np.float64), tails, heads, starts, pairs)
+    if number < 0:
+        p, q = places[tails], places[heads]
+        return box_pairs_within(np.minimum(p, q), np.maximum(p, q), starts)
+    i, j = pairs[:number].T
+    return [(i, j)] if number else []
+
+
+@compiled
+def doubtful_pairs(places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray, pairs: IntArray) -> int:
+    """List pairs of segments of the same group that may have more in common than an end, as far as doubles can tell.
+
+    Segments (m,) are group after group, ``starts`` (g + 1,). How many pairs (k, 2) there are, -1 for want of room.
+    """
+    p, q = places[tails], places[heads]
+    found, number = [np.empty((0, 2), dtype=np.int64)], 0
+    for i, j in box_pairs_within(np.minimum(p, q), np.maximum(p, q), starts):
+        tail, head = tails[i] == tails[j], heads[i] == heads[j]
+        ahead, behind = heads[i] == tails[j], tails[i] == heads[j]
+        shared = np.add(tail, head, dtype=np.int8) + ahead + behind
+        doubtful = shared > 1
+        one = np.flatnonzero(shared == 1)
+        at_tail, others_tail = (tail | behind)[one, None], (tail | ahead)[one, None]
+        here, there = i[one], j[one]
+        doubtful[one] = _may_overlap(
+            np.where(at_tail, p[here], q[here]),
+            np.where(at_tail, q[here], p[here]),
+            np.where(others_tail, q[there], p[there]),
+        )
+        apart = np.flatnonzero(shared == 0)
+        here, there = i[apart], j[apart]
+        doubtful[apart] = _may_meet(p[here], q[here], p[there], q[there])
+        found.append(np.stack([i[doubtful], j[doubtful]], axis=1))
+        number += len(found[-1])
+        if number > len(pairs):
+            return -1
+    listed = np.concatenate(found)
+    pairs[:number] = listed[np.lexsort(listed.T[::-1])]
+    return number
+
+
+def _may_overlap(start: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
+    """Whether segments from a place to two others may overlap: one of them is a point, or they may run the same way."""
+    same_way = ((one < start) == (other < start)).all(axis=1) & ((one > start) == (other > start)).all(axis=1)
+    same_way[same_way] = sure_orientation(one[same_way], start[same_way], other[same_way]) == 0
+    points: BoolArray = (start == one).all(axis=1) | (start == other).all(axis=1)
+    return points | same_way
+
+
+def _may_meet(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> BoolArray:
+    """Whether the segments pq and rs may have anything in common."""
+    near: BoolArray = sure_orientation(p, q, r) * sure_orientation(p, q, s) <= 0
+    near[near] = sure_orientation(r[near], s[near], p[near]) * sure_orientation(r[near], s[near], q[near]) <= 0
+    return near
+
+
+def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
+    """Which of many loops are simple, whatever they have in common with the others.
+
+    Parameters
+    ----------
+    loops : list of (l,) int64
+        Vertices, at least three each.
+    uv : (n, 2) float64
+        Places, finite where the loops use them.
+
+    Returns
+    -------
+    (k,) bool
+    """
+    simple = np.ones(len(loops), dtype=bool)
+    vertices, starts, following = _in_turn(loops)
+    p = uv.take(vertices, 0)
+    for i, j in _doubtful(p, np.arange(len(p)), following, starts):
+        q = p[following]
+        relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
+        joined = (following[i] == j) | (following[j] == i)
+        met = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
+        # An edge without length shares all it is with the edges before and after it.
+        met |= (p.take(i, 0) == q.take(i, 0)).all(axis=1) | (p.take(j, 0) == q.take(j, 0)).all(axis=1)
+        simple[np.searchsorted(starts, i[met], side="right") - 1] = False
+        if not simple.any():
+            break
+    return simple
+
+
+def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Winding number of closed curves around points.
+
+    Parameters
+    ----------
+    points : (k, 2) float64
+    tails, heads : (m, 2) float64
+        Ends of the directed edges that make up the curves.
+
+    Returns
+    -------
+    winding : (k,) int64
+        Counted counterclockwise: crossings of a ray to the right [1]_. Meaningless where ``on``.
+    on : (k,) bool
+        Whether the point lies on the curves.
+
+    References
+    ----------
+    .. [1] K. Hormann, A. Agathos, The point in polygon problem for arbitrary polygons.
+       Computational Geometry 20 (2001).
+    """
+    turns = np.zeros(len(points), dtype=np.int64)
+    on = np.zeros(len(points), dtype=bool)
+    for _, point, turn in _passed(points, tails, heads):
+        turns += np.bincount(point, weights=turn, minlength=len(points)).astype(np.int64)
+        on[point[turn == 0]] = True
+    return turns, on
+
+
+def _passed(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Iterator[tuple[IntArray, IntArray, SignArray]]:
+    """Edges that rays to the right of points cross, in portions.
+
+    Yields
+    ------
+    edge, point : (m,) int64
+    turn : (m,) int8
+        1 for an edge that crosses the ray upwards, -1 downwards (its lower end counts as on the
+        ray, its upper one does not), 0 for an edge on which the point lies.
+    """
+    low, high = np.minimum(tails, heads), np.maximum(tails, heads)
+    by_level = np.argsort(points[:, 1], kind="stable")
+    level = points[by_level, 1]
+    first = np.searchsorted(level, low[:, 1], side="left")
+    count = np.searchsorted(level, high[:, 1], side="right") - first
+    until = np.cumsum(count)
+    begin = 0
+    while begin < len(tails):
+        done = until[begin - 1] if begin else 0
+        end = max(int(np.searchsorted(until, done + PAIR_CHUNK, side="right")), begin + 1)
+        edge = np.repeat(np.arange(begin, end), count[begin:end])
+        point = by_level[first[edge] + np.arange(edge.size) - (until[edge] - count[edge] - done)]
+        begin = end
+        ahead = high[edge, 0] >= points[point, 0]
+        edge, point = edge[ahead], point[ahead]
+        here, tail, head = points[point], tails[edge], heads[edge]
+        side = orientation(tail, head, here)
+        rising = (tail[:, 1] <= here[:, 1]) & (here[:, 1] < head[:, 1]) & (side > 0)
+        falling = (head[:, 1] <= here[:, 1]) & (here[:, 1] < tail[:, 1]) & (side < 0)
+        on = (side == 0) & (low[edge, 0] <= here[:, 0])
+        met = rising | falling | on
+        yield edge[met], point[met], (rising.astype(np.int8) - falling)[met]
+
+
+@dataclass(frozen=True)
+class _Curves:
+    """Boundary loops as one array of edges, loop after loop."""
+
+    start: IntArray
+    """(l + 1,) Where each loop's edges start."""
+    owner: IntArray
+    """(k,) The loop of each edge."""
+    ends: IntArray
+    """(k, 2) Vertices of each edge."""
+    p: FloatArray
+    """(k, 2) Places of the first vertices."""
+    q: FloatArray
+    """(k, 2) Places of the second vertices."""
+    following: IntArray
+    """(k,) The next edge of the same loop."""
+
+    @classmethod
+    def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
+        tail, start, following = _in_turn(loops)
+        head, owner = tail[following], np.repeat(np.arange(len(loops)), np.diff(start))
+        return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
+
+
+def _in_turn(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+    """Vertices loop after loop (k,), where each starts and the last ends (l + 1,), and the one after each (k,)."""
+    starts = np.cumsum([0, *map(len, loops)])
+    following = np.arange(1, starts[-1] + 1)
+    following[starts[1:] - 1] = starts[:-1]
+    return np.concatenate(loops), starts, following
+
+
+def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
+    """Edges that meet where they should not (m, 4), and what is wrong with the loops."""
+    curves = _Curves.of(loops, uv)
+    pairs = _meeting_edges(curves, uv)
+    if not len(pairs):
+        # Only loops that are simple and apart have an inside to speak of.
+        return np.empty((0, 4), dtype=np.int64), _misplaced(curves)
+    crossings = curves.ends[pairs].reshape(-1, 4)
+    owners = curves.owner[pairs]
+    reasons = []
+    for i, j in np.unique(owners, axis=0).tolist():
+        met = crossings[(owners == (i, j)).all(axis=1)]
+        where = listed([f"{a}→{b} with {c}→{d}" for a, b, c, d in met.tolist()], 3)
+        if i == j:
+            reasons.append(Reason(Obstacle.SELF_INTERSECTION, f"boundary loop {i} meets itself ({where})", (i,)))
+        else:
+            reasons.append(Reason(Obstacle.INTERSECTION, f"boundary loops {i} and {j} meet ({where})", (i, j)))
+    return crossings, reasons
+
+
+def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
+    """Pairs of edges (m, 2) that share more than the vertex they have in common, if any; sorted."""
+    consecutive = np.stack([np.arange(len(curves.ends)), curves.following], axis=1)
+    # An edge without length shares all it is with the edges before and after it.
+    point = (curves.p == curves.q).all(axis=1)
+    swallowed = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)
+    pairs = np.concatenate([swallowed, contacts(uv, curves.ends, _MOST_CROSSINGS).pairs])
+    return np.unique(pairs, axis=0)[:_MOST_CROSSINGS] if len(pairs) else pairs
+
+
+def _misplaced(curves: _Curves) -> list[Reason]:
+    """Loops, all of them simple and apart, that do not bound a region covered once."""
+    p, q, start = curves.p, curves.q, curves.start
+    # At the lexicographically first vertex of a simple loop the turn is strict and has the loop's sense.
+    lowest = np.lexsort((p[:, 1], p[:, 0], curves.owner))[start[:-1]]
+    before = np.where(lowest == start[:-1], start[1:], lowest) - 1
+    sense = orientation(p[before], p[lowest], q[lowest])
+    around, inner = _containing(curves, p[lowest])
+    covered = np.bincount(inner, weights=sense[around], minlength=len(sense)).astype(np.int64)
+    fits = ((covered == 0) & (sense > 0)) | ((covered == 1) & (sense < 0))
+    reasons = []
+    for loop in np.flatnonzero(~fits).tolist():
+        outside = around[inner == loop].tolist()
+        runs = f"boundary loop {loop} runs {'counterclockwise' if sense[loop] > 0 else 'clockwise'}"
+        if outside:
+            text = f"{runs} inside {listed(outside)}: what it encloses is covered {covered[loop] + sense[loop]} times"
+            reasons.append(Reason(Obstacle.NESTING, text, (loop, *outside)))
+        else:
+            reasons.append(Reason(Obstacle.WINDING, f"{runs} and no other loop is around it", (loop,)))
+    return reasons
+
+
+def _containing(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray]:
+    """Pairs of loops, the first around the second; ``anchor`` (l, 2) has a vertex of each loop."""
+    number = len(anchor)
+    if number == 1:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    turns: dict[int, int] = {}
+    for edge, point, turn in _passed(anchor, curves.p, curves.q):
+        key, at = np.unique(curves.owner[edge] * number + point, return_inverse=True)
+        sums = np.bincount(at, weights=turn, minlength=len(key))
+        for pair, change in zip(key.tolist(), sums.tolist(), strict=True):
+            turns[pair] = turns.get(pair, 0) + int(change)
+    around, inner = np.divmod(np.array([pair for pair, turn in turns.items() if turn], dtype=np.int64), number)
+    others = around != inner
+    return around[others], inner[others]
+
+
+def listed(items: Sequence[object], most: int = 5) -> str:
+    """The first few of some items, in words."""
+    return ", ".join(str(item) for item in items[:most]) + (", …" if len(items) > most else "")

@@ -1,0 +1,426 @@
+"""Exact geometric predicates on arrays of points.
+
+Every predicate here is decided for the coordinates as they are stored, whatever their magnitude:
+doubles are rational numbers, and no answer depends on how arithmetic rounds. All rests on
+`orientation`, which works in three stages, each for what the one before could not decide:
+
+1. the determinant in floating point, with a bound on its error (one pass over the array);
+2. the same after scaling each triple by a power of two to magnitude one, then as a sum of sixteen
+   doubles that equals the determinant exactly [1]_, distilled until its sign shows [2]_ [3]_;
+3. integers of any size, for triples whose coordinates span more than 130 orders of magnitude.
+
+IEEE 754 doubles with gradual underflow are assumed, which is what NumPy has unless another library
+in the process has switched its thread to flush subnormal numbers to zero.
+
+References
+----------
+.. [1] J. R. Shewchuk, Adaptive precision floating-point arithmetic and fast robust geometric
+   predicates. Discrete & Computational Geometry 18 (1997).
+.. [2] S. M. Rump, T. Ogita, S. Oishi, Accurate floating-point summation part I: faithful rounding.
+   SIAM Journal on Scientific Computing 31 (2008).
+.. [3] G. Bohlender, Floating-point computation of functions with maximum accuracy.
+   IEEE Transactions on Computers C-26 (1977).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+SignArray = NDArray[np.int8]
+
+# |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r,
+# u = 2⁻⁵³ [1]_, and 4u covers the second order and the rounding of the bound itself.
+_RELATIVE_BOUND = 2.0**-51
+# Each of the two products, and the bound, may lose up to 2⁻¹⁰⁷⁵ to underflow; sums lose nothing.
+_UNDERFLOW_BOUND = 2.0**-1060
+# After scaling, a coordinate is 0 or at least this (or else stage 3 has it): then all that stage 2
+# forms is a multiple of 2⁻⁹⁸⁴ and no product underflows.
+_SMALLEST_SCALED = 2.0**-440
+# Triples that stage 2 takes at a time, so that its sixteen components stay in the cache.
+_EXACT_CHUNK = 8192
+# Levels of a tree of boxes that are not gone through one by one.
+_SKIPPED = 5
+# Pairs of boxes that `box_pairs` handles at a time.
+PAIR_CHUNK = 1 << 17
+
+
+def orientation(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> SignArray:
+    """Exact sign of the signed area of triangles.
+
+    Parameters
+    ----------
+    a, b, c : (k, 2) float64
+        Corners, or arrays that broadcast to a common shape (..., 2).
+
+    Returns
+    -------
+    (k,) int8
+        1 where ``a, b, c`` is counterclockwise, -1 where it is clockwise, 0 where the three points
+        lie exactly on a line.
+
+    Raises
+    ------
+    ValueError
+        When a coordinate is NaN or infinite.
+
+    Examples
+    --------
+    >>> orientation([[0.0, 0.0]], [[1.0, 0.0]], [[0.5, 1e-300]])
+    array([1], dtype=int8)
+    """
+    sign, nonfinite = orientation_or_nonfinite(a, b, c)
+    if nonfinite.size:
+        raise ValueError(f"NaN or infinite coordinates in triple {nonfinite[0]} ({nonfinite.size} in all)")
+    return sign
+
+
+def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[SignArray, IntArray]:
+    """As `orientation`, but name the triples with NaN or infinite coordinates instead of refusing them.
+
+    Returns
+    -------
+    sign : (k,) int8
+        As `orientation` has it, and 0 for the triples in ``nonfinite``.
+    nonfinite : (m,) int64
+        Ascending flat indices of the triples that have no orientation.
+    """
+    a, b, c = (np.asarray(p, dtype=np.float64) for p in (a, b, c))
+    corners = (a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
+    # An overflow or an invalid operation makes the bound infinite or the determinant NaN: undecided.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        sign = _filtered(*corners)
+        if np.all(sign):
+            return sign, np.empty(0, dtype=np.int64)
+        undecided = sign == 0
+        x = np.stack([np.broadcast_to(p, sign.shape)[undecided] for p in corners])
+        finite = np.isfinite(x).all(axis=0)
+        decided = np.zeros(finite.size, dtype=np.int8)
+        decided[finite] = _exact(x[:, finite])
+        sign[undecided] = decided
+    return sign, np.flatnonzero(undecided)[~finite]
+
+
+def sure_orientation(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
+    """As `orientation` where floating point is sure of it, and 0 elsewhere."""
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        return _filtered(a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
+
+
+def _filtered(
+    ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray, cx: FloatArray, cy: FloatArray
+) -> SignArray:
+    """Sign of the orientation where floating point is sure of it, 0 elsewhere."""
+    left = (ax - cx) * (by - cy)
+    right = (ay - cy) * (bx - cx)
+    det = left - right
+    bound = np.abs(left)
+    bound += np.abs(right)
+    bound *= _RELATIVE_BOUND
+    bound += _UNDERFLOW_BOUND
+    sign = np.asarray(det > bound).view(np.int8)
+    sign -= np.asarray(det < -bound).view(np.int8)
+    return sign
+
+
+def _exact(x: FloatArray) -> SignArray:
+    """Orientation of the triples ``x``, (6, k) finite, as rows ax, ay, bx, by, cx, cy."""
+    # Differences have the right sign even where they are rounded, so products of different sign
+    # decide; this settles corners that coincide and lines along an axis at little cost.
+    left = np.sign(x[0] - x[4]) * np.sign(x[3] - x[5])
+    right = np.sign(x[1] - x[5]) * np.sign(x[2] - x[4])
+    sign: SignArray = np.sign(left - right).astype(np.int8)
+    open_ = np.flatnonzero((left == right) & (left != 0) & ((x[0] != x[2]) | (x[1] != x[3])))
+    for start in range(0, open_.size, _EXACT_CHUNK):
+        chunk = open_[start : start + _EXACT_CHUNK]
+        sign[chunk] = _scaled(x[:, chunk])
+    return sign
+
+
+def _scaled(x: FloatArray) -> SignArray:
+    """As `_exact`, with every triple brought to magnitude one."""
+    exponent = np.frexp(np.abs(x).max(axis=0))[1]
+    scaled = np.ldexp(x, -exponent)
+    # Scaling may have rounded these, so what follows holds for the others.
+    wide = ((np.abs(scaled) < _SMALLEST_SCALED) & (x != 0)).any(axis=0)
+    sign = _filtered(*scaled)
+    open_ = (sign == 0) & ~wide
+    if np.any(open_):
+        sign[open_] = _expanded(scaled[:, open_])
+    for k in np.flatnonzero(wide):
+        sign[k] = _in_integers(x[:, k])
+    return sign
+
+
+def _expanded(x: FloatArray) -> SignArray:
+    """Orientation by expansion, for coordinates of magnitude up to one that are 0 or ≥ 2⁻⁴⁴⁰."""
+    return np.sign(_sum(_components(x))).astype(np.int8)
+
+
+def _components(x: FloatArray) -> FloatArray:
+    """Sixteen doubles, as a rule small ones first, whose sum is the determinant exactly; (16, k)."""
+    (ax, bx), (ax_tail, bx_tail) = two_sum(x[0:4:2], -x[4])
+    (ay, by), (ay_tail, by_tail) = two_sum(x[1:4:2], -x[5])
+    # (ax + ax_tail)(by + by_tail) − (ay + ay_tail)(bx + bx_tail), product by product, small ones first.
+    product, error = two_product(
+        np.stack([ax_tail, -ay_tail, ax_tail, ax, -ay_tail, -ay, ax, -ay]),
+        np.stack([by_tail, bx_tail, by, by_tail, bx, bx_tail, by, bx]),
+    )
+    return np.concatenate([error[:2], product[:2], error[2:6], error[6:], product[2:6], product[6:]])
+
+
+def _sum(terms: FloatArray) -> FloatArray:
+    """Sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow: off by 2⁻⁴⁸ of itself at most.
+
+    Each sweep replaces the terms by others of the same exact sum, the last of which is the rounded
+    sum, the rest what was lost on the way [2]_. A sum is decided when the last outweighs the rest,
+    which it does after at most t - 1 sweeps [3]_ and as a rule after two or three.
+    """
+    total = np.zeros(terms.shape[1])
+    left = np.arange(terms.shape[1])
+    while left.size:
+        for i in range(1, len(terms)):
+            terms[i], terms[i - 1] = two_sum(terms[i], terms[i - 1])
+        # Doubled, the computed weight of the rest is surely above the true one.
+        rest = 2.0 * np.abs(terms[:-1]).sum(axis=0)
+        decided = (np.abs(terms[-1]) > rest) | (rest == 0.0)
+        total[left[decided]] = terms[-1, decided] + terms[:-1, decided].sum(axis=0)
+        left, terms = left[~decided], terms[:, ~decided]
+    return total
+
+
+def two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rounded sum and its error: ``a + b`` exactly (Knuth)."""
+    total = a + b
+    b_part = total - a
+    return total, (a - (total - b_part)) + (b - b_part)
+
+
+def two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rounded product and its error: ``a * b`` exactly (Dekker, Veltkamp)."""
+    product = a * b
+    a_high, a_low = _split(a)
+    b_high, b_low = _split(b)
+    error = a_low * b_low - (((product - a_high * b_high) - a_low * b_high) - a_high * b_low)
+    return product, error
+
+
+def _split(a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Halves of at most 26 bits each with exact sum ``a``."""
+    scaled = 134217729.0 * a  # 2²⁷ + 1
+    high = scaled - (scaled - a)
+    return high, a - high
+
+
+def _in_integers(x: FloatArray) -> int:
+    """Orientation of one triple (6,) in integer arithmetic."""
+    ratios = [value.as_integer_ratio() for value in x.tolist()]
+    unit = max(denominator for _, denominator in ratios)  # all are powers of two
+    ax, ay, bx, by, cx, cy = (numerator * (unit // denominator) for numerator, denominator in ratios)
+    det: int = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
+    return (det > 0) - (det < 0)
+
+
+def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Twice the signed area of triangles, accurate however thin they are.
+
+    Parameters
+    ----------
+    a, b, c : (k, 2) float64
+        Corners, finite, with differences of magnitude about one.
+
+    Returns
+    -------
+    (k,) float64
+        Off by 2⁻⁴⁸ of itself at most, so zero exactly for corners on a line, as long as no product of
+        differences, or of what was rounded off them, underflows.
+    """
+    x = np.concatenate([a.T, b.T, c.T])
+    area = np.empty(x.shape[1])
+    for start in range(0, area.size, _EXACT_CHUNK):
+        chunk = slice(start, start + _EXACT_CHUNK)
+        area[chunk] = _sum(_components(x[:, chunk]))
+    return area
+
+
+class SegmentRelation(IntEnum):
+    """What two closed segments have in common."""
+
+    DISJOINT = 0
+    """No point."""
+    CROSSING = 1
+    """One point, interior to both."""
+    TOUCHING = 2
+    """One point, an end of at least one of them."""
+    OVERLAPPING = 3
+    """A segment of positive length."""
+
+
+def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> SignArray:
+    """Decide exactly what the closed segments ``pq`` and ``rs`` have in common.
+
+    Parameters
+    ----------
+    p, q, r, s : (k, 2) float64
+        Ends of the segments, finite; a segment may be a single point.
+
+    Returns
+    -------
+    (k,) int8
+        Values of `SegmentRelation`.
+    """
+    relation = np.zeros(len(p), dtype=np.int8)
+    r_side, s_side = orientation(p, q, r), orientation(p, q, s)
+    # Most candidates have rs strictly on one side of pq and need no more than this.
+    near = np.flatnonzero(r_side * s_side <= 0)
+    p, q, r, s = (array.take(near, axis=0) for array in (p, q, r, s))
+    r_side, s_side = r_side[near], s_side[near]
+    p_side, q_side = orientation(r, s, p), orientation(r, s, q)
+    crossing = (r_side * s_side < 0) & (p_side * q_side < 0)
+    touching = (
+        ((r_side == 0) & _in_box(r, p, q))
+        | ((s_side == 0) & _in_box(s, p, q))
+        | ((p_side == 0) & _in_box(p, r, s))
+        | ((q_side == 0) & _in_box(q, r, s))
+    )
+    # On a common line the lexicographic order is the order along it, and an overlap is that of intervals.
+    collinear = (r_side == 0) & (s_side == 0) & (p_side == 0) & (q_side == 0)
+    p_first, r_first = _before(p, q), _before(r, s)
+    p, q = np.where(p_first[:, None], p, q), np.where(p_first[:, None], q, p)
+    r, s = np.where(r_first[:, None], r, s), np.where(r_first[:, None], s, r)
+    start = np.where(_before(p, r)[:, None], r, p)
+    end = np.where(_before(q, s)[:, None], q, s)
+    relation[near[touching]] = SegmentRelation.TOUCHING
+    relation[near[crossing]] = SegmentRelation.CROSSING
+    relation[near[collinear & _before(start, end)]] = SegmentRelation.OVERLAPPING
+    return relation
+
+
+def _before(a: FloatArray, b: FloatArray) -> BoolArray:
+    """Lexicographic order of points: by x, then by y."""
+    less: BoolArray = (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
+    return less
+
+
+def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
+    """Whether ``x`` lies in the closed box spanned by ``p`` and ``q``."""
+    inside: BoolArray = (np.minimum(p, q) <= x) & (x <= np.maximum(p, q))
+    return inside[:, 0] & inside[:, 1]
+
+
+def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of closed boxes that meet, in portions.
+
+    A binary tree over the boxes *in the order given* is descended against itself, all pairs of a
+    level at once. Boxes of consecutive edges of a curve make a tight tree whatever the scale of its
+    parts, so the cost for such boxes is about proportional to their number and the pairs found.
+
+    Parameters
+    ----------
+    lo, hi : (k, 2) float64
+        Corners.
+
+    Yields
+    ------
+    i, j : (m,) int64
+        Indices of boxes that meet, ``i < j``, each pair once.
+    """
+    tree = _box_tree(lo, hi, max(len(lo) - 1, 0).bit_length())
+    for i, j in _meeting(tree, tree):
+        yield i[i < j], j[i < j]
+
+
+def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of closed boxes that meet and are of the same group; as `box_pairs` of one group after another.
+
+    Parameters
+    ----------
+    lo, hi : (k, 2) float64
+        Corners, group after group.
+    starts : (g + 1,) int64
+        Where each group starts, and the last one ends.
+
+    Yields
+    ------
+    i, j : (m,) int64
+        Indices of boxes that meet, ``i < j``, each pair once.
+    """
+    sizes, groups = np.diff(starts), len(starts) - 1
+    depth = int(max(sizes.max(initial=1) - 1, 0)).bit_length()
+    # Each group has a tree of its own, all of one depth.
+    place = np.arange(len(lo)) + np.repeat((np.arange(groups) << depth) - starts[:-1], sizes)
+    number = np.full(groups << depth, -1)
+    number[place] = np.arange(len(lo))
+    leaves = np.full((2, groups << depth, 2), np.array([np.inf, -np.inf])[:, None, None])
+    leaves[0, place], leaves[1, place] = lo, hi
+    tree = _box_tree(leaves[0], leaves[1], depth)
+    for i, j in _meeting(tree, tree):
+        yield number[i[i < j]], number[j[i < j]]
+
+
+def box_pairs_between(
+    lo: FloatArray, hi: FloatArray, other_lo: FloatArray, other_hi: FloatArray
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of closed boxes that meet, one of each of two kinds; as `box_pairs`.
+
+    Yields
+    ------
+    i, j : (m,) int64
+        Indices of a box (k, 2) and of another (l, 2) that it meets, each pair once.
+    """
+    depth = max(len(lo) - 1, len(other_lo) - 1, 0).bit_length()
+    yield from _meeting(_box_tree(lo, hi, depth), _box_tree(other_lo, other_hi, depth))
+
+
+_BoxTree = list[tuple[FloatArray, FloatArray]]
+
+
+def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
+    """Boxes, the boxes around each two of them, and so on up to those around 2^depth: one, or one for each group."""
+    # Missing leaves are boxes that nothing meets.
+    padding = ((0, max((1 << depth) - len(lo), 0)), (0, 0))
+    tree = [(np.pad(lo, padding, constant_values=np.inf), np.pad(hi, padding, constant_values=-np.inf))]
+    for _ in range(depth):
+        lo, hi = tree[-1]
+        tree.append((np.minimum(lo[::2], lo[1::2]), np.maximum(hi[::2], hi[1::2])))
+    return tree
+
+
+def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArray]]:
+    """Leaves of two trees of the same depth that meet; of a tree with itself, those with ``i ≤ j``.
+
+    Where there are several roots, what is below one meets nothing of what is below the others.
+    """
+    # The first few levels have so few boxes that all pairs of theirs are looked at sooner than level after level.
+    depth, roots = len(one) - 1, np.arange(len(one[-1][0]))
+    skipped = min(depth, _SKIPPED)
+    number = np.arange(1 << skipped)
+    i, j = (part.ravel() for part in np.broadcast_arrays(number[:, None], number))
+    if one is other:
+        i, j = i[i <= j], j[i <= j]
+    i, j = ((np.add.outer(roots << skipped, part)).ravel() for part in (i, j))
+    # The deepest portion first, so that what waits stays small however many pairs there are.
+    waiting = [(depth - skipped, i, j)]
+    while waiting:
+        level, i, j = waiting.pop()
+        (lo, hi), (other_lo, other_hi) = one[level], other[level]
+        meet = (lo.take(i, 0) <= other_hi.take(j, 0)) & (other_lo.take(j, 0) <= hi.take(i, 0))
+        meet = meet[:, 0] & meet[:, 1]
+        i, j = i[meet], j[meet]
+        if level == 0:
+            yield i, j
+            continue
+        i, j = (
+            np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1]),
+            np.concatenate([2 * j, 2 * j + 1, 2 * j, 2 * j + 1]),
+        )
+        if one is other:
+            i, j = i[i <= j], j[i <= j]
+        for start in range(0, i.size, PAIR_CHUNK):
+            chunk = slice(start, start + PAIR_CHUNK)
+            waiting.append((level - 1, i[chunk], j[chunk]))

@@ -1,0 +1,98 @@
+"""Fans: the triangles around a vertex that are joined by edges. Where there are several, the vertex can be split."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.topology import edge_keys, linked
+from quasiharmonic.util.arrays import BoolArray, IntArray
+
+
+def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
+    """Split vertices at which triangles touch without being joined by edges.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles, of any kind.
+    cut : (f, 3) bool, optional
+        At which sides, from each corner to the next, triangles are not joined whatever they share.
+
+    Returns
+    -------
+    split : (f, 3) int64
+        The same triangles with a vertex of its own for every fan around one: now a surface, with a boundary where
+        an edge was not shared by exactly two triangles that are wound alike.
+    component : (f,) int64
+        The component of each triangle; both are numbered by first appearance.
+    """
+    corner = np.arange(F.size).reshape(-1, 3)
+    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
+    ahead = corner[:, (1, 2, 0)].ravel()
+    key = edge_keys(tail, head, int(F.max(initial=0)) + 1)
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    first = first[np.diff(first, append=key.size) == 2]
+    one, other = order[first], order[first + 1]
+    opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
+    if cut is not None:
+        opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
+    one, other = one[opposed], other[opposed]
+    # The half-edge of a corner begins there: a joined pair identifies begin with end and end with begin.
+    split = linked(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
+    component = linked(one // 3, other // 3, len(F))
+    # What is called by its smallest element is in the order of appearance.
+    split, component = ((np.cumsum(label == np.arange(label.size)) - 1)[label] for label in (split, component))
+    return split.reshape(-1, 3), component
+
+
+def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
+    """Give the vertices of some triangles numbers without gaps.
+
+    Parameters
+    ----------
+    split : (k, 3) int64
+        Triangles, as `fans` has them.
+    F : (k, 3) int64
+        The same triangles by the vertices that were split. These decide the order: one that was not split and has
+        no gap keeps its numbers.
+
+    Returns
+    -------
+    renumbered : (k, 3) int64
+    first : (m,) int64
+        For every vertex a corner that it is at, as an index into the flattened triangles.
+    """
+    _, first, own = np.unique(split.ravel(), return_index=True, return_inverse=True)
+    order = np.argsort(F.ravel()[first], kind="stable")
+    return np.argsort(order)[own.reshape(-1, 3)], first[order]
+
+
+def numbered(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Give every fan a vertex: of several around one the first keeps its number, the others come after all vertices.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles.
+    split : (f, 3) int64
+        Their fans, as `fans` numbers them.
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    FT : (f, 3) int64
+        The triangles, by fans: `F` where a vertex was not split.
+    origin : (n + c,) int64
+        The vertex that each fan is around: ``origin[FT]`` is ``F``, and the first ``n`` are themselves.
+    """
+    # Fans are numbered by first appearance.
+    vertex = F.ravel()[np.unique(split.ravel(), return_index=True)[1]]
+    order = np.argsort(vertex, kind="stable")
+    keeps = np.diff(vertex[order], prepend=-1) > 0
+    kept, copies = order[keeps], order[~keeps]
+    own = np.empty(vertex.size, dtype=np.int64)
+    own[kept] = vertex[kept]
+    own[copies] = np.arange(n, n + copies.size)
+    return own[split], np.concatenate([np.arange(n), vertex[copies]])

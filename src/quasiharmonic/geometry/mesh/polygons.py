@@ -1,0 +1,197 @@
+"""Faces of any number of corners, and the triangles that stand for them.
+
+A triangulation has no vertex that the polygons do not have, and is chosen by their shape. A polygon then is a ring of
+corners of triangles, so what a triangle's corner says of its vertex and of its place holds for the polygon's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, named
+
+# Ears whose shapes differ by less are alike, and the first one is taken: noise in the last digits shall not decide.
+_ALIKE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Polygons:
+    """Faces as rings of corners of triangles.
+
+    The triangles are numbered polygon by polygon; one of k corners has k - 2 of them.
+
+    Attributes
+    ----------
+    corners : (c,) int64
+        The rings, one after another: indices into the flattened triangles. A corner of several of the polygon's
+        triangles is there as one of them.
+    starts : (p + 1,) int64
+        Where each ring begins, and the end of the last one.
+    """
+
+    corners: IntArray
+    starts: IntArray
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @property
+    def sizes(self) -> IntArray:
+        """How many corners each has; (p,) int64."""
+        return np.diff(self.starts)
+
+    @property
+    def first_triangle(self) -> IntArray:
+        """The first triangle of each, and the number of triangles; (p + 1,) int64."""
+        return self.starts - 2 * np.arange(len(self.starts))
+
+    @property
+    def of_triangle(self) -> IntArray:
+        """The polygon that each triangle is a part of; (f,) int64."""
+        return np.repeat(np.arange(len(self)), self.sizes - 2)
+
+    def diagonals(self, F: IntArray) -> IntArray:
+        """Edges (d, 2) of the triangles ``F`` inside polygons, at which nothing can be cut; by vertices."""
+        inside = np.repeat(self.sizes > 3, self.sizes - 2)
+        parent = self.of_triangle[inside]
+        tail = F[inside]
+        ends = np.stack([tail, tail[:, (1, 2, 0)]], axis=2).reshape(-1, 2)
+        rows = np.column_stack([np.repeat(parent, 3), np.sort(ends, axis=1)])
+        found, count = np.unique(rows, axis=0, return_counts=True)
+        return found[count == 2, 1:]
+
+
+def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[IntArray, Polygons]:
+    """Triangulate polygons by their shape.
+
+    Ears are cut off, the best-shaped one first, seen along the polygon's mean normal; an ear is a corner that is convex
+    and whose triangle has no other corner inside or on it. Of the last four corners the better diagonal is taken.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+        Positions.
+    vertices : (c,) int64
+        The polygons' vertices, ring after ring.
+    starts : (p + 1,) int64
+        Where each ring begins, and the end of the last one.
+
+    Returns
+    -------
+    T : (f, 3) int64
+        Triangles by corners, that is, by indices into ``vertices``; polygon by polygon, wound as these are. One that is
+        a triangle stays as it is.
+    polygons : Polygons
+
+    Raises
+    ------
+    ValueError
+        When a polygon has fewer than three corners, or one of more than three a vertex twice; names the first ones.
+    """
+    sizes = np.diff(starts)
+    _check_rings(vertices, sizes)
+    # Of about unit size, so that no square overflows or vanishes.
+    V = np.ldexp(V, -int(np.frexp(np.abs(V).max(initial=0.0))[1]))
+    T = np.empty((len(vertices) - 2 * len(sizes), 3), dtype=np.int64)
+    first = starts[:-1] - 2 * np.arange(len(sizes))
+    for size in np.unique(sizes).tolist():
+        alike = np.flatnonzero(sizes == size)
+        rings = starts[alike, None] + np.arange(size)
+        cut = rings[:, None] if size == 3 else _ears(V[vertices[rings]], rings)
+        T[first[alike, None] + np.arange(size - 2)] = cut
+    # Every corner of a polygon is one of its triangulation's; the first of them is written last.
+    corner = np.empty(len(vertices), dtype=np.int64)
+    corner[T.ravel()[::-1]] = np.arange(T.size)[::-1]
+    return T, Polygons(corner, starts)
+
+
+def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
+    small = np.flatnonzero(sizes < 3)
+    if small.size:
+        raise ValueError(f"{named('face', 'faces', small)} of fewer than three corners")
+    face = np.repeat(np.arange(len(sizes)), np.where(sizes > 3, sizes, 0))
+    vertices = vertices[np.repeat(sizes > 3, sizes)]
+    order = np.lexsort((vertices, face))
+    same = (np.diff(face[order]) == 0) & (np.diff(vertices[order]) == 0)
+    if same.any():
+        raise ValueError(
+            f"{named('face', 'faces', np.unique(face[order][1:][same]))} with a vertex twice: remove the repetition"
+        )
+
+
+def _ears(points: FloatArray, rings: IntArray) -> IntArray:
+    """Triangulate polygons (p, k, 3) of equally many corners, whose numbers are ``rings`` (p, k); (p, k - 2, 3)."""
+    # Corners that are not finite, or whose products are not, are triangulated in any way.
+    with np.errstate(all="ignore"):
+        return _cut(_projected(points), rings)
+
+
+def _cut(flat: ComplexArray, rings: IntArray) -> IntArray:
+    """Cut ears off polygons in the plane (p, k), the best first."""
+    triangles = []
+    while rings.shape[1] > 3:
+        ear = _best_ears(flat)
+        left, right = (ear - 1) % rings.shape[1], (ear + 1) % rings.shape[1]
+        triangles.append(np.take_along_axis(rings, np.stack([left, ear, right], axis=1), axis=1))
+        others = np.ones(rings.shape, dtype=np.bool_)
+        np.put_along_axis(others, ear[:, None], False, axis=1)
+        rings, flat = rings[others].reshape(len(rings), -1), flat[others].reshape(len(rings), -1)
+    return np.stack([*triangles, rings], axis=1)
+
+
+def _projected(points: FloatArray) -> ComplexArray:
+    """Polygons (p, k, 3) as complex numbers (p, k), seen against the mean normal by Newell's formula."""
+    ahead = np.roll(points, -1, axis=1)
+    normal = np.cross(points, ahead).sum(axis=1)
+    # The two directions in the plane: the axis least along the normal, made perpendicular, and what completes it.
+    least = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    across = np.cross(normal, least)
+    along = np.cross(across, normal)
+    across, along = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (across, along))
+    # A polygon without area has no normal, and is seen as well from anywhere.
+    plane = np.nan_to_num(along + 1j * across, nan=1.0)
+    return np.einsum("pkd,pd->pk", points, plane)
+
+
+def _best_ears(flat: ComplexArray) -> IntArray:
+    """The best corner to cut off each of some polygons (p, k), k > 3; (p,) int64."""
+    before, after = np.roll(flat, 1, axis=1), np.roll(flat, -1, axis=1)
+    score = _shape(before, flat, after)
+    if flat.shape[1] == 4:
+        # The triangle that is left counts as much.
+        score = np.minimum(score, _shape(after, np.roll(flat, -2, axis=1), before))
+    rows = np.arange(len(flat))
+    best = np.argmax(score >= score.max(axis=1, keepdims=True) - _ALIKE, axis=1)
+    chosen, open_, untried = best.copy(), np.ones(len(flat), dtype=np.bool_), score.copy()
+    while open_.any():
+        row, ear = rows[open_], chosen[open_]
+        blocked = _contains_another(flat[row], ear) & (untried[row, ear] > 0)
+        untried[row[blocked], ear[blocked]] = -np.inf
+        open_[row[~blocked]] = False
+        again = row[blocked]
+        most = untried[again].max(axis=1, keepdims=True)
+        chosen[again] = np.argmax(untried[again] >= most - _ALIKE, axis=1)
+        # No ear at all: a polygon that crosses itself, of which any triangulation is as bad.
+        hopeless = again[most[:, 0] <= 0]
+        chosen[hopeless], open_[hopeless] = best[hopeless], False
+    return chosen
+
+
+def _shape(a: ComplexArray, b: ComplexArray, c: ComplexArray) -> FloatArray:
+    """Twice the signed area over the sum of the squared sides; 0 for a triangle that is a point."""
+    doubled = ((b - a).conj() * (c - a)).imag
+    sides = np.abs(b - a) ** 2 + np.abs(c - b) ** 2 + np.abs(a - c) ** 2
+    return np.divide(doubled, sides, out=np.zeros_like(sides), where=sides > 0)
+
+
+def _contains_another(flat: ComplexArray, ear: IntArray) -> BoolArray:
+    """Whether the triangle at a corner of each polygon (p, k) has another corner inside or on it."""
+    rows, k = np.arange(len(flat)), flat.shape[1]
+    a, b, c = (flat[rows, (ear + step) % k][:, None] for step in (-1, 0, 1))
+    inside = np.ones(flat.shape, dtype=np.bool_)
+    for tail, head in ((a, b), (b, c), (c, a)):
+        inside &= ((head - tail).conj() * (flat - tail)).imag >= 0
+    inside &= (flat != a) & (flat != b) & (flat != c)
+    return np.asarray(inside.any(axis=1))

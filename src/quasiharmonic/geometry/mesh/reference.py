@@ -1,0 +1,266 @@
+"""Reference triangles: the shapes in which gradients are taken (§9.3, §F.1).
+
+Whether an injective map exists depends on how the triangles are joined, not on their shapes, so the
+triangle in which ``G`` and ``m`` are computed may be chosen. Each reference triangle lies in a frame
+of its own: vertex 0 at the origin and vertex 1 on the positive x axis, written as complex numbers::
+
+                 z₂
+                 ╱╲          γᵢ = gradient of the hat function of vertex i, as gₓ + i·g_y
+               ╱    ╲        p = ∂u/∂z, q = ∂u/∂z̄ of the complex map u + iv on the triangle
+             ╱        ╲      m = area
+        z₀ ──────────── z₁
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from copy import copy
+from functools import cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_range, own_triangles
+from quasiharmonic.util.kernels import compiled
+
+Reference = Literal["equilateral", "rest", "corrected"]
+
+# Triangles in a block: a complex number for each takes 128 KiB, and a dozen such arrays fit into a core's own cache.
+_BLOCK = 8192
+
+
+def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray]:
+    """Lay every triangle of a mesh into the plane.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+        Vertices of a planar or a curved mesh.
+    F : (f, 3) int
+        Triangles.
+
+    Returns
+    -------
+    z1 : (f,) float64
+        Vertex 1, on the real axis (vertex 0 is the origin).
+    z2 : (f,) complex128
+        Vertex 2. Its imaginary part is signed for planar meshes and not negative for curved ones.
+    """
+    return _frames(V, F)[:2]
+
+
+def flat_triangles(V: FloatArray, F: NDArray[np.integer]) -> IntArray:
+    """Ascending indices (k,) of the triangles of a mesh that have no area, as `rest_frames` computes it."""
+    z1, z2, flat = _frames(V, F)
+    return np.flatnonzero((z1 == 0) | (z2.imag == 0)) if flat else np.empty(0, dtype=np.int64)
+
+
+def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray, int]:
+    """As `rest_frames`, and how many triangles have no area."""
+    T = own_triangles(F)
+    check_range("F", T, len(V))
+    # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
+    exponent = math.frexp(max(V.max(initial=0), -V.min(initial=0)))[1]
+    z1, z2 = np.empty(len(T)), np.empty(len(T), dtype=np.complex128)
+    return z1, z2, lay_flat(V, T, exponent, z1, z2)
+
+
+@compiled
+def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: ComplexArray) -> int:
+    """Fill in `rest_frames` (f,), computed in units of 2^exponent; how many triangles have no area."""
+    coordinates = np.ldexp(V.T, -exponent, order="C")
+    for part in blocks(len(F)):
+        z1[part], z2.real[part], z2.imag[part] = _laid_flat(coordinates, F[part])
+    np.ldexp(z1, exponent, out=z1)
+    np.ldexp(z2.view(np.float64), exponent, out=z2.view(np.float64))
+    return int(np.count_nonzero((z1 == 0) | (z2.imag == 0)))
+
+
+def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Vertex 1 on the axis and both coordinates of vertex 2 in each triangle's frame; (f,) each."""
+    corners = [along.take(F) for along in coordinates]
+    e1 = [corner[:, 1] - corner[:, 0] for corner in corners]
+    e2 = [corner[:, 2] - corner[:, 0] for corner in corners]
+    length = np.sqrt(_dot(e1, e1))
+    safe = np.where(length > 0, length, 1.0)
+    normal = [e1[i] * e2[j] - e1[j] * e2[i] for i, j in ((0, 1), (1, 2), (2, 0))[: 1 if len(e1) == 2 else 3]]
+    across = normal[0] if len(normal) == 1 else np.sqrt(_dot(normal, normal))
+    # Where vertices 0 and 1 coincide any direction is as good as another.
+    along = np.where(length > 0, _dot(e1, e2), np.sqrt(_dot(e2, e2)))
+    return length, along / safe, across / safe
+
+
+def _dot(a: list[FloatArray], b: list[FloatArray]) -> FloatArray:
+    """Scalar products of vectors given by their coordinates."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total += x * y
+    return total
+
+
+def blocks(count: int) -> Iterator[slice]:
+    """Consecutive triangles, as many at a time as let what is computed of them stay in the processor's cache.
+
+    Where a formula takes many steps, taking them all for one block before the next halves the time.
+    """
+    return (slice(start, start + _BLOCK) for start in range(0, count, _BLOCK))
+
+
+class ReferenceMesh:
+    """Intrinsic gradient and area of every triangle of a mesh.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+        Rest positions.
+    F : (f, 3) int
+        Triangles.
+    kind : {"equilateral", "rest", "corrected"}
+        The triangles' shape. ``"rest"``: as they lie in ``V``. ``"equilateral"``: all alike, ``V`` is
+        not looked at. ``"corrected"``: as in ``V``, but angles below π/6 raised to π/6 and the three
+        scaled to sum to π, so that none stays below π/8 (§F.1).
+
+    Attributes
+    ----------
+    m : (f,) float64
+        Areas. Equilateral and corrected triangles have an arbitrary scale (which cancels in all of
+        the functionals).
+    gamma : (3, f) complex128
+        Gradients of the hat functions. For equilateral triangles these arrays are one number seen
+        f times (stride 0), which keeps them out of memory.
+    half_gamma : (2, f) complex128
+        Half of those of the last two corners; the three sum to zero.
+    stiffness_by_entry : (9, f) float64
+        How the stiffness of each edge depends on a11, a12, a22 of the tensor, edge after edge.
+    """
+
+    def __init__(self, V: FloatArray, F: IntArray, kind: Reference) -> None:
+        self.kind = kind
+        self.F = F = own_triangles(F)
+        self.n = len(V)
+        if kind == "equilateral":
+            check_range("F", F, self.n)
+            m, gamma, per_entry = _equilateral()
+        else:
+            z1, z2 = rest_frames(V, F)
+            if kind == "corrected":
+                z1, z2 = _corrected(z1, z2)
+            m, gamma, per_entry = _tables(z1, z2)
+        f = len(F)
+        self.m: FloatArray = np.broadcast_to(m, (f,))
+        self.gamma: ComplexArray = np.broadcast_to(gamma, (3, f))
+        self.half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
+        self.stiffness_by_entry: FloatArray = np.broadcast_to(per_entry.reshape(9, -1), (9, f))
+
+    def __getitem__(self, part: slice) -> ReferenceMesh:
+        """Some of the triangles, among the same vertices."""
+        some = copy(self)
+        some.F, some.m, some.gamma = self.F[part], self.m[part], self.gamma[:, part]
+        some.half_gamma, some.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
+        return some
+
+    def edge_stiffness(self, a: FloatArray) -> FloatArray:
+        """Off-diagonal entries of every triangle's ``Gᵀ A G``.
+
+        Parameters
+        ----------
+        a : (3, f) float64
+            Rows a11, a12, a22 of the tensor without its area factor, ``A₍ⱼ₎ = mⱼ 𝒜ⱼ``.
+
+        Returns
+        -------
+        (3, f) float64
+            For the edges (0,1), (1,2), (2,0) of each triangle.
+        """
+        return np.einsum("eaf,af->ef", self.stiffness_by_entry.reshape(3, 3, -1), a)
+
+    def derivatives(self, w: ComplexArray) -> Derivatives:
+        """Differentiate a complex map on every triangle.
+
+        Parameters
+        ----------
+        w : (n,) complex128
+            Places u + iv.
+
+        Returns
+        -------
+        Derivatives
+
+        Raises
+        ------
+        ValueError
+            When there is not a place for every vertex.
+        """
+        if w.shape != (self.n,):
+            raise ValueError(f"w must have shape ({self.n},), a place for every vertex, not {w.shape}")
+        f = len(self.F)
+        p, q, area = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
+        wirtinger(w, self.F, self.half_gamma, p, q, area)
+        return Derivatives(p, q, area)
+
+
+@compiled
+def wirtinger(
+    w: ComplexArray, F: IntArray, half_gamma: ComplexArray, p: ComplexArray, q: ComplexArray, area: FloatArray
+) -> None:
+    """Fill in ``∂w/∂z``, ``∂w/∂z̄`` and signed areas of a map (n,); half_gamma: of the last two corners (2, f)."""
+    corners = w.take(F)
+    d1, d2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    g1, g2 = half_gamma
+    area[:] = 0.5 * (d1.conj() * d2).imag
+    p[:] = d1 * g1.conj() + d2 * g2.conj()
+    q[:] = d1 * g1 + d2 * g2
+
+
+class Derivatives(NamedTuple):
+    """Wirtinger derivatives of a complex map, by triangle.
+
+    ``det J = |p|² - |q|²``, the singular values are ``|p| ± |q|`` in absolute value, and the map's own
+    Beltrami coefficient is ``q / p``.
+
+    Attributes
+    ----------
+    p, q : (f,) complex128
+        ``∂w/∂z`` and ``∂w/∂z̄`` in the reference triangle's frame.
+    area : (f,) float64
+        Signed areas of the images, ``m det J`` computed from the images alone.
+    """
+
+    p: ComplexArray
+    q: ComplexArray
+    area: FloatArray
+
+
+@cache
+def _equilateral() -> tuple[FloatArray, ComplexArray, FloatArray]:
+    return _tables(np.ones(1), np.array([0.5 + np.sqrt(0.75) * 1j]))
+
+
+def _tables(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """Areas (f,), gradients of the hat functions (3, f), and stiffness of edges by the tensor's entries (3, 3, f)."""
+    opposite = np.stack([z2 - z1, -z2, z1 + 0j])
+    m = 0.5 * z1 * z2.imag
+    # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22): m ∇hᵢᵀ 𝒜 ∇hⱼ. It has
+    # no scale, so tiny and huge triangles are on a par.
+    gx, gy = (1j * opposite).real, (1j * opposite).imag
+    gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
+    per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
+    return m, 1j * opposite / (2 * m), per_entry
+
+
+def _corrected(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+    """The triangles of §F.1, with side 0-1 of unit length."""
+
+    def angle(at: ComplexArray, to: ComplexArray) -> FloatArray:
+        turn = np.conj(at) * to
+        # Adding zero turns -0 into 0: between coincident points the angle is 0, not π.
+        return np.arctan2(np.abs(turn.imag), turn.real + 0.0)
+
+    base = z1.astype(np.complex128)
+    angles = np.stack([angle(base, z2), angle(z2 - base, -base), angle(-z2, base - z2)])
+    angles = np.maximum(angles, np.pi / 6)
+    angles *= np.pi / angles.sum(axis=0)
+    # Sine rule: |z2| / sin(angle at 1) = |z1| / sin(angle at 2).
+    return np.ones_like(z1), np.sin(angles[1]) / np.sin(angles[2]) * np.exp(1j * angles[0])

@@ -1,0 +1,181 @@
+"""Split named edges of a mesh at their midpoints and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edges as sort_edges
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    named_edges,
+    triangle_rows,
+    true_or_false,
+    vertex_array,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A mesh some of whose edges were split, and how it came from the old one.
+
+    Attributes
+    ----------
+    V : (n + s, d) float64
+        Vertices: the old ones first, at their old indices, then the new ones.
+    F : (f + …, 3) int64
+        Triangles. Every old one keeps its index, or leaves it to its first part; further parts follow.
+    parent : (f + …,) int64
+        The old triangle each new one is a part of.
+    parents : (s, k) int64
+        The old vertices between which each new one lies, ascending: the two ends of the edge that was
+        split, or, after several rounds, up to three corners of the old triangle that was. Where there
+        are fewer than k the last one is repeated.
+    weights : (s, k) float64
+        Their shares in it; 0 for what is repeated.
+    """
+
+    V: FloatArray
+    F: IntArray
+    parent: IntArray
+    parents: IntArray
+    weights: FloatArray
+
+    def extend(self, values: ArrayLike) -> FloatArray:
+        """Carry values at the old vertices over to the new ones, linear on the old triangles.
+
+        Parameters
+        ----------
+        values : (n, …) array
+            One row for each old vertex.
+
+        Returns
+        -------
+        (n + s, …) float64
+
+        Raises
+        ------
+        ValueError
+            When there are not as many rows as old vertices.
+        """
+        old = np.asarray(values, dtype=np.float64)
+        if not old.ndim or len(old) != len(self.V) - len(self.parents):
+            rows = "a number" if not old.ndim else f"{len(old)} rows"
+            raise ValueError(f"values must have {len(self.V) - len(self.parents)} rows, one a vertex, not {rows}")
+        return np.concatenate([old, np.einsum("sk,sk...->s...", self.weights, old[self.parents])])
+
+
+def composed(first: Refined, second: Refined) -> Refined:
+    """Two refinements, one after the other, as one; with three parents for each vertex."""
+    n = len(first.V) - len(first.parents)
+
+    def shares(vertex: int) -> dict[int, float]:
+        if vertex < n:
+            return {vertex: 1.0}
+        row = zip(first.parents[vertex - n].tolist(), first.weights[vertex - n].tolist(), strict=True)
+        return {parent: weight for parent, weight in row if weight}
+
+    combined = [shares(n + k) for k in range(len(first.parents))]
+    for row, weights in zip(second.parents.tolist(), second.weights.tolist(), strict=True):
+        total: dict[int, float] = {}
+        for vertex, weight in zip(row, weights, strict=True):
+            for parent, share in shares(vertex).items():
+                total[parent] = total.get(parent, 0.0) + weight * share
+        combined.append(total)
+    # What is split lies in one old triangle, so that there are three at most.
+    parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in combined], dtype=np.int64).reshape(-1, 3)
+    shared = [[*(row[parent] for parent in sorted(row)), 0.0, 0.0][:3] for row in combined]
+    weights_ = np.array(shared, dtype=np.float64).reshape(-1, 3)
+    return Refined(second.V, second.F, first.parent[second.parent], parents, weights_)
+
+
+def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
+    """Split edges at their midpoints; `quasiharmonic.refine` on arrays."""
+    V, F = vertex_array(V), triangle_rows(F)
+    n = len(V)
+    check_range("F", F, n)
+    wanted = np.unique(np.sort(_pairs(edges), axis=1), axis=0)
+    found = sort_edges(F, n)
+    allowed = [found.interior, np.sort(found.boundary, axis=1)]
+    _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
+    true_or_false("boundary", boundary)
+    if not boundary:
+        _refuse(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it all the same")
+
+    V = np.concatenate([V, V[wanted[:, 0]] / 2 + V[wanted[:, 1]] / 2])
+    keys = _keys(wanted, n)
+    # Midpoint of the side opposite to each corner, or -1.
+    sides = edge_keys(F[:, (1, 2, 0)].ravel(), F[:, (2, 0, 1)].ravel(), n)
+    at = np.minimum(np.searchsorted(keys, sides), max(len(keys) - 1, 0))
+    middle = np.where(keys[at] == sides, n + at, -1).reshape(-1, 3) if len(keys) else np.full(F.shape, -1)
+    F, parent = _subdivide(V, F, middle)
+    return Refined(V, F, parent, wanted, np.full(wanted.shape, 0.5))
+
+
+def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, IntArray]:
+    r"""Replace triangles by their parts; ``middle`` (f, 3) has the midpoints opposite to the corners.
+
+    Drawn with the midpoints p, q, r opposite to a, b, c:
+
+            c                c                 c
+           /|\              / \               / \
+          / | \            q---p             q---p
+         /  |  \          / `-. \           / \ / \
+        a---r---b        a-----`-b         a---r---b
+    """
+    count = (middle >= 0).sum(axis=1)
+    first, parts, of = F.copy(), [np.empty((0, 3), dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+
+    def replace(t: IntArray, *triangles: tuple[IntArray, IntArray, IntArray]) -> None:
+        first[t] = np.stack(triangles[0], axis=1)
+        for corners in triangles[1:]:
+            parts.append(np.stack(corners, axis=1))
+            of.append(t)
+
+    def turned(number: int, to: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        # Corners and midpoints, cyclically so that corner `to` is the last.
+        t = np.flatnonzero(count == number)
+        columns = (to[t, None] + [1, 2, 0]) % 3
+        return t, F[t[:, None], columns].T, middle[t[:, None], columns].T
+
+    t, (a, b, c), (_, _, r) = turned(1, np.argmax(middle, axis=1))
+    replace(t, (r, c, a), (r, b, c))
+    t, (a, b, c), (p, q, _) = turned(2, np.argmin(middle, axis=1))
+    through_b = _length(V, b, q) <= _length(V, a, p)
+    replace(t, (c, q, p), (q, a, b), (q, b, p))
+    k = np.flatnonzero(~through_b)
+    parts[-2][k] = np.stack([a, b, p], axis=1)[k]
+    parts[-1][k] = np.stack([a, p, q], axis=1)[k]
+    t, (a, b, c), (p, q, r) = turned(3, np.zeros(len(F), dtype=np.int64))
+    replace(t, (p, q, r), (a, r, q), (b, p, r), (c, q, p))
+    return np.concatenate([first, *parts]), np.concatenate([np.arange(len(F)), *of])
+
+
+def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
+    """A quarter of the distances of vertices, which no coordinates make overflow."""
+    lengths: FloatArray = np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
+    return lengths
+
+
+def _pairs(edges: ArrayLike) -> IntArray:
+    array = index_array("edges", edges)
+    if array.size and (array.ndim != 2 or array.shape[1] != 2):
+        raise ValueError(f"edges must have shape (k, 2), not {array.shape}")
+    return array.reshape(-1, 2)
+
+
+def _refuse(wanted: IntArray, known: IntArray, n: int, why: str) -> None:
+    inside = ((wanted >= 0) & (wanted < n)).all(axis=1)
+    bad = wanted[~(inside & np.isin(_keys(wanted, n), known))]
+    if len(bad):
+        raise ValueError(f"cannot split {named_edges(bad)}: {why}")
+
+
+def _keys(pairs: IntArray, n: int) -> IntArray:
+    return edge_keys(pairs[:, 0], pairs[:, 1], n)

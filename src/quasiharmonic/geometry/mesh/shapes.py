@@ -1,0 +1,81 @@
+"""The triangles of a surface as they lie in space, for measuring what a map does to them.
+
+Unlike a `ReferenceMesh`, which may choose its triangles, these are the mesh's own; and unlike the frames of
+a planar mesh they have no sign: a planar mesh is a surface seen from the side on which its triangles are
+counterclockwise. So the image of a triangle is inverted exactly when the certificate says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, vertex_array
+
+
+@dataclass(frozen=True, eq=False)
+class RestShapes:
+    """Triangles laid into the plane, counterclockwise, vertex 0 at 0 and vertex 1 on the positive x axis.
+
+    Attributes
+    ----------
+    unit : float
+        The unit of length: a power of two near the mesh's size, so that areas and their inverses stay
+        within the numbers' range.
+    sides : (3, f) complex128
+        From vertex 0 to 1, 1 to 2 and 2 to 0, in units.
+    m : (f,) float64
+        Areas in square units.
+    """
+
+    unit: float
+    sides: ComplexArray
+    m: FloatArray
+
+    @property
+    def flat(self) -> NDArray[np.int64]:
+        """Triangles of zero area (that is, whose area vanishes in floating point), ascending."""
+        return np.flatnonzero(~(self.m > 0))
+
+    def half_gradients(self) -> ComplexArray:
+        """Half the gradients ``γᵢ/2`` of the hat functions, ``∂w/∂z = Σ conj(gᵢ) wᵢ`` and ``∂w/∂z̄ = Σ gᵢ wᵢ``.
+
+        Returns
+        -------
+        (3, f) complex128
+            Per unit; NaN for flat triangles.
+        """
+        m = np.where(self.m > 0, self.m, np.nan)
+        return 0.25j * self.sides[(1, 2, 0), :] / m
+
+
+def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) -> RestShapes:
+    """Lay the triangles of a planar or curved mesh into the plane.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array
+        Rest positions.
+    F : (f, 3) int
+        Triangles.
+    lowest : float
+        Triangles lower than this share of their longest side are made so high.
+
+    Raises
+    ------
+    ValueError
+        When ``V`` has another shape.
+    """
+    positions = vertex_array(V, finite=False)
+    exponent = int(np.frexp(np.abs(positions).max(initial=0))[1]) - 1
+    surface = np.zeros((len(positions), 3))
+    surface[:, : positions.shape[1]] = np.ldexp(positions, -exponent)
+    z1, z2 = rest_frames(surface, F)
+    if lowest:
+        longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
+        z1 = np.where(z1 > 0, z1, longest)
+        z2.imag = np.maximum(z2.imag, lowest * longest**2 / np.where(z1 > 0, z1, 1.0))
+    return RestShapes(float(np.ldexp(1.0, exponent)), np.stack([z1 + 0j, z2 - z1, -z2]), 0.5 * z1 * z2.imag)

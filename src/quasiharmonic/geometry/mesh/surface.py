@@ -1,0 +1,102 @@
+"""Are these triangles a surface? Every check that needs to know how they are joined, each naming what is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.topology import Edges, components, edges
+from quasiharmonic.util.arrays import IntArray, named, named_edges
+
+
+def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
+    """The edges of triangles that form one connected, consistently oriented surface.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles among the vertices ``0 … n - 1``.
+    n : int
+        Number of vertices.
+    closed : bool
+        Whether the surface may be without boundary.
+
+    Returns
+    -------
+    Edges
+
+    Raises
+    ------
+    ValueError
+        With the first offending elements: triangles that use a vertex twice or are repeated, vertices without
+        triangle, non-manifold edges, mixed winding, no boundary, several components.
+    """
+    label = components(F, n)
+    connected = not label.any()
+    if not connected:
+        # A vertex without triangle is a component of its own.
+        unused = np.setdiff1d(np.arange(n), F)
+        if unused.size:
+            raise ValueError(f"{named('vertex', 'vertices', unused)}: no triangle uses them; remove them")
+    found = manifold_edges(F, n)
+    if not closed and not found.boundary.size:
+        raise ValueError(
+            "the surface is closed: it has no boundary to place; cut it open first "
+            "(cut_open; --cut of qhm map and qhm flatten)"
+        )
+    if not connected:
+        first = np.unique(label)
+        raise ValueError(
+            f"the mesh has {first.size} components, the first ones around {named('vertex', 'vertices', first)}: "
+            "map them one at a time"
+        )
+    return found
+
+
+def manifold_edges(F: IntArray, n: int) -> Edges:
+    """The edges of triangles that form any number of surfaces, each consistently oriented.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles among the vertices ``0 … n - 1``.
+    n : int
+        Number of vertices.
+
+    Returns
+    -------
+    Edges
+
+    Raises
+    ------
+    ValueError
+        With the first offending elements: triangles that use a vertex twice or are repeated, non-manifold edges,
+        mixed winding.
+    """
+    found = edges(F, n)
+    # An edge from a vertex to itself is never between two triangles that traverse it in opposite directions.
+    if found.nonmanifold.size or found.inconsistent.size or np.any(found.boundary[:, 0] == found.boundary[:, 1]):
+        _collapsed(F)
+        _repeated(F)
+    if found.nonmanifold.size:
+        raise ValueError(f"{named_edges(found.nonmanifold)} in more than two triangles: not a surface")
+    if found.inconsistent.size:
+        raise ValueError(
+            f"mixed winding: {named_edges(found.inconsistent)} traversed in the same direction by both triangles; "
+            "orient all triangles alike"
+        )
+    return found
+
+
+def _collapsed(F: IntArray) -> None:
+    collapsed = np.flatnonzero((F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0]))
+    if collapsed.size:
+        raise ValueError(f"{named('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
+
+
+def _repeated(F: IntArray) -> None:
+    corners = np.sort(F, axis=1)
+    order = np.lexsort(corners.T)
+    same = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
+    if same.any():
+        repeats = np.sort(order[1:][same])
+        raise ValueError(f"{named('triangle', 'triangles', repeats)} repeated: the same three vertices occur before")

@@ -1,1 +1,0 @@
-"""What callers hand over in place of arrays: mesh objects of any library, and files."""

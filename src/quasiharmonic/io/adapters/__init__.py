@@ -1,0 +1,4 @@
+"""Mesh objects of other libraries, and paths, in the place of ``V, F``.
+
+The package builds on `io`. Start reading in `accepts_mesh`, the decorators of public functions, then `objects`.
+"""

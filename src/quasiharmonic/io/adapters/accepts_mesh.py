@@ -1,0 +1,105 @@
+"""Functions that take one mesh in place of ``V`` and ``F``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from os import PathLike
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.adapters.cells import planar_cells
+from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.util.arrays import FloatArray, IntArray, kind_of
+
+P = ParamSpec("P")
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+Path = str | PathLike[str]
+
+
+class TakesMesh(Protocol[P, R_co]):
+    """A function of ``V``, ``F`` and further arguments, or of a mesh and these."""
+
+    @overload
+    def __call__(self, V: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+    @overload
+    def __call__(self, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+
+
+class WritesMesh(Protocol[P, R_co]):
+    """A function of a file to write, ``V``, ``F`` and further arguments, or of a file, a mesh and these."""
+
+    @overload
+    def __call__(self, path: Path, V: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+    @overload
+    def __call__(self, path: Path, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+
+
+class TakesPlanarMesh(Protocol[P, R_co]):
+    """A function of ``points``, ``F`` and further arguments, or of a mesh in the plane and these."""
+
+    @overload
+    def __call__(self, points: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+    @overload
+    def __call__(self, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+
+
+def takes_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesMesh[P, R]:
+    """Let a function whose first two arguments are ``V`` and ``F`` take one mesh in their place."""
+    return _taking(function, 0)
+
+
+def writes_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R]) -> WritesMesh[P, R]:
+    """Let a function whose arguments after a path are ``V`` and ``F`` take one mesh in their place."""
+    return _taking(function, 1)
+
+
+def takes_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesPlanarMesh[P, R]:
+    """Let a function whose first two arguments are ``points`` and elements ``F`` of a plane take one mesh instead."""
+    return _taking(function, 0, planar_cells)
+
+
+def made_of_mesh(init: Callable[..., None]) -> Callable[..., None]:
+    """Let an ``__init__`` whose arguments after ``self`` are ``V`` and ``F`` take one mesh in their place."""
+    made: Callable[..., None] = _taking(init, 1)
+    return made
+
+
+def made_of_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
+    """Let an ``__init__`` whose arguments after ``self`` are ``points`` and ``F`` of a plane take one mesh instead."""
+    made: Callable[..., None] = _taking(init, 1, planar_cells)
+    return made
+
+
+def _taking(
+    function: Callable[..., Any], place: int, arrays: Callable[[Any], tuple[FloatArray, IntArray]] = mesh_arrays
+) -> Any:
+    """A function that takes a mesh as its argument number ``place``, where positions are, and as ``F`` after it."""
+    first = list(inspect.signature(function).parameters)[place]
+
+    @wraps(function)
+    def taking(*args: Any, **kwargs: Any) -> Any:
+        if len(args) > place and stands_for_mesh(args[place]):
+            mesh, before, after = args[place], args[:place], args[place + 1 :]
+            _check_room(function, mesh, len(args) + 1, kwargs)
+            args = (*before, *arrays(mesh), *after)
+        elif len(args) > place and isinstance(args[place], tuple) and np.ndim(args[place][:1]) > 2:
+            pair = f"a tuple of {len(args[place])} arrays"
+            raise TypeError(f"V is {pair}: hand these over one by one, as in {function.__name__}(*mesh)")
+        elif first in kwargs and "F" not in kwargs and stands_for_mesh(kwargs[first]):
+            kwargs[first], kwargs["F"] = arrays(kwargs[first])
+        return function(*args, **kwargs)
+
+    return taking
+
+
+def _check_room(function: Callable[..., Any], mesh: object, count: int, kwargs: dict[str, Any]) -> None:
+    """Raise a TypeError where a mesh was handed over and ``F`` too."""
+    parameters = inspect.signature(function).parameters.values()
+    most = sum(parameter.kind is not inspect.Parameter.KEYWORD_ONLY for parameter in parameters)
+    if "F" in kwargs or count > most:
+        raise TypeError(f"{kind_of(mesh)} stands for V and F both: leave F out, or hand over V in its place")

@@ -1,0 +1,260 @@
+"""The vertices and triangles of whatever stands for a mesh: an object of another library, a mapping, a file.
+
+Nobody's library is imported: an object is known by what it calls its positions and its faces, as trimesh, PyVista,
+meshio, Open3D, vedo, SciPy's triangulations and this package's own classes do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Number
+from os import PathLike
+from typing import Any, Protocol
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.polygons import triangulated
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    kind_of,
+    triangle_rows,
+    vertex_array,
+)
+
+
+class _VerticesFaces(Protocol):
+    @property
+    def vertices(self) -> Any: ...
+    @property
+    def faces(self) -> Any: ...
+
+
+class _VerticesTriangles(Protocol):
+    @property
+    def vertices(self) -> Any: ...
+    @property
+    def triangles(self) -> Any: ...
+
+
+class _PointsFaces(Protocol):
+    @property
+    def points(self) -> Any: ...
+    @property
+    def faces(self) -> Any: ...
+
+
+class _PointsCells(Protocol):
+    @property
+    def points(self) -> Any: ...
+    @property
+    def cells(self) -> Any: ...
+
+
+class _VF(Protocol):
+    @property
+    def V(self) -> Any: ...
+    @property
+    def F(self) -> Any: ...
+
+
+class _DoflocsT(Protocol):
+    @property
+    def doflocs(self) -> Any: ...
+    @property
+    def t(self) -> Any: ...
+
+
+class _Geometry(Protocol):
+    @property
+    def geometry(self) -> Any: ...
+
+
+#: What stands for a mesh: an object with vertices and faces, a mapping with these keys, or the path of a file.
+MeshLike = (
+    _VerticesFaces
+    | _VerticesTriangles
+    | _PointsFaces
+    | _PointsCells
+    | _VF
+    | _DoflocsT
+    | _Geometry
+    | Mapping[str, Any]
+    | str
+    | PathLike[str]
+)
+
+# A mesh of trimesh has "triangles" too, which are coordinates: its "faces" come first.
+_POSITIONS = ("vertices", "points", "V", "coordinates", "verts")
+_FACES = ("faces", "triangles", "F", "cells", "simplices")
+# What scikit-fem calls its positions, which are columns, as the corners of its elements are.
+_BY_COLUMNS = "doflocs"
+
+# Kinds of cells that are faces, and those that are no part of a surface and are passed over: meshio's, and VTK's.
+_FACES_OF, _PASSED_OVER = ("triangle", "quad", "polygon"), ("vertex", "line")
+_FACES_OF_VTK, _PASSED_OVER_OF_VTK = (5, 7, 9), (0, 1, 2, 3, 4)
+
+
+def stands_for_mesh(value: object) -> bool:
+    """Whether a value can only be meant as a whole mesh: it is a path, has vertices and faces, or is no array."""
+    if isinstance(value, np.ndarray):
+        return False
+    if isinstance(value, str | PathLike | Mapping) or None not in _parts(value) or hasattr(value, _BY_COLUMNS):
+        return True
+    numbers = isinstance(value, Number | Sequence | bytes | memoryview | type(None))
+    return not numbers and not any(
+        hasattr(value, name) for name in ("__array__", "__array_interface__", "__dlpack__", "__iter__")
+    )
+
+
+def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
+    """The positions and the triangles of what stands for a mesh.
+
+    Parameters
+    ----------
+    mesh : object, mapping or path
+        With positions as ``vertices``, ``points``, ``V``, ``coordinates`` or ``verts``, and faces as ``faces``,
+        ``triangles``, ``F``, ``cells`` or ``simplices``: rows of corners, VTK's numbers (count, corners, count, …), or
+        meshio's blocks; or a mesh of scikit-fem. Larger faces are cut into triangles as those of files are; vertices
+        and lines among cells are passed over. A path is that of a file as `quasiharmonic.io.read_mesh` reads it.
+
+    Returns
+    -------
+    V : (n, 2) or (n, 3) float64
+    F : (f, 3) int64
+
+    Raises
+    ------
+    ValueError
+        When these are not to be found, or there are cells that are no faces, such as tetrahedra.
+    quasiharmonic.io.MeshFileError
+        When the file cannot be read.
+    """
+    if isinstance(mesh, str | PathLike):
+        from quasiharmonic.io import read_mesh
+
+        read = read_mesh(mesh)
+        return read.V, read.F
+    what = kind_of(mesh)
+    by_columns = getattr(mesh, _BY_COLUMNS, None)
+    if by_columns is not None:
+        V = vertex_array(np.asarray(by_columns).T, f"{_BY_COLUMNS} of {what}")
+        return V, _triangles(V, f"t of {what}", np.asarray(_part(mesh, "t")).T, None)
+    positions, faces = _parts(mesh)
+    if positions is None or faces is None:
+        lacking = "vertices" if positions is None else "faces"
+        raise ValueError(
+            f"{what} is no mesh that can be taken as one, as it has no {lacking}: hand over an object with vertices "
+            "and faces, the path of a file, or the arrays V and F"
+        )
+    name = f"{faces} of {what}"
+    V = vertex_array(_part(mesh, positions), f"{positions} of {what}")
+    return V, _triangles(V, name, _part(mesh, faces), _part(mesh, "celltypes"))
+
+
+def planar_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
+    """As `mesh_arrays`, of a mesh in the plane: positions (n, 2), whose third coordinate is the same everywhere."""
+    V, F = mesh_arrays(mesh)
+    return (V[:, :2] if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V), F
+
+
+def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
+    """A mesh with the seams and the map that it carries: a `SeamedMesh`, `MeshData` or file; others have none."""
+    from quasiharmonic import io
+
+    if isinstance(mesh, SeamedMesh):
+        return mesh
+    if isinstance(mesh, str | PathLike):
+        return io.seamed(io.read_mesh(mesh))
+    if isinstance(mesh, io.MeshData):
+        return io.seamed(mesh)
+    if not stands_for_mesh(mesh):
+        raise TypeError(f"{kind_of(mesh)} is no mesh: hand over a SeamedMesh, or the path of a file")
+    return SeamedMesh(*mesh_arrays(mesh))
+
+
+def mesh_triangles(F: Any) -> Any:
+    """The triangles of what stands for a mesh, and anything else as it is."""
+    return mesh_arrays(F)[1] if stands_for_mesh(F) else F
+
+
+def _parts(mesh: object) -> tuple[str | None, str | None]:
+    """What a mesh calls its positions and its faces; None for what it has not."""
+
+    def first(names: Iterable[str]) -> str | None:
+        parts = ((name, _part(mesh, name)) for name in names)
+        # Some have methods or counts of these names.
+        return next((name for name, part in parts if hasattr(part, "__len__")), None)
+
+    return first(_POSITIONS), first(_FACES)
+
+
+def _part(mesh: object, name: str) -> Any:
+    return mesh.get(name) if isinstance(mesh, Mapping) else getattr(mesh, name, None)
+
+
+def _triangles(V: FloatArray, name: str, faces: Any, kinds: Any) -> IntArray:
+    """Triangles of faces in any of the forms that `mesh_arrays` names."""
+    if isinstance(faces, Sequence) and any(hasattr(block, "data") and hasattr(block, "type") for block in faces):
+        rings = [ring for block in faces for ring in _block(name, block)]
+        return _cut(V, np.concatenate([[], *rings]).astype(np.int64), np.array([len(ring) for ring in rings]))
+    try:
+        array = np.asarray(faces)
+    except ValueError:  # rows that differ in length
+        rings = [index_array(name, ring) for ring in faces]
+        return _cut(V, np.concatenate(rings), np.array([len(ring) for ring in rings]))
+    if array.ndim == 1 and array.size:
+        return _cut(V, *_vtk(name, index_array(name, array), kinds))
+    if array.ndim == 2 and array.shape[1] > 3:
+        return _cut(V, index_array(name, array).ravel(), np.full(len(array), array.shape[1]))
+    return triangle_rows(faces, name)
+
+
+def _block(name: str, block: Any) -> Iterable[IntArray]:
+    """The faces of one of meshio's blocks."""
+    if block.type in _PASSED_OVER:
+        return ()
+    if block.type not in _FACES_OF:
+        raise ValueError(f"{name} has cells of the kind {block.type!r}, of which no surface of triangles is made")
+    return (index_array(name, ring) for ring in block.data)
+
+
+def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
+    """Corners and sizes of the faces in VTK's list (count, corners, count, …); ``kinds`` tells what each cell is."""
+    step = int(numbers[0]) + 1
+    if step > 1 and len(numbers) % step == 0 and (numbers[::step] == step - 1).all():
+        heads = np.arange(0, len(numbers), step)
+    else:
+        heads = np.array(_heads(name, numbers.tolist()))
+    sizes = numbers[heads]
+    faces = np.ones(len(heads), dtype=np.bool_)
+    if kinds is not None:
+        faces = np.isin(kinds, _FACES_OF_VTK)
+        wrong = np.setdiff1d(kinds, (*_FACES_OF_VTK, *_PASSED_OVER_OF_VTK))
+        if wrong.size:
+            raise ValueError(f"{name} has cells of VTK's kind {wrong[0]}, of which no surface of triangles is made")
+    corner = np.repeat(faces, sizes + 1)
+    corner[heads] = False
+    return numbers[corner], sizes[faces]
+
+
+def _heads(name: str, numbers: list[int]) -> list[int]:
+    """Where the counts stand in VTK's list."""
+    heads, at = [], 0
+    while at < len(numbers):
+        if numbers[at] < 1 or at + numbers[at] >= len(numbers):
+            raise ValueError(f"{name} must be rows of corners, or (count, corners, count, …) from beginning to end")
+        heads.append(at)
+        at += 1 + numbers[at]
+    return heads
+
+
+def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
+    """Triangles (f, 3) of faces of any number of corners."""
+    check_range("the faces", corners, len(V))
+    space = V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    return corners[triangulated(space, corners, starts)[0]]

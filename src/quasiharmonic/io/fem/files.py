@@ -1,0 +1,194 @@
+"""Planar meshes of finite-element programs: Gmsh's MSH, VTK's legacy and XML files.
+
+Only positions are ever changed, where they stand in the file. Every other byte stays: cells, data, several times,
+physical groups and their names, numbering.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.fem.gmsh import read_gmsh
+from quasiharmonic.io.fem.legacy_vtk import read_legacy_vtk
+from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.vtu import read_vtu
+from quasiharmonic.io.meshdata import is_planar
+from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, named
+
+_READERS = {".msh": read_gmsh, ".vtk": read_legacy_vtk, ".vtu": read_vtu}
+# What readers meet in files that are damaged.
+_DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
+
+
+@dataclass(frozen=True, eq=False)
+class FemMesh:
+    """A planar mesh and all else that its file holds.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        Every point of the file, in its order.
+    F : (f, 3), (f, 4) or (f, 6) int64
+        Triangles of three or six nodes and quadrilaterals of all blocks of the file, in their order, as
+        `quasiharmonic.geometry.mesh.elements` has them.
+    source : Path
+    parts : MeshParts
+        The file taken apart.
+    """
+
+    points: FloatArray
+    F: IntArray
+    source: Path
+    parts: MeshParts
+
+    def point_field(self, name: str, vertices: ArrayLike) -> FloatArray:
+        """Vectors at some points, (k, 2) float64, from the file's point data; of several times the last.
+
+        Raises
+        ------
+        MeshFileError
+            When there are no such data, they are no vectors in the plane, or one at these points is missing or not
+            finite.
+        """
+        which, fields = np.asarray(vertices, dtype=np.int64), self.parts.fields
+        if name not in fields:
+            there = ", ".join(map(repr, sorted(fields))) or "none"
+            raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"there are: {there}")
+        try:
+            # A NaN of single precision may be one that signals when it is made double.
+            with np.errstate(invalid="ignore"):
+                values = fields[name]()[which]
+        except _DAMAGE as error:
+            raise MeshFileError(self.source, f"the point data {name!r} cannot be read: {error}") from error
+        if values.shape[1] not in (2, 3):
+            raise MeshFileError(
+                self.source,
+                f"the point data {name!r} are no vectors in the plane: {values.shape[1]} numbers at each point",
+            )
+        lost = which[~np.isfinite(values).all(axis=1)]
+        if lost.size:
+            raise MeshFileError(
+                self.source,
+                f"{name!r} has no finite value at {named('boundary point', 'boundary points', lost)} (0-based)",
+                remedy="give every point of the boundary one, 0 where it stays",
+            )
+        if values[:, 2:].any():
+            raise MeshFileError(self.source, f"the point data {name!r} lead out of the plane")
+        return values[:, :2].copy()
+
+
+def read_fem(path: str | os.PathLike[str]) -> FemMesh:
+    """Read a planar mesh for finite elements.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A ``.msh`` of version 2 or 4, a legacy ``.vtk`` of an unstructured grid or polygons, or a ``.vtu``, each
+        as text or binary.
+
+    Raises
+    ------
+    MeshFileError
+        When the file is another, cannot be read, has cells with area other than triangles of three or six nodes and
+        quadrilaterals of four, none of these, or is not planar.
+    """
+    source = Path(path)
+    try:
+        data = source.read_bytes()
+    except OSError as error:
+        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
+    return _mesh(source, data)
+
+
+def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str]) -> None:
+    """Say early whether a mesh could be written.
+
+    Raises
+    ------
+    MeshFileError
+        When the suffix is not that of the source: converting would lose data.
+    OutputError
+        When the file cannot be written.
+    """
+    there, here = Path(path).suffix.lower(), Path(source).suffix.lower()
+    if here in _READERS and there != here:
+        raise MeshFileError(
+            path,
+            f"a {here} file is written as {here}, in which only positions change; written as "
+            f"{there or 'a file without suffix'}, it could lose groups, data or times",
+            remedy="convert the written file if you need another format",
+        )
+    check_writable(path)
+
+
+def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) -> None:
+    """Write a mesh that was read, with other positions in the plane and every other byte as it was.
+
+    Parameters
+    ----------
+    path : str or path-like
+        With the suffix that was read. Replaced as a whole once the file is complete.
+    mesh : FemMesh
+    points : (n, 2) array
+        Rounded to single precision where that is what the file has.
+
+    Raises
+    ------
+    ValueError
+        When ``points`` has another shape or is not finite.
+    MeshFileError, OutputError
+        As for `check_fem_output`; or when positions are too large for the file's precision.
+    """
+    points = map_array("points", points, len(mesh.points))
+    check_fem_output(path, mesh.source)
+    with np.errstate(over="ignore"):
+        expected = points.astype(mesh.parts.precision).astype(np.float64)
+    if not np.isfinite(expected).all():
+        raise MeshFileError(path, "positions are too large for single precision, which the file has")
+    data = mesh.parts.replaced(points)
+    written = _mesh(mesh.source, data)
+    if not (
+        np.array_equal(written.points, expected)
+        and np.array_equal(written.F, mesh.F)
+        and np.array_equal(written.parts.points[:, 2], mesh.parts.points[:, 2])
+    ):
+        raise MeshFileError(path, "what would be written does not read back as it should, so it is not")
+    write_whole(path, data)
+
+
+def _mesh(source: Path, data: bytes) -> FemMesh:
+    """Take a file apart and check it."""
+    reader = _READERS.get(source.suffix.lower())
+    if reader is None:
+        raise MeshFileError(
+            source,
+            f"{source.suffix or 'files without suffix'} cannot be read",
+            remedy="convert it to .msh, .vtk or .vtu",
+        )
+    try:
+        with np.errstate(invalid="ignore"):
+            parts = reader(data)
+    except _DAMAGE as error:
+        what = str(error) if isinstance(error, ValueError) else f"something is missing in it ({error})"
+        raise MeshFileError(source, f"cannot be read: {what}") from error
+    points, F = parts.points, parts.F
+    if not F.size:
+        raise MeshFileError(source, "has no triangles")
+    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if lost.size:
+        raise MeshFileError(source, f"not finite at {named('point', 'points', lost)} (0-based)")
+    used = points[np.unique(F)]
+    if not is_planar(used):
+        raise MeshFileError(
+            source,
+            f"is not planar: z goes from {used[:, 2].min():.6g} to {used[:, 2].max():.6g}",
+            remedy="a mesh in the plane z = constant is needed",
+        )
+    return FemMesh(points[:, :2].copy(), F, source, parts)

@@ -1,0 +1,218 @@
+"""Gmsh's MSH files, versions 2 and 4, text and binary: nodes, triangles, and data of nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import groupby
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.elements import joined
+from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.tables import Table, TableReader, replaced, stacked
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Nodes of each kind of element that is read, and of those that are passed over: lines and points.
+_ELEMENTS = {2: 3, 3: 4, 9: 6}
+_NODES = {**_ELEMENTS, 1: 2, 8: 3, 15: 1}
+_NAMES = {
+    4: "tetrahedron",
+    5: "hexahedron",
+    6: "prism",
+    7: "pyramid",
+    10: "second-order quadrangle",
+    11: "second-order tetrahedron",
+    16: "second-order quadrangle",
+}
+
+
+def read_gmsh(data: bytes) -> MeshParts:
+    """Take an MSH file apart.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Raises
+    ------
+    ValueError
+        When it is not an MSH file of version 2 or 4, ends early, or has elements other than points, lines,
+        triangles of three or six nodes and quadrilaterals of four.
+    """
+    version, order, position = _format(data)
+    nodes: list[tuple[IntArray, Table]] = []
+    elements: list[IntArray] = []
+    later: dict[str, list[tuple[int, int]]] = {}
+    for name, begin, end in _sections(data, position):
+        if name == b"Nodes":
+            nodes.append(_nodes(data, begin, end, version, order))
+        elif name == b"ParametricNodes":
+            raise ValueError("nodes with parameters are not known in version 2: save it as 4.1, or without them")
+        elif name == b"Elements":
+            elements.append(_elements(data, begin, end, version, order))
+        elif name == b"NodeData":
+            title = TableReader(data, begin, end, "<")
+            if int(title.words()[0]) > 0:
+                later.setdefault(title.line().strip(b'"').decode("utf-8", "replace"), []).append((begin, end))
+    if not (nodes and elements):
+        raise ValueError(f"there is no section ${'Elements' if nodes else 'Nodes'}")
+    tags, numbers = nodes[0][0], elements[0]
+    # Gmsh repeats the mesh with every view that it appends.
+    if not (
+        all(np.array_equal(t, tags) and np.array_equal(p.values, nodes[0][1].values) for t, p in nodes[1:])
+        and all(np.array_equal(other, numbers) for other in elements[1:])
+    ):
+        raise ValueError("it has several meshes: save each in a file of its own")
+    place = stacked([table for _, table in nodes], 3)
+    known = np.argsort(tags, kind="stable")
+    at = np.searchsorted(tags, numbers, sorter=known).clip(max=max(len(tags) - 1, 0))
+    F = known[at] if len(tags) else numbers
+    wrong = numbers[tags[F] != numbers] if len(tags) else numbers.ravel()
+    if wrong.size:
+        raise ValueError(f"an element refers to node {wrong[0]}, which is not there")
+    if version == "2":
+        # An element in several physical groups is there once for each.
+        F = F[np.sort(np.unique(np.sort(F, axis=1), axis=0, return_index=True)[1])]
+    # Of several time steps the last.
+    fields = {
+        title: partial(_node_data, data, *places[-1], order, tags[known], known) for title, places in later.items()
+    }
+    return MeshParts(
+        nodes[0][1].values.astype(np.float64),
+        F.astype(np.int64),
+        np.dtype(np.float64),
+        fields,
+        lambda points: replaced(data, place, np.tile(points, (len(nodes), 1))),
+    )
+
+
+def _format(data: bytes) -> tuple[str, str | None, int]:
+    """Version ("2", "4.0" or "4.1"), byte order (None for text), and what comes behind."""
+    begin = data.find(b"$MeshFormat")
+    reader = TableReader(data, max(begin, 0), len(data), "<")
+    reader.line()
+    words = reader.words()
+    if begin < 0 or len(words) != 3:
+        raise ValueError("it does not begin as an MSH file of version 2 or 4 does")
+    version = words[0].decode("ascii", "replace")
+    version = "2" if version.split(".")[0] == "2" else "4.0" if version == "4" else version
+    if version not in ("2", "4.0", "4.1"):
+        raise ValueError(f"version {version} is not known: save it as 2.2 or 4.1")
+    if words[2] != b"8":
+        raise ValueError(f"numbers of {words[2].decode('ascii', 'replace')} bytes are not known: save it with 8")
+    order: str | None = None
+    if words[1] == b"1":
+        one = data[reader.position : reader.position + 4]
+        order = "<" if one == b"\x01\0\0\0" else ">"
+    end = data.find(b"$EndMeshFormat", reader.position)
+    if end < 0:
+        raise ValueError("it ends too early")
+    return version, order, end + len(b"$EndMeshFormat")
+
+
+def _sections(data: bytes, position: int) -> Iterator[tuple[bytes, int, int]]:
+    """Names of the sections, where their contents begin and end."""
+    while (position := data.find(b"$", position)) >= 0:
+        stop = data.find(b"\n", position)
+        name = data[position + 1 : stop].strip()
+        end = data.find(b"$End" + name, stop)
+        if stop < 0 or end < 0:
+            raise ValueError(f"the section ${name.decode('ascii', 'replace')} does not end")
+        yield name, stop + 1, end
+        position = end + 4 + len(name)
+
+
+def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -> tuple[IntArray, Table]:
+    """Tags of nodes and where their positions stand."""
+    if version == "2":
+        head = TableReader(data, begin, end, "<")
+        count = int(head.words()[0])
+        tags, place = TableReader(data, head.position, end, order).tables(count, ("i4", 1), ("f8", 3))
+        return tags.values[:, 0].astype(np.int64), place
+    reader = TableReader(data, begin, end, order)
+    blocks = int(reader.take("u8", 2 if version == "4.0" else 4)[0])
+    numbers, places = [np.empty(0, dtype=np.int64)], []
+    for _ in range(blocks):
+        first, second, parametric = reader.take("i4", 3).tolist()
+        count = int(reader.take("u8", 1)[0])
+        # Behind a node's position may stand its parameters on its curve or surface.
+        width = 3 + (parametric and (first if version == "4.1" else second))
+        if version == "4.1":
+            numbers.append(reader.take("u8", count).astype(np.int64))
+            places += reader.tables(count, ("f8", width))
+        else:
+            tags, place = reader.tables(count, ("i4", 1), ("f8", width))
+            numbers.append(tags.values[:, 0].astype(np.int64))
+            places.append(place)
+    if not places:
+        raise ValueError("there are no nodes")
+    return np.concatenate(numbers), stacked(places, 3)
+
+
+def _elements(data: bytes, begin: int, end: int, version: str, order: str | None) -> IntArray:
+    """Tags of the elements' nodes, (f, 3), (f, 4) or (f, 6)."""
+    found: list[IntArray] = []
+    if version == "2":
+        head = TableReader(data, begin, end, "<")
+        count = int(head.words()[0])
+        if order is None:
+            return _element_lines(list(map(int, data[head.position : end].split())), count)
+        reader = TableReader(data, head.position, end, order)
+        while count > 0:
+            kind, size, tags = reader.take("i4", 3).tolist()
+            table = reader.tables(size, ("i4", 1 + tags + _nodes_of(kind)))[0].values
+            if kind in _ELEMENTS:
+                found.append(table[:, -_nodes_of(kind) :].astype(np.int64))
+            count -= max(size, 1)
+        return joined(found)
+    reader = TableReader(data, begin, end, order)
+    for _ in range(int(reader.take("u8", 2 if version == "4.0" else 4)[0])):
+        kind = int(reader.take("i4", 3)[2])
+        size = int(reader.take("u8", 1)[0])
+        table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _nodes_of(kind)))[0].values
+        if kind in _ELEMENTS:
+            found.append(table[:, 1:].astype(np.int64))
+    return joined(found)
+
+
+def _element_lines(numbers: list[int], count: int) -> IntArray:
+    """Elements of lines "number kind tags … nodes …" of version 2."""
+    found: list[list[int]] = []
+    at = 0
+    for _ in range(count):
+        if at + 3 > len(numbers):
+            raise ValueError("it ends too early")
+        kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1])
+        if kind in _ELEMENTS:
+            found.append(numbers[stop - _nodes_of(kind) : stop])
+        at = stop
+    if at > len(numbers):
+        raise ValueError("it ends too early")
+    return joined([np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)])
+
+
+def _nodes_of(kind: int) -> int:
+    if kind not in _NODES:
+        raise ValueError(
+            f"there are cells of the kind {_NAMES.get(kind, f'number {kind}')}: triangles of three or six "
+            "nodes or quadrilaterals are needed"
+        )
+    return _NODES[kind]
+
+
+def _node_data(data: bytes, begin: int, end: int, order: str | None, tags: IntArray, which: IntArray) -> FloatArray:
+    """Values at every node, NaN at those that have none; (n, k)."""
+    head = TableReader(data, begin, end, "<")
+    for _ in range(2):  # names, then real numbers
+        for _ in range(int(head.words()[0])):
+            head.line()
+    integers = [int(head.words()[0]) for _ in range(int(head.words()[0]))]
+    _, components, count = integers[:3]
+    table, values = TableReader(data, head.position, end, order).tables(count, ("i4", 1), ("f8", components))
+    result = np.full((len(tags), components), np.nan)
+    node = table.values[:, 0].astype(np.int64)
+    at = np.searchsorted(tags, node).clip(max=len(tags) - 1)
+    known = tags[at] == node
+    result[which[at[known]]] = values.values[known]
+    return result

@@ -1,0 +1,214 @@
+"""VTK's legacy files, text and binary: unstructured grids and polygons, and data of points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.tables import Table, TableReader, replaced
+from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+_KINDS = {
+    b"char": "i1",
+    b"signed_char": "i1",
+    b"unsigned_char": "u1",
+    b"short": "i2",
+    b"unsigned_short": "u2",
+    b"int": "i4",
+    b"unsigned_int": "u4",
+    b"long": "i8",
+    b"unsigned_long": "u8",
+    b"float": "f4",
+    b"double": "f8",
+    b"vtkidtype": "i4",
+    b"vtktypeint64": "i8",
+    b"vtktypeuint64": "u8",
+}
+# Values at a point of the attributes that have their number in their name.
+_COMPONENTS = {b"VECTORS": 3, b"NORMALS": 3, b"TENSORS": 9, b"TENSORS6": 6, b"GLOBAL_IDS": 1, b"PEDIGREE_IDS": 1}
+# Kinds of cells of the sections of polygons: vertices, lines, polygons, strips.
+_POLY = {b"VERTICES": 2, b"LINES": 4, b"POLYGONS": 7, b"TRIANGLE_STRIPS": 6}
+
+
+def read_legacy_vtk(data: bytes) -> MeshParts:
+    """Take a legacy VTK file apart.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Raises
+    ------
+    ValueError
+        When it is no such file, ends early, has cells with area other than triangles and quadrilaterals, or something
+        in it is not known.
+    """
+    return _Walk(data).parts()
+
+
+class _Walk:
+    """A way through a file, section by section."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        head = TableReader(data, 0, len(data), ">")
+        if not head.line().startswith(b"# vtk DataFile Version"):
+            raise ValueError("it does not begin as a legacy VTK file does")
+        head.line()
+        coding = head.line().upper()
+        if coding not in (b"ASCII", b"BINARY"):
+            raise ValueError("its third line is neither ASCII nor BINARY")
+        self._reader = TableReader(data, head.position, len(data), None if coding == b"ASCII" else ">")
+        self._points: Table | None = None
+        self._lists: list[tuple[IntArray, IntArray, int]] = []
+        self._kinds: IntArray | None = None
+        self._fields: dict[str, Callable[[], FloatArray]] = {}
+        # What arrays belong to: points or something else, and how many there are.
+        self._of_points, self._count = False, 0
+
+    def parts(self) -> MeshParts:
+        """Walk to the end."""
+        while words := self._reader.words():
+            self._section(words[0].upper(), words[1:])
+        if self._points is None:
+            raise ValueError("there is no section POINTS")
+        starts, connectivity = [np.zeros(1, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+        for offsets, corners, _ in self._lists:
+            starts.append(offsets[1:] + starts[-1][-1])
+            connectivity.append(corners)
+        lists = [np.full(len(offsets) - 1, kind) for offsets, _, kind in self._lists]
+        kinds = self._kinds if self._kinds is not None else np.concatenate([np.empty(0, dtype=np.int64), *lists])
+        place = self._points
+        F = elements(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values))
+        points = place.values.astype(np.float64)
+        change = partial(replaced, self._data, place)
+        return MeshParts(points, F, np.dtype(place.values.dtype.newbyteorder("=")), self._fields, change)
+
+    def _section(self, name: bytes, words: list[bytes]) -> None:
+        reader = self._reader
+        if name == b"DATASET":
+            if words[:1] not in ([b"UNSTRUCTURED_GRID"], [b"POLYDATA"]):
+                raise ValueError(f"its data set is {_text(words)}: an unstructured grid or polygons are needed")
+        elif name == b"POINTS":
+            kind = _KINDS.get(words[1].lower(), "")
+            if kind not in ("f4", "f8"):
+                raise ValueError(f"its positions are {_text(words[1:])}: float or double is needed")
+            (self._points,) = reader.tables(int(words[0]), (kind, 3))
+        elif name == b"CELLS" or name in _POLY:
+            self._cells(int(words[0]), int(words[1]), _POLY.get(name, 0))
+        elif name == b"CELL_TYPES":
+            self._kinds = reader.take("i4", int(words[0])).astype(np.int64)
+        elif name in (b"POINT_DATA", b"CELL_DATA"):
+            self._of_points, self._count = name == b"POINT_DATA", int(words[0])
+        elif name == b"METADATA":
+            while reader.line():
+                pass
+        elif name == b"FIELD":
+            for _ in range(int(words[1])):
+                self._field()
+        elif name == b"SCALARS":
+            begin = reader.position
+            if reader.words()[:1] != [b"LOOKUP_TABLE"]:
+                reader.position = begin
+            self._array(words[0], words[1], int(words[2]) if len(words) > 2 else 1)
+        elif name == b"LOOKUP_TABLE":
+            reader.skip("u1", 4 * int(words[1]))
+        elif name == b"COLOR_SCALARS":
+            reader.skip("u1", self._count * int(words[1]))
+        elif name == b"TEXTURE_COORDINATES":
+            self._array(words[0], words[2], int(words[1]))
+        elif name in _COMPONENTS:
+            self._array(words[0], words[1], _COMPONENTS[name])
+        else:
+            raise ValueError(f"the section {_text([name])} is not known")
+
+    def _cells(self, count: int, size: int, kind: int) -> None:
+        """A list of cells, in the way of version 5.1 or of those before."""
+        reader = self._reader
+        begin = reader.position
+        words = reader.words()
+        if words[:1] == [b"OFFSETS"]:
+            offsets = reader.take(_KINDS[words[1].lower()], count).astype(np.int64)
+            connectivity = reader.take(_KINDS[reader.words()[1].lower()], size).astype(np.int64)
+            self._lists.append((offsets if count else np.zeros(1, dtype=np.int64), connectivity, kind))
+            return
+        reader.position = begin
+        mixed = reader.take("i4", size).astype(np.int64)
+        if not 0 <= count <= size:
+            raise ValueError("its lists of cells contradict each other")
+        starts = np.empty(count + 1, dtype=np.int64)
+        if count and size % count == 0 and (mixed[:: size // count] == size // count - 1).all():
+            starts[:] = np.arange(count + 1) * (size // count)
+        else:
+            values, at = mixed.tolist(), 0
+            for cell in range(count):
+                starts[cell] = at
+                at += 1 + values[at] if at < size else 0
+            starts[count] = at
+        if starts[-1] != size:
+            raise ValueError("its lists of cells contradict each other")
+        corners = np.delete(mixed, starts[:-1])
+        self._lists.append((starts - np.arange(count + 1), corners, kind))
+
+    def _field(self) -> None:
+        """An array of a field: name, components, tuples, kind."""
+        words = self._reader.words()
+        while words[:1] == [b"METADATA"]:
+            self._section(b"METADATA", [])
+            words = self._reader.words()
+        if len(words) == 4:
+            count, self._count = self._count, int(words[2])
+            of_points, self._of_points = self._of_points, self._of_points and self._count == count
+            self._array(words[0], words[3], int(words[1]))
+            self._count, self._of_points = count, of_points
+        elif words[:1] != [b"NULL_ARRAY"]:
+            raise ValueError(f"{_text(words)[:60]!r} stands where an array of a field should")
+
+    def _array(self, name: bytes, kind: bytes, components: int) -> None:
+        """Values at the points, cells or neither; those at points are kept."""
+        start = self._reader.position
+        self._skip(kind, self._count * components)
+        if self._of_points and kind.lower() in _KINDS:
+            self._fields[_decoded(name)] = partial(self._values, start, kind.lower(), components, self._count)
+
+    def _values(self, start: int, kind: bytes, components: int, count: int) -> FloatArray:
+        order = None if self._reader.text else ">"
+        reader = TableReader(self._data, start, len(self._data), order)
+        return reader.tables(count, (_KINDS[kind], components))[0].values.astype(np.float64)
+
+    def _skip(self, kind: bytes, count: int) -> None:
+        """Go past numbers or strings."""
+        reader, kind = self._reader, kind.lower()
+        if kind == b"string":
+            for _ in range(count):
+                reader.line() if reader.text else self._skip_string()
+        elif kind == b"bit":
+            reader.take("u1", count if reader.text else (count + 7) // 8)
+        elif kind not in _KINDS:
+            raise ValueError(f"arrays of {_text([kind])} are not known")
+        else:
+            reader.skip(_KINDS[kind], count)
+
+    def _skip_string(self) -> None:
+        """Go past a string, whose first two bits say how many bytes its length takes."""
+        first = int(self._reader.take("u1", 1)[0])
+        more = {3: 0, 2: 1, 1: 3, 0: 7}[first >> 6]
+        length = first & 63
+        for byte in self._reader.take("u1", more).tolist():
+            length = 256 * length + byte
+        self._reader.take("u1", length)
+
+
+def _decoded(name: bytes) -> str:
+    """A name, in which %20 stands for a space."""
+    from urllib.parse import unquote_to_bytes
+
+    return unquote_to_bytes(name).decode("utf-8", "replace")
+
+
+def _text(words: list[bytes]) -> str:
+    return b" ".join(words).decode("ascii", "replace") or "nothing"

@@ -1,0 +1,71 @@
+"""Cells as VTK's formats have them: lists of points, one after another, and a kind for each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.elements import joined
+from quasiharmonic.util.arrays import IntArray
+
+#: Kinds without area: vertices and lines, one or several, and lines of the second order.
+_LOWER = (1, 2, 3, 4, 21)
+# Kinds that are elements, and how many nodes they have; a polygon may be one.
+_ELEMENTS = {5: 3, 9: 4, 22: 6}
+_POLYGON = 7
+_NAMES = {
+    6: "triangle strip",
+    8: "pixel",
+    10: "tetrahedron",
+    12: "hexahedron",
+    13: "wedge",
+    14: "pyramid",
+    23: "second-order quadrilateral",
+}
+
+
+def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int) -> IntArray:
+    """Pick the triangles and quadrilaterals; (f, 3), (f, 4) or (f, 6) int64, as in `geometry.mesh.elements`.
+
+    Parameters
+    ----------
+    connectivity : (m,) int64
+        Points of all cells, one cell after another.
+    starts : (c + 1,) int64
+        Where each cell begins, and the end.
+    kinds : (c,) int64
+        VTK's number of each cell's kind. A polygon with three corners is a triangle, one with four a quadrilateral.
+    points : int
+        How many there are.
+
+    Raises
+    ------
+    ValueError
+        When a cell with area is none of these, six-node triangles stand beside others, or cells refer to points that
+        are not there.
+    """
+    if len(starts) != len(kinds) + 1 or (np.diff(starts) < 0).any() or starts[-1] > len(connectivity):
+        raise ValueError("its lists of cells contradict each other")
+    sizes = np.diff(starts)
+    wanted = (kinds == _POLYGON) & np.isin(sizes, (3, 4))
+    for kind, size in _ELEMENTS.items():
+        wanted |= (kinds == kind) & (sizes == size)
+    other = np.unique(kinds[~wanted & ~np.isin(kinds, _LOWER)])
+    if other.size:
+        names = (_NAMES.get(kind, "polygon" if kind == _POLYGON else f"number {kind}") for kind in other.tolist())
+        raise ValueError(
+            f"there are cells of the kind {', '.join(names)}: triangles of three or six nodes or quadrilaterals are "
+            "needed"
+        )
+    begins, sizes = starts[:-1][wanted], sizes[wanted]
+    changes = np.flatnonzero(np.diff(sizes)) + 1
+    F = joined(
+        [
+            connectivity[block[:, None] + np.arange(size[0])]
+            for block, size in zip(np.split(begins, changes), np.split(sizes, changes), strict=True)
+            if len(block)
+        ]
+    )
+    if F.size and (F.min() < 0 or F.max() >= points):
+        wrong = F.min() if F.min() < 0 else F.max()
+        raise ValueError(f"an element refers to point {wrong}, but there are {points}")
+    return F

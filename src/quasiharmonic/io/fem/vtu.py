@@ -1,0 +1,281 @@
+"""VTK's XML files of unstructured grids (.vtu): positions, triangles, and data of points.
+
+Arrays stand between their tags, as text or as base64, or behind all of them, as base64 or as they are; either may be
+compressed::
+
+    <DataArray format="ascii">0 0 0 …</DataArray>      <DataArray format="appended" offset="84"/>
+    <DataArray format="binary">AAAB…</DataArray>       <AppendedData encoding="raw">_ ▯▯▯▯▯▯▯ </AppendedData>
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import lzma
+import re
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate, pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.tables import TableReader, replaced
+from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.util.arrays import FloatArray
+
+_KINDS = {
+    **{f"Int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
+    **{f"UInt{8 * size}": f"u{size}" for size in (1, 2, 4, 8)},
+    "Float32": "f4",
+    "Float64": "f8",
+}
+_APPENDED = re.compile(rb"<AppendedData[^>]*>")
+_OFFSET = re.compile(rb"""(\soffset\s*=\s*["'])\s*(\d+)\s*(["'])""")
+_TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
+# What unpacking may take beside what is unpacked, bytes; the densest preset takes half of it.
+_LZMA_MEMORY = 128 << 20
+# From bytes to packed ones, and what takes a part of the way back.
+_Coder = tuple[Callable[[bytes], bytes], Callable[[], Any]]
+_CODERS: dict[str, _Coder] = {
+    "vtkZLibDataCompressor": (zlib.compress, zlib.decompressobj),
+    "vtkLZMADataCompressor": (lzma.compress, partial(lzma.LZMADecompressor, memlimit=_LZMA_MEMORY)),
+}
+
+
+@dataclass(frozen=True)
+class _Array:
+    """A DataArray: its attributes, where its tag begins and where its text does and ends."""
+
+    attributes: dict[str, str]
+    tag: int
+    begin: int
+    end: int
+
+
+def read_vtu(data: bytes) -> MeshParts:
+    """Take a VTU file apart.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Raises
+    ------
+    ValueError
+        When it is no such file, has several pieces or times, an encoding that is not known, or cells with area
+        other than triangles and quadrilaterals.
+    """
+    file = _VtuFile(data)
+    points = file.only("Points", None)
+    precision = points.attributes.get("type")
+    if precision not in ("Float32", "Float64") or points.attributes.get("NumberOfComponents") != "3":
+        raise ValueError(f"its positions are not three Float32 or Float64 each but {precision}")
+    place = file.values(points, 3 * file.points).reshape(-1, 3)
+    ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
+    connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
+    F = elements(connectivity, np.concatenate([[0], ends]), kinds, len(place))
+    fields = {name: partial(_rows, file, array) for name, array in file.point_data.items()}
+    kind = np.dtype(_KINDS[precision])
+    return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replaced, points))
+
+
+def _rows(file: _VtuFile, array: _Array) -> FloatArray:
+    components = int(array.attributes.get("NumberOfComponents", "1"))
+    return file.values(array, file.points * components).astype(np.float64).reshape(-1, components)
+
+
+class _VtuFile:
+    """A file taken apart at its tags."""
+
+    def __init__(self, data: bytes) -> None:
+        from xml.parsers.expat import ExpatError, ParserCreate
+
+        self._data = data
+        self._arrays: dict[tuple[str, str], list[_Array]] = {}
+        self._all: list[_Array] = []
+        self._path: list[str] = []
+        self._open: tuple[dict[str, str], int] | None = None
+        self._file: dict[str, str] = {}
+        self._pieces: list[dict[str, str]] = []
+        tag = _APPENDED.search(data)
+        # What is appended need not be XML.
+        head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
+        self._parser = ParserCreate()
+        self._parser.StartElementHandler = self._begins
+        self._parser.EndElementHandler = self._ends
+        try:
+            self._parser.Parse(head, True)
+        except ExpatError as error:
+            raise ValueError(f"it is not the XML of a VTU file: {error}") from error
+        if self._file.get("type") != "UnstructuredGrid":
+            raise ValueError("it is not a VTU file of an unstructured grid")
+        if len(self._pieces) != 1:
+            raise ValueError(f"it has {len(self._pieces)} pieces: merge them into one")
+        self.points, self.cells = (int(self._pieces[0].get(f"NumberOf{what}", "0")) for what in ("Points", "Cells"))
+        self._order = {"LittleEndian": "<", "BigEndian": ">"}.get(self._file.get("byte_order", "LittleEndian"), "<")
+        self._word = np.dtype(self._order + _KINDS[self._file.get("header_type", "UInt32")])
+        compressor = self._file.get("compressor")
+        if compressor is not None and compressor not in _CODERS:
+            raise ValueError(f"it is compressed by {compressor}: save it with ZLib or without compression")
+        self._coder = None if compressor is None else _CODERS[compressor]
+        self._appended, self._raw = -1, False
+        if tag is not None:
+            self._appended = data.index(b"_", tag.end()) + 1
+            self._raw = b'"raw"' in tag.group().replace(b"'", b'"')
+
+    @property
+    def point_data(self) -> dict[str, _Array]:
+        """Arrays at points by name; of several times the last."""
+        return {name: arrays[-1] for (parent, name), arrays in self._arrays.items() if parent == "PointData"}
+
+    def only(self, parent: str, name: str | None) -> _Array:
+        """The array of an element, by its name if it has several."""
+        found = [a for (p, n), arrays in self._arrays.items() if p == parent and name in (None, n) for a in arrays]
+        if len(found) != 1:
+            what = parent if name is None else f"{parent} called {name}"
+            raise ValueError(f"it has {len(found)} arrays of {what}: one is needed, of one time")
+        return found[0]
+
+    def values(self, array: _Array, most: int) -> NDArray[Any]:
+        """The numbers of an array, of which there may be so many."""
+        kind = _KINDS.get(array.attributes.get("type", ""))
+        if kind is None:
+            raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are no numbers")
+        if array.attributes.get("format") == "ascii":
+            text = self._data[array.begin : array.end].split()
+            return np.array(text, dtype=np.bytes_).astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)
+        number = np.dtype(self._order + kind)
+        return np.frombuffer(self._block(array, most * number.itemsize)[0], number)
+
+    def replaced(self, array: _Array, points: FloatArray) -> bytes:
+        """The file with the first two of every three numbers of an array changed."""
+        if array.attributes.get("format") == "ascii":
+            reader = TableReader(self._data, array.begin, array.end, None)
+            table = reader.tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
+            return replaced(self._data, table, points)
+        number = np.dtype(self._order + _KINDS[array.attributes["type"]])
+        block, begin, end = self._block(array, 3 * self.points * number.itemsize)
+        numbers = np.frombuffer(block, number).reshape(-1, 3).copy()
+        with np.errstate(over="ignore"):
+            numbers[:, :2] = points
+        if numbers.tobytes() == block:
+            return self._data
+        coded = self._coded(numbers.tobytes(), array)
+        whole = self._data[:begin] + coded + self._data[end:]
+        longer = len(coded) - (end - begin)
+        if not longer or array.attributes.get("format") == "binary":
+            return whole
+        # What is appended behind these numbers has moved.
+        for other in sorted(self._all, key=lambda a: -a.tag):
+            offset = int(other.attributes.get("offset", "-1"))
+            if offset + self._appended > begin:
+                tag = _OFFSET.sub(rb"\g<1>%d\g<3>" % (offset + longer), whole[other.tag : other.begin], count=1)
+                whole = whole[: other.tag] + tag + whole[other.begin :]
+        return whole
+
+    def _begins(self, name: str, attributes: dict[str, str]) -> None:
+        if name == "VTKFile":
+            self._file = attributes
+        elif name == "Piece":
+            self._pieces += [attributes] * (attributes.get("NumberOfPoints") != "0")
+        elif name in ("DataArray", "Array"):
+            self._open = attributes, self._parser.CurrentByteIndex
+        self._path.append(name)
+
+    def _ends(self, name: str) -> None:
+        self._path.pop()
+        if name in ("DataArray", "Array") and self._open is not None:
+            attributes, tag = self._open
+            begin = _tag_end(self._data, tag)
+            # What describes the array further may follow its numbers.
+            array = _Array(attributes, tag, begin, self._data.find(b"<", begin))
+            self._all.append(array)
+            self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
+            self._open = None
+
+    def _block(self, array: _Array, most: int) -> tuple[bytes, int, int]:
+        """The bytes of an array, so many at most, and where they stand in the file, coded as they are there."""
+        begin, raw = self._where(array)
+        take = _take_raw if raw else _take_base64
+        size = self._word.itemsize
+        if self._coder is None:
+            (length,) = np.frombuffer(take(self._data, begin, size)[0], self._word).tolist()
+            block, end = take(self._data, begin, size + length)
+            return block[size:], begin, end
+        (count,) = np.frombuffer(take(self._data, begin, size)[0], self._word).tolist()
+        header, at = take(self._data, begin, size * (3 + count))
+        part, last, *lengths = np.frombuffer(header, self._word)[1:].tolist()
+        sizes = [part] * (count - 1) + [last or part] * (count > 0)
+        if sum(sizes) > most:
+            raise ValueError(f"compressed data are of {sum(sizes)} bytes, and there is room for {most}")
+        packed, end = take(self._data, at, sum(lengths))
+        ends = accumulate(lengths, initial=0)
+        whole = b"".join(self._unpacked(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True))
+        return whole, begin, end
+
+    def _unpacked(self, packed: bytes, size: int) -> bytes:
+        """Bytes as they were before they were compressed to those given."""
+        assert self._coder is not None
+        coder = self._coder[1]()
+        try:
+            # One byte more would be one too many, and what it is does not matter.
+            whole: bytes = coder.decompress(packed, size + 1)
+        except (zlib.error, lzma.LZMAError, OverflowError) as error:
+            raise ValueError(f"compressed data are damaged: {error}") from error
+        if len(whole) != size or not coder.eof:
+            raise ValueError(f"compressed data are damaged: they are not the {size} bytes that they should be")
+        return whole
+
+    def _coded(self, block: bytes, array: _Array) -> bytes:
+        """Bytes coded as those of an array of the same length are in the file."""
+        begin, raw = self._where(array)
+        code: Callable[[bytes], bytes] = bytes if raw else base64.b64encode
+        if self._coder is None:
+            return code(np.array([len(block)], dtype=self._word).tobytes() + block)
+        take = _take_raw if raw else _take_base64
+        # How many parts, their size, and the last one's if it is shorter.
+        head = np.frombuffer(take(self._data, begin, 3 * self._word.itemsize)[0], self._word)
+        count, size, _ = head.tolist()
+        packed = [self._coder[0](block[i * size : (i + 1) * size]) for i in range(count)]
+        header = np.concatenate([head, np.array([len(part) for part in packed], dtype=self._word)])
+        return code(header.astype(self._word).tobytes()) + code(b"".join(packed))
+
+    def _where(self, array: _Array) -> tuple[int, bool]:
+        """Where the bytes of an array begin, and whether they are there as they are."""
+        if array.attributes.get("format") != "appended":
+            inline = self._data[array.begin : array.end]
+            return array.begin + len(inline) - len(inline.lstrip()), False
+        begin = self._appended + int(array.attributes["offset"])
+        if self._appended < 0 or begin > len(self._data):
+            raise ValueError("an array refers to what should be appended, but is not")
+        return begin, self._raw
+
+
+def _take_raw(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
+    """So many bytes, and where the next are."""
+    if begin + length > len(data):
+        raise ValueError("it ends too early")
+    return data[begin : begin + length], begin + length
+
+
+def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
+    """As `_take_raw`, of base64."""
+    end = begin + 4 * -(-length // 3)
+    try:
+        found = base64.b64decode(data[begin:end], validate=True)[:length]
+    except binascii.Error as error:
+        raise ValueError(f"what should be base64 is not: {error}") from error
+    if len(found) < length:
+        raise ValueError("it ends too early")
+    return found, end
+
+
+def _tag_end(data: bytes, tag: int) -> int:
+    """Where the text of an element begins, given where its tag does."""
+    quoted = _TAG.match(data, tag)
+    return tag if quoted is None else quoted.end()

@@ -1,0 +1,304 @@
+"""Surfaces in glTF documents: one vertex for every place at a seam, made one surface again by equal positions."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.formats.gltf import DAMAGE, Document, fault, load, whole
+from quasiharmonic.io.formats.normals import normal_lines
+from quasiharmonic.io.formats.welding import welded
+from quasiharmonic.io.meshdata import Carried, MeshData
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+PLACES = "TEXCOORD_0"
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_READ = "POSITION", "NORMAL", "COLOR_0", PLACES
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Vertices that one or several primitives share.
+
+    Attributes
+    ----------
+    attributes : dict
+        From names to accessors.
+    targets : list of dict
+        Likewise, for each morph target.
+    mesh : int
+        The mesh of which they are.
+    first, count : int
+        The number of the first among the vertices of all pools, and how many there are.
+    """
+
+    attributes: dict[str, int]
+    targets: list[dict[str, int]]
+    mesh: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A primitive: of which mesh it is, which one of it, from which pool, and its triangles' first and end."""
+
+    mesh: int
+    primitive: int
+    pool: int
+    begin: int
+    end: int
+
+
+class CarriedGltf(Carried):
+    """A glTF document and how the surface in it is made up.
+
+    Attributes
+    ----------
+    document : Document
+    folder : Path
+        Where pictures may stand that it refers to.
+    pools : list of Pool
+    parts : list of Part
+    rows : (f, 3) int64
+        For every corner its vertex among those of all pools.
+    """
+
+    def __init__(
+        self, document: Document, folder: Path, pools: list[Pool], parts: list[Part], rows: IntArray, mesh: MeshData
+    ) -> None:
+        super().__init__(mesh.V, mesh.F)
+        self.document, self.folder, self.pools, self.parts, self.rows = document, folder, pools, parts, rows
+
+    def further(self) -> list[str]:
+        tree = self.document.tree
+        found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]
+        if any(pool.targets for pool in self.pools):
+            found.append("morph targets")
+        names = sorted({name for pool in self.pools for name in pool.attributes if name not in _READ})
+        return found + [f"{name} of vertices" for name in names]
+
+
+def read_gltf(path: str | os.PathLike[str]) -> MeshData:
+    """Read the triangles of a glTF 2.0 file, binary (.glb) or JSON (.gltf).
+
+    A vertex in such a file has one place, so it is there repeatedly along seams. Here vertices of one mesh at positions
+    that are equal to the last bit are one again, and the seams are in the places. Positions are those in the scene;
+    of a mesh that is there several times the first.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file. Its buffers are in it or in its folder; nothing else is opened.
+
+    Returns
+    -------
+    MeshData
+        Triangles in the order of the file, vertices in that in which they come first. Places are ``TEXCOORD_0``
+        with v upwards, 1 - v; a vertex has the colour of the first one at its position; objects and materials are
+        statements. Its ``carried`` has all else, for `write_gltf`.
+
+    Raises
+    ------
+    MeshFileError
+        When it is no glTF 2.0 file, is damaged, compressed by an extension, or holds no triangles.
+    """
+    document = load(path)
+    try:
+        # What is beyond all numbers is told where it is found.
+        with np.errstate(over="ignore", invalid="ignore"):
+            mesh = _mesh(document, os.fspath(path))
+    except (*DAMAGE, RecursionError) as error:
+        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
+    if mesh is None:
+        raise MeshFileError(path, "holds no triangles", remedy="a surface is needed")
+    return mesh
+
+
+def _mesh(document: Document, source: str) -> MeshData | None:
+    """The surface, with what else is in the file; None where there are no triangles."""
+    pools, parts, rows, statements = _parts(document)
+    if not len(rows):
+        return None
+    points, kind = _positions(document, pools)
+    # Equal positions of one mesh.
+    V, which = welded(np.column_stack([kind, points]))
+    F = which[rows]
+    vt, known = _attribute(document, pools, PLACES, 2)
+    vt[:, 1] = 1 - vt[:, 1]
+    normals, shaded = _attribute(document, pools, "NORMAL", 3)
+    colours, coloured = _attribute(document, pools, "COLOR_0", None)
+    extra = np.full((len(V), colours.shape[1]), np.nan)
+    order = np.flatnonzero(coloured)[::-1]
+    extra[which[order]] = colours[order]
+    mesh = MeshData(
+        V[:, 1:],
+        F,
+        vt=vt if known.any() else None,
+        FT=np.where(known[rows], rows, -1) if known.any() else None,
+        extra=extra if coloured.any() else None,
+        normals=normal_lines(_turned(document, pools, normals)) if shaded.any() else b"",
+        FN=np.where(shaded[rows], rows, -1) if shaded.any() else None,
+        statements=b"".join(line for line, _ in statements),
+        statement_faces=np.array([face for _, face in statements], dtype=np.int64),
+        source=source,
+    )
+    return replace(mesh, carried=CarriedGltf(document, Path(source).parent, pools, parts, rows, mesh))
+
+
+def _parts(document: Document) -> tuple[list[Pool], list[Part], IntArray, list[tuple[bytes, int]]]:
+    """Pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
+    tree, pools, parts, known = document.tree, list[Pool](), list[Part](), dict[str, int]()
+    triangles, statements, vertices, faces = [np.empty((0, 3), dtype=np.int64)], [], 0, 0
+    for m, mesh in enumerate(tree.get("meshes", [])):
+        for p, primitive in enumerate(mesh["primitives"]):
+            attributes, targets = primitive["attributes"], primitive.get("targets", [])
+            mode = primitive.get("mode", _TRIANGLES)
+            if mode not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
+                continue
+            key = json.dumps([attributes, targets], sort_keys=True)
+            if key not in known:
+                known[key] = len(pools)
+                count = _common_count(document, [attributes, *targets])
+                pools.append(Pool(attributes, targets, m, vertices, count))
+                vertices += count
+            pool = pools[known[key]]
+            if "indices" not in primitive:
+                corners = np.arange(pool.count)
+            else:
+                corners = document.numbers(primitive["indices"])[:, 0].astype(np.int64)
+            if corners.size and corners.max() >= pool.count:
+                raise ValueError(f"mesh {m} refers to vertex {corners.max()}, but there are {pool.count}")
+            own = _triangles(corners, mode)
+            if faces + len(own) + vertices > document.size:
+                raise ValueError("its meshes repeat the same data too often")
+            parts.append(Part(m, p, known[key], faces, faces + len(own)))
+            if p == 0 and isinstance(mesh.get("name"), str):
+                statements.append((_statement("o", mesh["name"]), faces))
+            if "material" in primitive:
+                material = tree["materials"][whole(primitive["material"])]
+                # One without a name, and the only one, need not be told from others.
+                if "name" in material or len(tree["materials"]) > 1:
+                    name = str(material.get("name", primitive["material"]))
+                    statements.append((_statement("usemtl", name), faces))
+            triangles.append(pool.first + own)
+            faces += len(own)
+    return pools, parts, np.concatenate(triangles), statements
+
+
+def _common_count(document: Document, of: list[dict[str, int]]) -> int:
+    """How many vertices some attributes have, which are read, since a count may say anything."""
+    count = len(document.numbers(of[0]["POSITION"]))
+    for name, accessor in (pair for attributes in of for pair in attributes.items()):
+        if len(document.numbers(accessor)) != count:
+            raise ValueError(f"{name} has another number of vertices than POSITION")
+    return count
+
+
+def _triangles(corners: IntArray, mode: int) -> IntArray:
+    """Triangles (k, 3) of a list, a strip or a fan."""
+    if mode == _TRIANGLES:
+        if len(corners) % 3:
+            raise ValueError(f"{len(corners)} indices make no triangles")
+        return corners.reshape(-1, 3)
+    i = np.arange(max(len(corners) - 2, 0))
+    if mode == _FAN:
+        return np.stack([corners[i + 1], corners[i + 2], corners[np.zeros_like(i)]], axis=1)
+    strip = np.stack([corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]], axis=1)
+    # Strips are joined by triangles that are none.
+    return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
+
+
+def _statement(keyword: str, name: str) -> bytes:
+    # A name may hold anything, and a line of OBJ must not.
+    return f"{keyword} {' '.join(name.split()) or '-'}".encode("utf-8", "replace").replace(b"\\", b"/") + b"\n"
+
+
+def _attribute(document: Document, pools: list[Pool], name: str, width: int | None) -> tuple[FloatArray, BoolArray]:
+    """Numbers at the vertices of all pools, (v, width), and at which there are any."""
+    tables = [document.reals(pool.attributes[name]) if name in pool.attributes else None for pool in pools]
+    if width is None:
+        width = max((table.shape[1] for table in tables if table is not None), default=3)
+    total = sum(pool.count for pool in pools)
+    numbers, known = np.zeros((total, width)), np.zeros(total, dtype=np.bool_)
+    for pool, table in zip(pools, tables, strict=True):
+        if table is None:
+            continue
+        if table.shape[1] > width:
+            raise ValueError(f"{name} has {table.shape[1]} numbers a vertex")
+        rows = slice(pool.first, pool.first + pool.count)
+        numbers[rows, : table.shape[1]] = table
+        numbers[rows, table.shape[1] :] = 1.0
+        known[rows] = True
+    return numbers, known
+
+
+def _positions(document: Document, pools: list[Pool]) -> tuple[FloatArray, FloatArray]:
+    """Positions (v, 3) in the scene, and the mesh (v,) of each."""
+    points, _ = _attribute(document, pools, "POSITION", 3)
+    placed = _placements(document.tree)
+    for pool in pools:
+        if pool.mesh in placed:
+            rows = slice(pool.first, pool.first + pool.count)
+            matrix = placed[pool.mesh]
+            points[rows] = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+    return points, np.repeat([pool.mesh for pool in pools], [pool.count for pool in pools]).astype(np.float64)
+
+
+def _turned(document: Document, pools: list[Pool], normals: FloatArray) -> FloatArray:
+    """Normals (v, 3) in the scene, of unit length where they were turned."""
+    placed = _placements(document.tree)
+    for pool in pools:
+        if pool.mesh in placed:
+            rows = slice(pool.first, pool.first + pool.count)
+            linear = placed[pool.mesh][:3, :3]
+            # The matrix of cofactors: that of surface elements, whatever the matrix.
+            cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
+            turned = normals[rows] @ cofactors.T
+            length = np.linalg.norm(turned, axis=1, keepdims=True)
+            normals[rows] = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
+    return normals
+
+
+def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
+    """Where meshes are in the scene: matrices (4, 4) of those that are moved at all, each by its first node."""
+    nodes = tree.get("nodes", [])
+    scenes = tree.get("scenes", [])
+    roots = scenes[whole(tree.get("scene", 0))].get("nodes", []) if scenes else []
+    waiting = [(whole(root), np.eye(4)) for root in reversed(roots)]
+    placed: dict[int, FloatArray] = {}
+    seen = set()
+    while waiting:
+        index, above = waiting.pop()
+        if index in seen:
+            continue
+        seen.add(index)
+        node = nodes[index]
+        here = above @ _local(node)
+        if "mesh" in node:
+            # A skin says where its vertices are, and the node does not.
+            placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
+        waiting += [(whole(child), here) for child in reversed(node.get("children", []))]
+    return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
+
+
+def _local(node: dict[str, Any]) -> FloatArray:
+    """The matrix of a node."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] = np.array(rotation) * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix

@@ -1,0 +1,263 @@
+"""Wavefront OBJ, read and written such that nothing but the map changes."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.atomic import no_remains, write_whole
+from quasiharmonic.io.formats.objlines import REFUSED, read_obj_lines
+from quasiharmonic.io.materials import companions, with_libraries, write_material
+from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
+from quasiharmonic.io.textual import integer_table, number_table, read_text
+
+# Kinds of line, for the reader that takes all lines of a kind at once.
+_BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)
+# Lines that look like statements to that reader and want the careful one.
+_CAREFUL = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
+_NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _CAREFUL + rb")\s)", re.MULTILINE)
+# What a corner of each form refers to: 0 vertices, 1 texture coordinates, 2 normals.
+_FORMS = {b"1": (0,), b"1/1": (0, 1), b"1//1": (0, 2), b"1/1/1": (0, 1, 2)}
+_CHUNK = 100_000
+# How a file ends its lines shows in its first bytes.
+_HEAD = 4096
+
+
+def read_obj(path: str | os.PathLike[str]) -> MeshData:
+    """Read a mesh of triangles and other polygons from an OBJ file.
+
+    Vertices, faces and the statements between faces keep their order. Faces may refer to vertices
+    in any form (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative). Every ``v`` and ``vt`` must be
+    finite, used or not. Of ``vt`` the first two numbers are read; what stands behind the
+    coordinates of a ``v`` is kept. Normals are kept without being looked at, and so is every
+    statement that is not geometry: groups, materials, comments, and ones not known here. Blank
+    lines and comments behind data are dropped. A comment that ends in a backslash ends there;
+    other lines go on.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    MeshData
+        The mesh, numbers correctly rounded to double.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for a face of fewer than three corners or a polygon with a vertex twice, an
+        index that refers to nothing, a number that is none or not finite, free-form geometry, and
+        ``l`` or ``p`` elements whose indices are not plain (they could not be kept); for a file
+        without vertices or faces, one that is not text, or none at all.
+    """
+    data = read_text(path)
+    mesh = read_regular(path, data) or read_obj_lines(path, data)
+    with open(path, "rb") as file:
+        return replace(mesh, newline=b"\r\n" if b"\r\n" in file.read(_HEAD) else b"\n")
+
+
+def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
+    """Write a mesh as an OBJ file, whole or not at all.
+
+    Numbers are written such that reading them gives the same double. A material library (``mtllib``) is named such
+    that it is found from the new file where it was found from the old one. With a texture there are two files more,
+    a library and a picture (`quasiharmonic.io.materials.companions`).
+
+    Parameters
+    ----------
+    path : str or path-like
+        Where to.
+    mesh : MeshData
+        What to write: statements before the first vertex, then vertices, texture coordinates,
+        normals, and the faces with the other statements in between where they were.
+    durable : bool
+        As for `write_whole`.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written; the old file is then untouched.
+    """
+    beside = () if mesh.texture is None else companions(path, mesh.texture)
+    with no_remains(*beside):
+        if mesh.texture is not None:
+            mesh = write_material(path, mesh, durable=durable)
+        mesh = with_libraries(path, mesh)
+        pieces = (piece.replace(b"\n", mesh.newline) for piece in _pieces(mesh))
+        write_whole(path, lambda file: file.writelines(pieces), durable=durable)
+
+
+def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
+    """Read a file whose lines of one kind all have one form; None when it is not so."""
+    lines = data.count(b"\n")
+    # Shorter lines than any vertex or face has would cost more memory than the file is worth.
+    if not lines or 4 * lines > len(data) or b"\\\n" in data:
+        return None
+    ends, kinds = _classify(data)
+    counts = np.bincount(kinds, minlength=6)
+    if not (counts[_VERTEX] and counts[_FACE]):
+        return None
+    statements = _lines_of(_STATEMENT, data, ends, kinds)
+    if _NOT_PLAIN.search(statements):
+        return None
+    positions = _lines_of(_VERTEX, data, ends, kinds)
+    rows = number_table(positions, b"v", int(counts[_VERTEX]))
+    if rows is None or rows.shape[1] < 3:
+        return None
+    vt, places = None, b""
+    if counts[_TEXTURE]:
+        places = _lines_of(_TEXTURE, data, ends, kinds)
+        vt = number_table(places, b"vt", int(counts[_TEXTURE]))
+        if vt is None or not 2 <= vt.shape[1] <= 3:
+            return None
+    parts = _regular_faces(_lines_of(_FACE, data, ends, kinds), counts)
+    if parts is None:
+        return None
+    before = np.cumsum(kinds == _FACE)
+    before[: int(np.argmax((kinds > _BLANK) & (kinds < _STATEMENT)))] = -1
+    flat = {part: indices.ravel() for part, indices in parts.items()}
+    return polygon_mesh(
+        np.ascontiguousarray(rows[:, :3]),
+        flat[0],
+        parts[0].shape[1] * np.arange(len(parts[0]) + 1),
+        places=flat.get(1),
+        normal_lines=flat.get(2),
+        vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
+        extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
+        lines=KeptLines(positions, rows),
+        map_lines=None if vt is None else KeptLines(places, vt[:, :2]),
+        normals=_lines_of(_NORMAL, data, ends, kinds),
+        statements=statements,
+        statement_faces=before[kinds == _STATEMENT],
+        source=os.fspath(path),
+    )
+
+
+def _classify(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
+    """Find the end of every line, counting its newline, and its kind by its first letters."""
+    text = np.frombuffer(data, dtype=np.uint8)
+    ends = np.flatnonzero(text == ord("\n")) + 1
+    starts = np.concatenate(([0], ends[:-1]))
+    # A line may be shorter than three letters, but these are then not asked for.
+    first, second, third = (text.take(starts + i, mode="clip") for i in range(3))
+
+    def blank(letter: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        return (letter == ord(" ")) | (letter == ord("\t"))
+
+    kinds = np.full(ends.size, _STATEMENT, dtype=np.int8)
+    kinds[first == ord("\n")] = _BLANK
+    kinds[(first == ord("f")) & blank(second)] = _FACE
+    kinds[(first == ord("v")) & blank(second)] = _VERTEX
+    kinds[(first == ord("v")) & (second == ord("t")) & blank(third)] = _TEXTURE
+    kinds[(first == ord("v")) & (second == ord("n")) & blank(third)] = _NORMAL
+    return ends, kinds
+
+
+def _lines_of(kind: int, data: bytes, ends: NDArray[np.int64], kinds: NDArray[np.int8]) -> bytes:
+    """Return all lines of one kind, one after another."""
+    member = np.concatenate(([False], kinds == kind, [False]))
+    change = np.flatnonzero(member[1:] != member[:-1])
+    cuts = np.concatenate(([0], ends))[change].tolist()
+    return b"".join([data[start:end] for start, end in zip(cuts[::2], cuts[1::2], strict=True)])
+
+
+def _regular_faces(block: bytes, counts: NDArray[np.int64]) -> dict[int, NDArray[np.int64]] | None:
+    """Return the indices (p, k) of faces with k corners each, by what they refer to (see `_FORMS`)."""
+    # No more of a line is taken apart than the longest regular face has, twelve indices.
+    first = re.sub(rb"[0-9]+", b"1", block[: min(block.index(b"\n"), 250)]).split()
+    corners = first[1:]
+    if len(corners) not in (3, 4) or corners[0] not in _FORMS or len(set(corners)) > 1:
+        return None
+    table = integer_table(block, b" ".join(first) + b"\n", int(counts[_FACE]))
+    if table is None:
+        return None
+    referred = _FORMS[corners[0]]
+    parts = {}
+    for column, part in enumerate(referred):
+        indices = table[:, column :: len(referred)] - 1
+        if indices.min() < 0 or indices.max() >= counts[(_VERTEX, _TEXTURE, _NORMAL)[part]]:
+            return None
+        parts[part] = indices
+    ring = np.sort(parts[0], axis=1)
+    # Polygons with a vertex twice are refused with their line.
+    return None if len(corners) > 3 and (ring[:, 1:] == ring[:, :-1]).any() else parts
+
+
+def _pieces(mesh: MeshData) -> Iterator[bytes]:
+    """Yield the contents of the file to write."""
+    at = np.concatenate((mesh.statement_faces, [mesh.faces]))
+    statements = mesh.statements.split(b"\n")
+    head = int(np.count_nonzero(at < 0))
+    yield b"".join(line + b"\n" for line in statements[:head])
+    rows = mesh.V if mesh.extra is None else np.hstack([mesh.V, mesh.extra])
+    yield from _lines("v", mesh.lines, rows)
+    if mesh.vt is not None:
+        yield from _lines("vt", mesh.map_lines, mesh.vt)
+    yield mesh.normals
+    corners = _corner_texts(mesh)
+    starts = 3 * np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.starts
+    begin = 0
+    for end, line in zip(at[head:].tolist(), [*statements[head:-1], b""], strict=True):
+        for first in range(begin, end, _CHUNK):
+            bounds = starts[first : min(first + _CHUNK, end) + 1]
+            forms = ["f" + " %s" * size + "\n" for size in np.diff(bounds).tolist()]
+            yield ("".join(forms) % tuple(corners[bounds[0] : bounds[-1]])).encode()
+        begin = end
+        yield line + b"\n" if line else b""
+
+
+def _lines(keyword: str, kept: KeptLines | None, rows: NDArray[np.float64]) -> Iterator[bytes]:
+    """Rows of numbers, as they stood where they still say what they said."""
+    same = np.zeros(len(rows), dtype=np.bool_) if kept is None else kept.unchanged(rows)
+    if kept is None or not same.any():
+        yield from _number_lines(keyword, rows)
+        return
+    texts = kept.text.split(b"\n")
+    # In runs of what stays and what does not.
+    ends = [*(np.flatnonzero(same[1:] != same[:-1]) + 1).tolist(), len(rows)]
+    begin = 0
+    for end in ends:
+        if same[begin]:
+            yield b"\n".join([*texts[begin:end], b""])
+        else:
+            yield from _number_lines(keyword, rows[begin:end])
+        begin = end
+
+
+def _number_lines(keyword: str, rows: NDArray[np.float64]) -> Iterator[bytes]:
+    if np.isnan(rows).any():
+        for row in rows.tolist():
+            yield (keyword + "".join(f" {x!r}" for x in row if not math.isnan(x)) + "\n").encode()
+        return
+    form = keyword + " %r" * rows.shape[1] + "\n"
+    for start in range(0, len(rows), _CHUNK):
+        part = rows[start : start + _CHUNK]
+        # repr() is the shortest text that reads back as the same double.
+        yield (form * len(part) % tuple(part.ravel().tolist())).encode()
+
+
+def _corner_texts(mesh: MeshData) -> list[str]:
+    """Text of every corner of every face, one after another."""
+    ring = slice(None) if mesh.polygons is None else mesh.polygons.corners
+    parts = [None if part is None else part.ravel()[ring] for part in (mesh.F, mesh.FT, mesh.FN)]
+    F, FT, FN = parts
+    assert F is not None
+    if FN is None and (FT is None or np.array_equal(F, FT)):
+        # Each vertex always looks the same: made once and looked up.
+        texts = [f"{i}" if FT is None else f"{i}/{i}" for i in range(1, len(mesh.V) + 1)]
+        return list(map(texts.__getitem__, F.tolist()))
+    absent = [-1] * F.size
+    columns = [absent if part is None else part.tolist() for part in parts]
+    texts = []
+    for a, b, c in zip(*columns, strict=True):
+        place = str(b + 1) if b >= 0 else ""
+        texts.append(f"{a + 1}/{place}/{c + 1}" if c >= 0 else f"{a + 1}/{place}" if place else f"{a + 1}")
+    return texts

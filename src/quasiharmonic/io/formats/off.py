@@ -1,0 +1,165 @@
+"""OFF, the Object File Format of Geomview, as far as surfaces go."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from array import array
+from collections.abc import Iterator
+
+import numpy as np
+
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.meshdata import MeshData, polygon_mesh
+from quasiharmonic.io.textual import integer, integer_table, number, number_table, read_text, shown
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Texture coordinates, colours and normals stand behind the coordinates, so they can be passed over.
+_HEADER = re.compile(rb"(?:ST)?C?N?OFF")
+# A polygon of more is no polygon but a fault.
+_MOST_CORNERS = 1000
+
+
+def read_off(path: str | os.PathLike[str]) -> MeshData:
+    """Read a mesh of triangles and other polygons from an OFF file.
+
+    The counts may share the line of the header. Comments, and what stands behind the coordinates of
+    a vertex or the corners of a face (colours, normals), are ignored.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    MeshData
+        Vertices and faces in the order of the file, numbers correctly rounded to double.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for a face of fewer than three corners or a polygon with a vertex twice, an
+        index that refers to nothing, a number that is none or not finite, counts that the file does
+        not keep; for another kind of OFF (binary, four-dimensional), a file that is not text, or none at all.
+    """
+    data = read_text(path)
+    lines = _content(data)
+    line, text = next(lines, (1, b""))
+    header, *counts = text.split(None, 3) or [b""]
+    if not _HEADER.fullmatch(header):
+        raise MeshFileError(path, f"{shown(text)} and not OFF", line, "only the plain text form is read")
+    if not counts:
+        line, text = next(lines, (line, b""))
+        counts = text.split(None, 2)
+    if len(counts) < 2:
+        raise MeshFileError(path, "no counts of vertices and faces", line)
+    try:
+        vertices, faces = integer(counts[0]), integer(counts[1])
+    except ValueError as error:
+        raise MeshFileError(path, f"no counts of vertices and faces: {error}", line) from None
+    if vertices < 1 or faces < 1:
+        what = f"holds {vertices} vertices and {faces} faces"
+        raise MeshFileError(path, what, line, "a surface is needed")
+    arrays = read_regular(data, line, vertices, faces) or _read_lines(path, lines, vertices, faces)
+    return polygon_mesh(*arrays, source=os.fspath(path))
+
+
+def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write a mesh as an OFF file, whole or not at all.
+
+    Numbers are written such that reading them gives the same double.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Where to.
+    mesh : MeshData
+        What to write; OFF takes its vertices and faces.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written; the old file is then untouched.
+    """
+    head = f"OFF\n{len(mesh.V)} {mesh.faces} 0\n"
+    points = "%r %r %r\n" * len(mesh.V) % tuple(mesh.V.ravel().tolist())
+    if mesh.polygons is None:
+        faces = "3 %d %d %d\n" * len(mesh.F) % tuple(mesh.F.ravel().tolist())
+    else:
+        forms = [f"{size}" + " %d" * size + "\n" for size in mesh.polygons.sizes.tolist()]
+        faces = "".join(forms) % tuple(mesh.F.ravel()[mesh.polygons.corners].tolist())
+    write_whole(path, (head + points + faces).encode())
+
+
+def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray, IntArray] | None:
+    """Read triangles that follow ``line`` when it is all of one form; None when it is not."""
+    if data.count(b"\n") != line + vertices + faces:
+        return None
+    ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
+    first, middle = int(ends[line - 1]), int(ends[line + vertices - 1])
+    V = number_table(data[first:middle], b"", vertices)
+    F = integer_table(data[middle:], b"1 1 1 1\n", faces)
+    if V is None or V.shape[1] < 3 or F is None or np.any(F[:, 0] != 3) or F.max() >= vertices:
+        return None
+    return np.ascontiguousarray(V[:, :3]), F[:, 1:].ravel(), 3 * np.arange(faces + 1)
+
+
+def _read_lines(
+    path: str | os.PathLike[str], lines: Iterator[tuple[int, bytes]], vertices: int, faces: int
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Read vertices and faces line by line: positions, corners ring after ring, where rings begin."""
+    # Never sized by the counts, which may say anything.
+    V, corners, starts = array("d"), array("q"), array("q", [0])
+    line = 0
+    for line, text in lines:
+        try:
+            if len(V) < 3 * vertices:
+                tokens = text.split(None, 3)[:3]
+                if len(tokens) < 3:
+                    raise MeshFileError(path, "a vertex with fewer than three coordinates", line)
+                V.extend([number(token) for token in tokens])
+                continue
+            if len(starts) == faces + 1:
+                raise MeshFileError(path, f"more follows the {faces} faces", line, "correct the counts")
+            corners.extend(_ring(path, line, text, vertices))
+            starts.append(len(corners))
+        except MeshFileError:
+            raise
+        except ValueError as error:
+            raise MeshFileError(path, str(error), line) from None
+    if len(starts) <= faces:
+        have = f"{len(V) // 3} of {vertices} vertices and {len(starts) - 1} of {faces} faces"
+        raise MeshFileError(path, f"ends after {have}", remedy="it was cut off, or its counts are wrong")
+    return (
+        np.array(V, dtype=np.float64).reshape(-1, 3),
+        np.array(corners, dtype=np.int64),
+        np.array(starts, dtype=np.int64),
+    )
+
+
+def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -> list[int]:
+    """The corners of the face on a line."""
+    count, *rest = text.split(None, _MOST_CORNERS + 1)
+    size = integer(count)
+    if not 3 <= size <= _MOST_CORNERS:
+        remedy = "a triangle has 3" if size < 3 else "triangulate it first"
+        raise MeshFileError(path, f"face with {size} corners", line, remedy)
+    if len(rest) < size:
+        raise MeshFileError(path, f"face of {size} corners with {len(rest)} of them", line)
+    ring = [integer(corner) for corner in rest[:size]]
+    beyond = next((index for index in ring if not 0 <= index < vertices), None)
+    if beyond is not None:
+        raise MeshFileError(path, f"index {beyond}, but the file has {vertices} vertices", line, "OFF counts from 0")
+    if size > 3 and len(set(ring)) < size:
+        raise MeshFileError(path, f"face with {size} corners that uses a vertex twice", line, "remove the repetition")
+    return ring
+
+
+def _content(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Lines that say something, without comments, each with its number."""
+    for line, raw in enumerate(io.BytesIO(data), 1):
+        if text := raw.split(b"#", 1)[0].strip():
+            yield line, text

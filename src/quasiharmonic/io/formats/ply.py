@@ -1,0 +1,279 @@
+"""PLY, the polygon file format: positions and places in double precision, polygons, seams, and all else in it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.formats.normals import normal_lines, normal_rows
+from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, decoded, encoded
+from quasiharmonic.io.meshdata import Carried, MeshData, polygon_mesh, vertex_places
+from quasiharmonic.io.textual import read_bytes
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# What programs call places, at vertices and at the corners of faces.
+_PLACES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
+_CORNER_PLACES = "texcoord"
+_RINGS = "vertex_indices", "vertex_index"
+_COLOUR = "red", "green", "blue", "alpha"
+_NORMAL = "nx", "ny", "nz"
+
+
+class CarriedPly(Carried):
+    """The tables of a PLY file.
+
+    Parameters
+    ----------
+    tables : PlyTables
+    V, F
+        As for `Carried`.
+    """
+
+    def __init__(self, tables: PlyTables, V: FloatArray, F: IntArray) -> None:
+        super().__init__(V, F)
+        self.tables = tables
+
+    def further(self) -> list[str]:
+        read = {
+            *("x", "y", "z"),
+            *_COLOUR,
+            *_NORMAL,
+            *_RINGS,
+            _CORNER_PLACES,
+            *(name for pair in _PLACES for name in pair),
+        }
+        return [
+            f"{column.name} of {element.name}"
+            for element in self.tables.elements
+            for column in element.columns
+            if element.name not in ("vertex", "face") or column.name not in read
+        ]
+
+
+def read_ply(path: str | os.PathLike[str]) -> MeshData:
+    """Read a mesh of triangles and other polygons from a PLY file, text or binary.
+
+    Places are read from the faces' ``texcoord`` (a pair for each corner, so that there can be seams), else from the
+    vertices' ``s`` and ``t``, ``u`` and ``v``, or ``texture_u`` and ``texture_v``.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    MeshData
+        Vertices and faces in the order of the file. Its ``carried`` has all else, for `write_ply`.
+
+    Raises
+    ------
+    MeshFileError
+        When it is no PLY file, is damaged, or holds no faces.
+    """
+    data = read_bytes(path)
+    try:
+        # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+        with np.errstate(invalid="ignore"):
+            return _mesh(decoded(data), os.fspath(path))
+    except ValueError as error:
+        raise MeshFileError(path, str(error), remedy="" if data else "it is empty") from error
+
+
+def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write a mesh as a binary PLY file, whole or not at all.
+
+    Positions and places are doubles. Places are the vertices' ``s`` and ``t`` where each has one, and the faces'
+    ``texcoord`` where there are seams or faces without. A mesh that was read from a PLY file keeps all else
+    that was in it, its positions as they were; another one its normals and colours, as far as vertices have one each.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Where to.
+    mesh : MeshData
+        What to write.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written; the old file is then untouched.
+    """
+    carried = mesh.carried
+    if isinstance(carried, CarriedPly) and carried.fits(mesh):
+        tables = carried.tables
+    else:
+        tables = PlyTables((_vertices(mesh), _faces(mesh)))
+    write_whole(path, encoded(_with_places(tables, mesh)))
+
+
+def not_in_ply(mesh: MeshData) -> list[str]:
+    """What a mesh has that a PLY file written of it will not have."""
+    if isinstance(mesh.carried, CarriedPly) and mesh.carried.fits(mesh):
+        return []
+    lost = [] if mesh.carried is None else [*mesh.carried.further()]
+    if mesh.statements.strip():
+        lost.append("groups, names of materials and other statements")
+    if mesh.extra is not None and _colours(mesh) is None:
+        lost.append("what stands behind the coordinates of some vertices, or is no colour")
+    if mesh.FN is not None and _normals(mesh) is None:
+        lost.append("normals, of which a vertex has several")
+    return lost
+
+
+def _mesh(tables: PlyTables, source: str) -> MeshData:
+    vertex, face = tables.find("vertex"), tables.find("face")
+    if vertex is None or not vertex.rows:
+        raise ValueError("holds no vertices")
+    ring = None if face is None else face.find(*_RINGS)
+    if face is None or not face.rows or ring is None or ring.sizes is None:
+        raise ValueError("holds no faces")
+    V = _table(vertex, "x", "y", "z")
+    if V is None:
+        raise ValueError("its vertices lack x, y or z")
+    corners = ring.values.astype(np.int64)
+    starts = np.concatenate([[0], np.cumsum(ring.sizes)])
+    vt, places = _read_places(vertex, face, corners, ring.sizes)
+    normals = _table(vertex, *_NORMAL)
+    mesh = polygon_mesh(
+        V,
+        corners,
+        starts,
+        places=places,
+        vt=vt,
+        extra=_read_colours(vertex),
+        normals=b"" if normals is None else normal_lines(normals),
+        normal_lines=None if normals is None else corners,
+        source=source,
+    )
+    return replace(mesh, carried=CarriedPly(tables, mesh.V, mesh.F))
+
+
+def _table(element: Element, *names: str) -> FloatArray | None:
+    """Columns of numbers side by side; None where one is not there."""
+    found = [element.find(name) for name in names]
+    columns = [column.values.astype(np.float64) for column in found if column is not None and column.sizes is None]
+    return np.stack(columns, axis=1) if len(columns) == len(names) else None
+
+
+def _read_colours(vertex: Element) -> FloatArray | None:
+    """Red, green, blue and perhaps opacity of vertices, 0 to 1."""
+    found = [column for name in _COLOUR if (column := vertex.find(name)) is not None and column.sizes is None]
+    if [column.name for column in found] not in (list(_COLOUR), list(_COLOUR[:3])):
+        return None
+    whole = [np.iinfo(c.values.dtype).max if c.values.dtype.kind in "iu" else 1 for c in found]
+    return np.stack([c.values / one for c, one in zip(found, whole, strict=True)], axis=1)
+
+
+def _read_places(
+    vertex: Element, face: Element, corners: IntArray, sizes: IntArray
+) -> tuple[FloatArray | None, IntArray | None]:
+    """Places, and for every corner of every face its row of them or -1; None where there are none."""
+    of_faces = face.find(_CORNER_PLACES)
+    if of_faces is not None and of_faces.sizes is not None:
+        odd = np.flatnonzero((of_faces.sizes != 2 * sizes) & (of_faces.sizes != 0))
+        if odd.size:
+            raise ValueError(
+                f"face {odd[0]} (0-based) has {of_faces.sizes[odd[0]]} numbers of {_CORNER_PLACES} "
+                f"and {sizes[odd[0]]} corners"
+            )
+        has = np.repeat(of_faces.sizes > 0, sizes)
+        # A row for each vertex and place of it.
+        pairs = np.column_stack([corners[has], of_faces.values.astype(np.float64).reshape(-1, 2) + 0.0])
+        rows, which = np.unique(pairs, axis=0, return_inverse=True)
+        places = np.full(len(corners), -1)
+        places[has] = which.ravel()
+        return (rows[:, 1:], places) if has.any() else (None, None)
+    for names in _PLACES:
+        vt = _table(vertex, *names)
+        if vt is not None:
+            return vt, corners
+    return None, None
+
+
+def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
+    """The tables with other places."""
+    elements = []
+    vt, seam = vertex_places(mesh)
+    scattered = bool(seam.any()) or (mesh.FT is not None and bool((mesh.FT < 0).any()))
+    for element in tables.elements:
+        columns = list(element.columns)
+        if element.name == "vertex":
+            old = {name for names in _PLACES for name in names if _table(element, *names) is not None}
+            columns = [column for column in columns if column.name not in old]
+            if mesh.FT is not None and not scattered:
+                # Vertices that no face uses have none, which no reader would understand.
+                columns += [Column(name, np.nan_to_num(vt[:, i])) for i, name in enumerate(_PLACES[0])]
+        elif element.name == "face":
+            columns = [column for column in columns if column.name != _CORNER_PLACES]
+            if scattered:
+                columns.append(_corner_places(mesh))
+        elements.append(replace(element, columns=tuple(columns)))
+    return replace(tables, elements=tuple(elements))
+
+
+def _corner_places(mesh: MeshData) -> Column:
+    """A pair for each corner of the faces that have places."""
+    assert mesh.FT is not None
+    assert mesh.vt is not None
+    ring, sizes = _rings(mesh)
+    at = mesh.FT.ravel()[ring]
+    face = np.repeat(np.arange(len(sizes)), sizes)
+    bare = np.unique(face[at < 0])
+    given = ~np.isin(face, bare)
+    count = 2 * sizes
+    count[bare] = 0
+    return Column(_CORNER_PLACES, mesh.vt[at[given]].ravel(), count)
+
+
+def _rings(mesh: MeshData) -> tuple[IntArray, IntArray]:
+    """The corners of faces, as indices into the flattened triangles, and how many each has."""
+    if mesh.polygons is None:
+        return np.arange(mesh.F.size), np.full(len(mesh.F), 3)
+    return mesh.polygons.corners, mesh.polygons.sizes
+
+
+def _vertices(mesh: MeshData) -> Element:
+    """The table of the vertices of a mesh that is from no PLY file."""
+    names = ["x", "y", "z"]
+    tables: list[NDArray[Any]] = [mesh.V]
+    normals, colours = _normals(mesh), _colours(mesh)
+    if normals is not None:
+        names += _NORMAL
+        tables.append(normals)
+    if colours is not None:
+        names += _COLOUR[: colours.shape[1]]
+        tables.append(colours)
+    columns = [column for table in tables for column in np.ascontiguousarray(table.T)]
+    return Element("vertex", len(mesh.V), tuple(Column(*pair) for pair in zip(names, columns, strict=True)))
+
+
+def _faces(mesh: MeshData) -> Element:
+    """The table of the faces of a mesh that is from no PLY file."""
+    ring, sizes = _rings(mesh)
+    return Element("face", len(sizes), (Column(_RINGS[0], mesh.F.ravel()[ring].astype(np.int32), sizes),))
+
+
+def _colours(mesh: MeshData) -> NDArray[Any] | None:
+    """Colours of vertices, as bytes where they are such; None where they have none or not all."""
+    extra = mesh.extra
+    if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
+        return None
+    in_bytes = np.rint(255 * extra)
+    return in_bytes.astype(np.uint8) if (in_bytes / 255 == extra).all() else extra.astype(np.float32)
+
+
+def _normals(mesh: MeshData) -> FloatArray | None:
+    """The normal of every vertex; None where one has several or none."""
+    rows = None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)
+    if rows is None or mesh.FN is None:
+        return None
+    own = np.zeros((len(mesh.V), 3))
+    own[mesh.F] = rows[mesh.FN]
+    return own if (own[mesh.F] == rows[mesh.FN]).all() else None

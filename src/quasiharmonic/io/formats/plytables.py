@@ -1,0 +1,322 @@
+"""PLY files as tables: elements with rows of numbers and of lists of numbers."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.textual import shown
+from quasiharmonic.util.arrays import IntArray
+
+_KINDS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_WORDS = {kind: word for word, kind in reversed(_KINDS.items())}
+_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
+_FIRST = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """What all rows of an element have under one name.
+
+    Attributes
+    ----------
+    name : str
+    values : (k,) array
+        The numbers, of the type that they have in the file; of lists one after another.
+    sizes : (r,) int64 or None
+        How long each row's list is; None where a row has one number.
+    """
+
+    name: str
+    values: NDArray[Any]
+    sizes: IntArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """A table: its name, how many rows it has, and its columns in their order."""
+
+    name: str
+    rows: int
+    columns: tuple[Column, ...]
+
+    def find(self, *names: str) -> Column | None:
+        """The first column that has one of some names."""
+        return next((column for column in self.columns if column.name in names), None)
+
+
+@dataclass(frozen=True, eq=False)
+class PlyTables:
+    """All tables of a file, and the lines of its header that tell something else."""
+
+    elements: tuple[Element, ...]
+    remarks: tuple[bytes, ...] = ()
+
+    def find(self, name: str) -> Element | None:
+        """The element of some name."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+@dataclass(frozen=True)
+class _Property:
+    """A column as the header declares it: the types of its numbers and, if these are lists, of their lengths."""
+
+    name: str
+    kind: str
+    count: str | None
+
+
+def decoded(data: bytes) -> PlyTables:
+    """Take a PLY file apart, be it text or binary.
+
+    Raises
+    ------
+    ValueError
+        When it is none, is damaged, or ends too early. No more memory is taken than a few times the file's.
+    """
+    first = _FIRST.match(data)
+    if first is None:
+        raise ValueError("does not begin as a PLY file")
+    newline = first.group(1)
+    ending = re.compile(rb"end_header[ \t]*" + newline).search(data)
+    if ending is None:
+        raise ValueError("its header has no end")
+    order, declared, remarks = _header(data[first.end() : ending.start()].split(newline))
+    reader = _TextReader(data[ending.end() :]) if order == "" else _BinaryReader(data, ending.end(), order)
+    return PlyTables(tuple(Element(name, rows, reader.columns(rows, of)) for name, rows, of in declared), remarks)
+
+
+def encoded(tables: PlyTables) -> bytes:
+    """The bytes of a PLY file, binary and little-endian."""
+    lines = [b"ply", b"format binary_little_endian 1.0", *tables.remarks]
+    for element in tables.elements:
+        lines.append(f"element {element.name} {element.rows}".encode())
+        for column in element.columns:
+            word = _WORDS[column.values.dtype.str[1:]]
+            form = word if column.sizes is None else f"list {_WORDS[_count_kind(column.sizes)]} {word}"
+            lines.append(f"property {form} {column.name}".encode())
+    head = b"\n".join([*lines, b"end_header\n"])
+    return head + b"".join(_rows(element) for element in tables.elements)
+
+
+def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Property]]], tuple[bytes, ...]]:
+    """Byte order (none of a text), the elements and their properties, and other lines."""
+    order: str | None = None
+    declared: list[tuple[str, int, list[_Property]]] = []
+    remarks = []
+    for line in lines:
+        match line.split():
+            case []:
+                continue
+            case [b"format", form, _] if form in _ORDERS:
+                order = _ORDERS[form]
+            case [b"comment" | b"obj_info", *_]:
+                remarks.append(line)
+            case [b"element", name, rows] if rows.isdigit() and len(rows) < 19:
+                declared.append((name.decode("ascii", "replace"), int(rows), []))
+            case [b"property", *form, name] if declared and len(form) in (1, 3):
+                kinds = [_KINDS.get(word.decode("ascii", "replace")) for word in form[-2:]]
+                if None in kinds or (len(form) == 3 and (form[0] != b"list" or str(kinds[0])[0] == "f")):
+                    raise ValueError(f"its header has {shown(line)}")
+                count = kinds[0] if len(form) == 3 else None
+                declared[-1][2].append(_Property(name.decode("ascii", "replace"), str(kinds[-1]), count))
+            case _:
+                raise ValueError(f"its header has {shown(line)}")
+    if order is None:
+        raise ValueError("its header names no format that is known")
+    for element, many, of in declared:
+        if many and not of:
+            raise ValueError(f"element {element!r} has no properties")
+        if len({property_.name for property_ in of}) < len(of):
+            raise ValueError(f"element {element!r} has two properties of one name")
+    return order, declared, tuple(remarks)
+
+
+class _BinaryReader:
+    """Tables of bytes."""
+
+    def __init__(self, data: bytes, at: int, order: str) -> None:
+        self._data, self._at, self._order = data, at, order
+
+    def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+        """The next table."""
+        return self._alike(rows, properties) or self._one_by_one(rows, properties)
+
+    def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
+        """The next table if its lists are all as long as those of its first row."""
+        sizes = self._first_sizes(properties) if rows else [0] * len(properties)
+        fields: list[Any] = []
+        for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
+            if of.count is not None:
+                fields.append((f"n{i}", self._order + of.count))
+            fields.append((f"v{i}", self._order + of.kind, () if of.count is None else (size,)))
+        dtype = np.dtype(fields)
+        if rows * dtype.itemsize > len(self._data) - self._at:
+            if any(of.count is not None for of in properties):
+                return None
+            raise ValueError("it ends too early")
+        table = np.frombuffer(self._data, dtype, count=rows, offset=self._at)
+        columns = []
+        for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
+            if of.count is not None and (table[f"n{i}"] != size).any():
+                return None
+            lists = None if of.count is None else np.full(rows, size)
+            columns.append(Column(of.name, table[f"v{i}"].astype(of.kind).ravel(), lists))
+        self._at += rows * dtype.itemsize
+        return tuple(columns)
+
+    def _first_sizes(self, properties: list[_Property]) -> list[int]:
+        """How long each list of the next row is."""
+        at, sizes = self._at, []
+        for of in properties:
+            size, at = self._size(of, at)
+            at += (1 if of.count is None else size) * np.dtype(of.kind).itemsize
+            sizes.append(size)
+        return sizes
+
+    def _size(self, of: _Property, at: int) -> tuple[int, int]:
+        """How long the list at a place is, and where its numbers begin."""
+        if of.count is None:
+            return 0, at
+        width = np.dtype(of.count).itemsize
+        if at + width > len(self._data):
+            raise ValueError("it ends too early")
+        size = int.from_bytes(
+            self._data[at : at + width], "little" if self._order == "<" else "big", signed=of.count[0] == "i"
+        )
+        if size < 0 or size > len(self._data):
+            raise ValueError(f"it has a list of {size} numbers")
+        return size, at + width
+
+    def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+        """The next table, row by row."""
+        parts: list[list[bytes]] = [[] for _ in properties]
+        sizes: list[list[int]] = [[] for _ in properties]
+        widths = [np.dtype(of.kind).itemsize for of in properties]
+        at, end = self._at, len(self._data)
+        for _ in range(rows):
+            for i, of in enumerate(properties):
+                size, at = self._size(of, at)
+                begin, at = at, at + (1 if of.count is None else size) * widths[i]
+                if at > end:
+                    raise ValueError("it ends too early")
+                parts[i].append(self._data[begin:at])
+                sizes[i].append(size)
+        self._at = at
+        return tuple(
+            Column(
+                of.name,
+                np.frombuffer(b"".join(parts[i]), self._order + of.kind).astype(of.kind),
+                None if of.count is None else np.array(sizes[i], dtype=np.int64),
+            )
+            for i, of in enumerate(properties)
+        )
+
+
+class _TextReader:
+    """Tables of text."""
+
+    def __init__(self, text: bytes) -> None:
+        if b"_" in text:
+            raise ValueError("it has an underscore where numbers should be")
+        self._numbers = np.array(list(map(float, text.split())), dtype=np.float64)
+        self._at = 0
+
+    def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+        """The next table."""
+        if all(of.count is None for of in properties):
+            table = self._take(rows * len(properties)).reshape(rows, -1)
+            return tuple(Column(of.name, _typed(table[:, i], of.kind)) for i, of in enumerate(properties))
+        return self._alike(rows, properties) or self._one_by_one(rows, properties)
+
+    def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
+        """The next table if it has one column, of lists that are all as long as the first."""
+        if not rows or len(properties) > 1 or self._at == len(self._numbers):
+            return None
+        (of,), size = properties, self._numbers[self._at]
+        table = self._numbers[self._at : self._at + rows * (int(size) + 1)] if 0 <= size < len(self._numbers) else None
+        if table is None or table.size < rows * (int(size) + 1) or (table[:: int(size) + 1] != size).any():
+            return None
+        self._at += table.size
+        lists = table.reshape(rows, -1)
+        return (Column(of.name, _typed(lists[:, 1:].ravel(), of.kind), _typed(lists[:, 0], "i4").astype(np.int64)),)
+
+    def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+        """The next table, row by row."""
+        parts: list[list[NDArray[np.float64]]] = [[] for _ in properties]
+        sizes: list[list[int]] = [[] for _ in properties]
+        for _ in range(rows):
+            for i, of in enumerate(properties):
+                size = 1
+                if of.count is not None:
+                    size = int(_typed(self._take(1), of.count)[0])
+                    if size < 0:
+                        raise ValueError(f"it has a list of {size} numbers")
+                parts[i].append(self._take(size))
+                sizes[i].append(size)
+        return tuple(
+            Column(
+                of.name,
+                _typed(np.concatenate([np.empty(0), *parts[i]]), of.kind),
+                None if of.count is None else np.array(sizes[i], dtype=np.int64),
+            )
+            for i, of in enumerate(properties)
+        )
+
+    def _take(self, count: int) -> NDArray[np.float64]:
+        """The next numbers."""
+        if self._at + count > len(self._numbers):
+            raise ValueError("it ends too early")
+        self._at += count
+        return self._numbers[self._at - count : self._at]
+
+
+def _typed(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:
+    """Numbers of a text as what the header says they are."""
+    if kind[0] == "f":
+        with np.errstate(over="ignore"):
+            return numbers.astype(kind)
+    limits = np.iinfo(kind)
+    if not ((numbers >= limits.min) & (numbers <= limits.max) & (numbers == np.floor(numbers))).all():
+        raise ValueError(f"it has a number that is no {_WORDS[kind]} where its header says so")
+    return numbers.astype(kind)
+
+
+def _count_kind(sizes: IntArray) -> str:
+    return "u1" if sizes.max(initial=0) < 256 else "i4"
+
+
+def _rows(element: Element) -> bytes:
+    """The bytes of a table."""
+    width = np.zeros(element.rows, dtype=np.int64)
+    fields: list[tuple[IntArray, NDArray[Any], IntArray | None]] = []
+    for column in element.columns:
+        if column.sizes is not None:
+            counts = column.sizes.astype("<" + _count_kind(column.sizes))
+            fields.append((width.copy(), counts, None))
+            width += counts.itemsize
+        values = column.values.astype(column.values.dtype.newbyteorder("<"))
+        fields.append((width.copy(), values, column.sizes))
+        width += values.itemsize * (1 if column.sizes is None else column.sizes)
+    begin = np.cumsum(width) - width
+    out = np.empty(int(width.sum()), dtype=np.uint8)
+    for within, values, sizes in fields:
+        at = begin + within
+        if sizes is not None:
+            at = np.repeat(at - values.itemsize * (np.cumsum(sizes) - sizes), sizes)
+            at += values.itemsize * np.arange(len(values))
+        out[at[:, None] + np.arange(values.itemsize)] = values.view(np.uint8).reshape(-1, values.itemsize)
+    return out.tobytes()

@@ -1,0 +1,126 @@
+"""Many small problems posed at once, for less than each would cost alone.
+
+What is looked at when a problem is posed takes some microseconds a call however small the mesh is. So meshes are laid
+side by side, none joined to another, and are checked and their boundaries traced as one. Nothing is said here of what
+is wrong: where anything is, `Problem` says it, of one after another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.geometry.mesh.topology import Edges, components, edges, trace_loops
+from quasiharmonic.problem.domain import Domain
+from quasiharmonic.problem.problem import Problem
+from quasiharmonic.util.arrays import IntArray, index_array, real_array, triangle_rows
+
+# Binary orders of magnitude in which meshes may be, so that none of their lengths leaves the numbers' range.
+_ORDERS = 400
+
+Given = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+
+
+def posed_each(given: Sequence[Given]) -> list[Problem] | None:
+    """Pose problems on a mesh each: what `Problem` makes of each, with no reference of their own.
+
+    Parameters
+    ----------
+    given : sequence of (V, F, fixed, target)
+        As `Problem` takes them, as arrays of NumPy.
+
+    Returns
+    -------
+    list of Problem or None
+        None where anything is the matter with one of them, or they are not alike enough: then each has to be posed by
+        itself.
+    """
+    try:
+        V = [real_array("V", one[0]) for one in given]
+        F = [triangle_rows(one[1]) for one in given]
+        fixed = [index_array("fixed", one[2]) for one in given]
+        target = [real_array("target", one[3]) for one in given]
+    except ValueError:
+        return None
+    shaped = all(
+        v.ndim == 2 and v.shape[1] in (2, 3) and v.shape[1] == V[0].shape[1] and len(v) and len(T) and k.ndim == 1
+        for v, T, k in zip(V, F, fixed, strict=True)
+    )
+    if not shaped or any(uv.shape != (len(k), 2) for uv, k in zip(target, fixed, strict=True)):
+        return None
+    starts = np.cumsum([0, *map(len, V)])
+    places = np.concatenate(V)
+    if not np.isfinite(places).all() or not np.isfinite(np.concatenate(target)).all():
+        return None
+    triangles, held = _renumbered(F, starts), _renumbered(fixed, starts)
+    if triangles is None or held is None or (np.bincount(held, minlength=1) > 1).any():
+        return None
+    found = _surfaces(triangles, starts)
+    if found is None:
+        return None
+    on_boundary = np.zeros(len(places), dtype=bool)
+    on_boundary[found.boundary] = True
+    on_boundary[held] = False
+    if on_boundary.any() or not _areas(places, triangles, starts):
+        return None
+    try:
+        loops = trace_loops(found.boundary)
+    except ValueError:
+        return None
+    own: list[list[IntArray]] = [[] for _ in given]
+    for loop, k in zip(loops, np.searchsorted(starts, [loop[0] for loop in loops], side="right").tolist(), strict=True):
+        own[k - 1].append(loop - starts[k - 1])
+    none = np.empty((0, 2), dtype=np.int64)
+    problems = []
+    parts = zip(_parted(found.interior, starts), _parted(found.boundary, starts), strict=True)
+    for k, (interior, boundary) in enumerate(parts):
+        domain = object.__new__(Domain)
+        domain.__setstate__(
+            {"V": V[k], "F": F[k], "edges": Edges(interior, boundary, none.copy(), none.copy()), "loops": own[k]}
+            | {"fixed": fixed[k]}
+        )
+        problems.append(Problem.on(domain, target[k]))
+    return problems
+
+
+def _renumbered(own: Sequence[IntArray], starts: IntArray) -> IntArray | None:
+    """Vertices of all meshes in common numbers, or None where some are none of their own mesh's."""
+    for indices, n in zip(own, np.diff(starts).tolist(), strict=True):
+        if indices.size and (indices.min() < 0 or indices.max() >= n):
+            return None
+    return np.concatenate([indices + start for indices, start in zip(own, starts[:-1].tolist(), strict=True)])
+
+
+def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
+    """The edges of meshes side by side, or None where one is no connected surface with boundary."""
+    a, b, c = F.T
+    n = int(starts[-1])
+    found = edges(F, n)
+    if ((a == b) | (b == c) | (c == a)).any() or found.nonmanifold.size or found.inconsistent.size:
+        return None
+    # A vertex without triangle is a component of its own.
+    if not np.array_equal(components(F, n), np.repeat(starts[:-1], np.diff(starts))):
+        return None
+    bounded = np.zeros(starts.size - 1, dtype=bool)
+    bounded[np.searchsorted(starts, found.boundary[:, 0], side="right") - 1] = True
+    return found if bounded.all() else None
+
+
+def _areas(V: NDArray[np.float64], F: IntArray, starts: IntArray) -> bool:
+    """Whether all triangles certainly have an area at rest, as `Domain.check_areas` computes it."""
+    size = np.maximum.reduceat(np.abs(V).max(axis=1), starts[:-1])
+    exponent = np.frexp(size)[1]
+    if (np.abs(exponent) > _ORDERS).any():
+        return False
+    z1, z2 = rest_frames(np.ldexp(V, -np.repeat(exponent, np.diff(starts))[:, None]), F)
+    return not ((z1 == 0) | (z2.imag == 0)).any()
+
+
+def _parted(pairs: IntArray, starts: IntArray) -> list[IntArray]:
+    """Edges in the order of their smaller ends, (e, 2), mesh by mesh in its own numbers."""
+    ends = np.searchsorted(np.minimum(pairs[:, 0], pairs[:, 1]), starts[1:-1])
+    return [part - start for part, start in zip(np.split(pairs, ends), starts[:-1].tolist(), strict=True)]

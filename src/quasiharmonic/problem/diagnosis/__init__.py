@@ -1,0 +1,10 @@
+"""Why a problem has no map: necessary conditions, and the elements that violate each.
+
+The package builds on `problem` and `geometry.exact`. Start reading in `examine`; each other module is one kind of
+obstruction or a tool of it.
+"""
+
+from quasiharmonic.problem.diagnosis.examine import diagnose
+from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction
+
+__all__ = ["Diagnosis", "Forbids", "Kind", "Obstruction", "diagnose"]

@@ -1,0 +1,72 @@
+"""Whether segments pass between walls, for many at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.predicates import SegmentRelation, box_pairs_between, segment_relation
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.progress import still_at_it
+
+# Segments that are taken at a time.
+_SEGMENTS = 1 << 14
+
+
+def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positions: FloatArray, most: int) -> BoolArray:
+    """Whether segments are known to meet no wall but those that end where they do.
+
+    Parameters
+    ----------
+    p, q : (k, 2) float64
+        Ends of the segments.
+    ends : (k, 2) int64
+        The points that these are, -1 for none.
+    walls : (m, 2) int64
+        As pairs of points.
+    positions : (n, 2) float64
+        The points.
+    most : int
+        How many pairs of a segment and a wall near it are looked at, about.
+
+    Returns
+    -------
+    (k,) bool
+        Decided exactly where True. False also for segments that were not looked at.
+    """
+    result = np.zeros(len(p), dtype=bool)
+    # Neighbours in the plane next to each other, so that few boxes have to be compared.
+    order = _curve(p / 2 + q / 2)
+    walls = walls[_curve(positions[walls[:, 0]] / 2 + positions[walls[:, 1]] / 2)]
+    r, s = positions[walls.T]
+    tail, head = walls.T
+    low, high = np.minimum(r, s), np.maximum(r, s)
+    spent = 0
+    for start in range(0, len(p), _SEGMENTS):
+        part = order[start : start + _SEGMENTS]
+        a, b, (first, last) = p[part], q[part], ends[part].T
+        met = np.zeros(len(part), dtype=bool)
+        still_at_it()
+        for i, j in box_pairs_between(np.minimum(a, b), np.maximum(a, b), low, high):
+            spent += i.size
+            if spent > most:
+                return result
+            apart = (first[i] != tail[j]) & (first[i] != head[j]) & (last[i] != tail[j]) & (last[i] != head[j])
+            apart &= ~met[i]
+            i, j = i[apart], j[apart]
+            relation = segment_relation(a.take(i, 0), b.take(i, 0), r.take(j, 0), s.take(j, 0))
+            met[i[relation != SegmentRelation.DISJOINT]] = True
+        result[part] = ~met
+    return result
+
+
+def _curve(points: FloatArray) -> IntArray:
+    """The order in which a curve that fills the plane comes by points (Morton 1966); (k,) int64."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64)
+    low, high = points.min(axis=0) / 2, points.max(axis=0) / 2
+    size = np.max(high - low)
+    cell = ((points / 2 - low) / (size if size > 0 else 1) * 0xFFFF).astype(np.int64)
+    # Each bit moves to twice its place.
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        cell = (cell | cell << shift) & mask
+    return np.argsort(cell[:, 0] | cell[:, 1] << 1, kind="stable")

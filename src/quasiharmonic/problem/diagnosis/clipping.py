@@ -1,0 +1,258 @@
+"""Exact convex polygons in the plane, and the part of one that sees given points.
+
+All lines here pass through two points of the target, all points are where two such lines meet.
+Both are kept in homogeneous integers, so that every sign is exact and no number grows with the
+length of a computation: a corner is always the meeting point of two of the first lines, however
+often a polygon was cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from quasiharmonic.problem.diagnosis.effort import Effort
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+Point = tuple[int, int]
+Line = tuple[int, int, int]
+"""``a, b, c``: the point (x, y) lies to the left where ``a x + b y + c > 0``."""
+
+# Coordinates below are at most 1 and rounded once, so that a product of two differences is wrong by
+# less than this; what the filter cannot decide by this margin is decided in integers.
+MARGIN = 2.0**-48
+
+
+def line(p: Point, q: Point) -> Line:
+    """The line from ``p`` to ``q``, positive to its left."""
+    a, b = p[1] - q[1], q[0] - p[0]
+    return a, b, -(a * p[0] + b * p[1])
+
+
+def reverse(along: Line) -> Line:
+    """The same line, positive on the other side."""
+    a, b, c = along
+    return -a, -b, -c
+
+
+def _meet(first: Line, second: Line) -> Line:
+    """Where two lines meet, in homogeneous coordinates."""
+    a, b, c = first
+    d, e, f = second
+    return b * f - c * e, c * d - a * f, a * e - b * d
+
+
+@dataclass(frozen=True)
+class Convex:
+    """An open convex polygon of positive area.
+
+    Attributes
+    ----------
+    lines : list of Line
+        Its sides in counterclockwise order, the polygon to their left.
+    corners : list of (int, int, int)
+        Homogeneous coordinates of where each side starts, the last one positive.
+    """
+
+    lines: list[Line]
+    corners: list[tuple[int, int, int]]
+
+    @staticmethod
+    def box(low: Point, high: Point) -> Convex:
+        """The axis-parallel rectangle between two points."""
+        (x0, y0), (x1, y1) = low, high
+        corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+        sides = [line(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+        return Convex(sides, [_meet(sides[i - 1], sides[i]) for i in range(4)])
+
+    def cut(self, along: Line) -> Convex | None:
+        """What lies to the left of a line, or None if that has no area."""
+        a, b, c = along
+        sides = [a * x + b * y + c * w for x, y, w in self.corners]
+        if min(sides) >= 0:
+            return self
+        if max(sides) <= 0:
+            return None
+        lines: list[Line] = []
+        corners: list[tuple[int, int, int]] = []
+        for i, here in enumerate(sides):
+            side, after = self.lines[i], sides[i + 1 - len(sides)]
+            if here > 0 or (here == 0 and after > 0):
+                lines.append(side)
+                corners.append(self.corners[i])
+            elif after > 0:
+                lines.append(side)
+                corners.append(_meet(along, side))
+            if here > 0 and after <= 0:
+                lines.append(along)
+                corners.append(self.corners[i + 1 - len(sides)] if after == 0 else _meet(side, along))
+        return Convex(lines, corners)
+
+
+class Lattice:
+    """Positions as integers: the doubles of a target over their smallest unit.
+
+    Parameters
+    ----------
+    positions : (k, 2) float64
+        Finite.
+
+    Attributes
+    ----------
+    points : list of (int, int)
+        The same points, exactly.
+    near : (k, 2) float64
+        The same points, centred and scaled to magnitude one, rounded.
+    """
+
+    def __init__(self, positions: FloatArray) -> None:
+        fraction, exponent = np.frexp(positions)
+        mantissa = np.ldexp(fraction, 53).astype(np.int64)
+        lowest = int(exponent[mantissa != 0].min(initial=np.iinfo(np.int32).max))
+        shift = np.where(mantissa != 0, exponent - lowest, 0)
+        whole = [m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)]
+        self.points: list[Point] = list(zip(whole[::2], whole[1::2], strict=True))
+        self._lowest = lowest - 53
+        xs, ys = whole[::2], whole[1::2]
+        self.low, self.high = (min(xs), min(ys)), (max(xs), max(ys))
+        self._centre = (self.low[0] + self.high[0]) // 2, (self.low[1] + self.high[1]) // 2
+        self._unit = max(self.high[0] - self.low[0], self.high[1] - self.low[1], 1)
+        self.near = self._near([(x, y, 1) for x, y in self.points])
+
+    def _near(self, points: Sequence[tuple[int, int, int]]) -> FloatArray:
+        (cx, cy), unit = self._centre, self._unit
+        # Quotients of integers are rounded once, whatever their size.
+        return np.array([((x - cx * w) / (unit * w), (y - cy * w) / (unit * w)) for x, y, w in points])
+
+    def corners(self, area: Convex) -> FloatArray:
+        """Corners of a polygon in the coordinates of ``near``; (r, 2) float64."""
+        return self._near(area.corners)
+
+    def middle(self, area: Convex) -> tuple[float, float]:
+        """A position in the middle of a polygon, rounded only once: that of three corners far apart."""
+        r, unit = len(area.corners), Fraction(2) ** self._lowest
+        three = [area.corners[k] for k in (0, r // 3, 2 * r // 3)]
+        x, y = (sum(Fraction(corner[axis], corner[2]) for corner in three) * unit / 3 for axis in (0, 1))
+        return float(x), float(y)
+
+
+class Walls:
+    """Segments that block the view, and what can be seen past them.
+
+    Parameters
+    ----------
+    ends : (m, 2) int64
+        The segments, as pairs of points of the lattice.
+    lattice : Lattice
+    effort : Effort
+        Of which looking takes.
+    """
+
+    def __init__(self, ends: IntArray, lattice: Lattice, effort: Effort) -> None:
+        self._ends, self._lattice, self._effort = ends, lattice, effort
+        corners = lattice.near[ends.T].transpose(2, 0, 1)  # coordinate, end, wall
+        self._low, self._high = corners.min(axis=1), corners.max(axis=1)
+
+    def seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
+        """A part of ``area`` from which all ``eyes`` are seen, or None if there is no such point.
+
+        A point sees an eye when the open segment between them meets no wall (walls that lie on the
+        line, or end in the eye, take nothing away from an open set). The area is cut along the
+        shadow of one wall after another, the shadow dropped, and the parts looked at one by one.
+
+        Parameters
+        ----------
+        area : Convex
+            Where to look for points; of positive area.
+        eyes : sequence of int
+            Points to be seen.
+
+        Returns
+        -------
+        Convex or None
+            A polygon of positive area all of which sees every eye.
+        """
+        near = self._lattice.corners(area)
+        met = self._met(np.concatenate([near, self._lattice.near[list(eyes)]]))
+        # Which walls may hide an area from the first eyes; none for those that are known to see it all.
+        waiting: list[tuple[Convex, FloatArray, list[IntArray]]] = [(area, near, [])]
+        while waiting:
+            area, near, blocking = waiting.pop()
+            parts = None
+            blocking = list(blocking)
+            for k, eye in enumerate(eyes):
+                if k == len(blocking):
+                    blocking.append(self._facing(eye, met))
+                if len(blocking[k]):
+                    parts, blocking[k] = self._split(area, near, eye, blocking[k])
+                if parts is not None:
+                    break
+            if parts is None:
+                return area
+            waiting += [(part, self._lattice.corners(part), blocking) for part in parts]
+        return None
+
+    def _met(self, points: FloatArray) -> IntArray:
+        """Walls that reach into the box around some points, (m, 2) int64."""
+        (x0, y0), (x1, y1) = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
+        inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
+        return self._ends[inside]
+
+    def _facing(self, eye: int, walls: IntArray) -> IntArray:
+        """Walls as an eye sees them from right to left, without those that end in it; (m, 2) int64."""
+        ends = walls[(walls[:, 0] != eye) & (walls[:, 1] != eye)]
+        p, q = self._lattice.near[ends.T] - self._lattice.near[eye]
+        turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
+        return np.where(turned[:, None], ends[:, ::-1], ends)
+
+    def _split(self, area: Convex, near: FloatArray, eye: int, walls: IntArray) -> tuple[list[Convex] | None, IntArray]:
+        """Cut an area at the shadow of one of the walls.
+
+        Returns
+        -------
+        parts : list of Convex or None
+            What the wall leaves to be seen, the most promising last; None when no wall is in the way.
+        walls : (m, 2) int64
+            The walls that may still be in the way of these parts.
+        """
+        self._effort.spend(100 + len(walls) * len(near) // 20)
+        here = self._lattice.near[eye]
+        p, q = self._lattice.near[walls.T]
+        right, left = cross((p - here)[:, None], near - here), cross((q - here)[:, None], near - here)
+        front = cross((q - p)[:, None], near - p[:, None])
+        in_the_way = (right.max(axis=1) > -MARGIN) & (left.min(axis=1) < MARGIN) & (front.min(axis=1) < MARGIN)
+        # The walls that hide most corners first: one that hides them all leaves nothing to look at.
+        hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
+        walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]
+        points = self._lattice.points
+        for k, (i, j) in enumerate(walls.tolist()):
+            parts = _past(area, points[eye], points[i], points[j])
+            if parts is not None:
+                return parts, walls[k + 1 :]
+        return None, walls[:0]
+
+
+def _past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
+    """The parts of an area that are not in the shadow of a wall, or None if the whole area is not."""
+    across = line(p, q)
+    side = across[0] * eye[0] + across[1] * eye[1] + across[2]
+    if side == 0:
+        return None
+    if side < 0:
+        p, q, across = q, p, reverse(across)
+    first, second = line(eye, p), line(eye, q)
+    beside = area.cut(first)
+    ahead = beside and beside.cut(reverse(second))
+    if beside is None or ahead is None or ahead.cut(reverse(across)) is None:
+        return None
+    parts = [area.cut(reverse(first)), beside.cut(second), ahead.cut(across)]
+    return [part for part in parts if part is not None]
+
+
+def cross(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Cross products along the last axis, of which the others are broadcast."""
+    product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return product

@@ -1,0 +1,206 @@
+"""The curves onto which the boundary goes: where they meet, how they turn, how often they wind.
+
+Everything is decided exactly. It rests on three facts. A map without inverted triangles covers
+every point off its boundary curves as often as they wind around it, so they never wind a negative
+number of times. The exterior angles of its boundary add up to at least 2π times the Euler
+characteristic of the surface, and to exactly that unless the map winds more than once around a
+vertex (count the angles of all triangles in two ways). And where the curves wind at most once
+around every point, such a map is injective.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.loops import Contacts, contacts, winding
+from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.progress import still_at_it
+
+# More meeting pairs than this are not collected: a target that is this entangled needs no full list.
+MOST_CONTACTS = 10_000
+
+
+def turning_number(loop: FloatArray) -> int:
+    """How often the direction of a closed polygon turns around, counterclockwise.
+
+    A fold, where an edge goes back along the one before, counts as a turn by -π: the only angle
+    between 0 and 2π that triangles can fill there is 2π.
+
+    Parameters
+    ----------
+    loop : (l, 2) float64
+        Corners, no two consecutive ones equal.
+    """
+    after = np.roll(loop, -1, axis=0)
+    # Comparing coordinates is exact, subtracting them is not.
+    # Directions of angle 0 ≤ θ < π are up, the others down; each full turn passes from down to up.
+    up = (after[:, 1] > loop[:, 1]) | ((after[:, 1] == loop[:, 1]) & (after[:, 0] > loop[:, 0]))
+    turn = orientation(loop, after, np.roll(after, -1, axis=0))
+    up_after = np.roll(up, -1)
+    # A turn of zero from one to the other is a fold, and goes to the right.
+    passes = np.where(turn > 0, ~up & up_after, False).astype(np.int64)
+    passes -= np.where(turn <= 0, up & ~up_after, False)
+    return int(passes.sum())
+
+
+class BoundaryCurves:
+    """The boundary loops of a surface at their positions in the plane.
+
+    Parameters
+    ----------
+    positions : (n, 2) float64
+        Positions of vertices, finite on the boundary.
+    loops : list of (l,) int64
+        The surface lies to the left of each.
+
+    Attributes
+    ----------
+    loops : list of (l,) int64
+        The same loops, each from its lowest corner on (of several, the leftmost).
+    ends : (m, 2) int64
+        Boundary edges, loop by loop, in order.
+    loop_of : (m,) int64
+        Index of the loop of each edge.
+    """
+
+    def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
+        self.positions = positions
+        self.loops = [_from_lowest(positions, loop) for loop in loops]
+        self.ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
+        self.loop_of = np.repeat(np.arange(len(loops)), [len(loop) for loop in self.loops])
+
+    @cached_property
+    def degenerate(self) -> IntArray:
+        """Indices of edges of length zero."""
+        return np.flatnonzero((self.tails == self.heads).all(axis=1))
+
+    @property
+    def tails(self) -> FloatArray:
+        """Where the edges start, (m, 2) float64."""
+        return self.positions[self.ends[:, 0]]
+
+    @property
+    def heads(self) -> FloatArray:
+        """Where the edges end, (m, 2) float64."""
+        return self.positions[self.ends[:, 1]]
+
+    @cached_property
+    def folds(self) -> IntArray:
+        """Vertices at which the curve goes back the way it came."""
+        folded = []
+        for loop in self.loops:
+            here, before, after = (self.positions[np.roll(loop, k)] for k in (0, 1, -1))
+            flat = orientation(before, here, after) == 0
+            # On one line: a fold unless the vertex lies between its neighbours.
+            low, high = np.minimum(before, after), np.maximum(before, after)
+            distinct = (here != before).any(axis=1) & (here != after).any(axis=1)
+            outside = ((here < low) | (here > high)).any(axis=1)
+            folded.append(loop[flat & distinct & outside])
+        return np.concatenate(folded)
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """Where the curves meet themselves or each other, as pairs of edges."""
+        return contacts(self.positions, self.ends, MOST_CONTACTS)
+
+    @property
+    def simple(self) -> bool:
+        """Whether every loop is simple and none meets another."""
+        return not self.degenerate.size and not len(self.contacts.pairs)
+
+    @cached_property
+    def turning(self) -> list[int] | None:
+        """Turning number of each loop; None where edges of length zero have no direction."""
+        if self.degenerate.size:
+            return None
+        return [turning_number(self.positions[loop]) for loop in self.loops]
+
+    @cached_property
+    def winding_range(self) -> IntArray | None:
+        """Smallest winding number right of each loop, largest one left of it; (loops, 2) int64.
+
+        The numbers are those of all curves together, and every region of the plane but the outermost
+        lies beside some loop. None where curves touch or overlap instead of crossing, or meet too
+        often to be followed.
+        """
+        meet = self.contacts
+        if self.degenerate.size or not meet.complete or (meet.relation != SegmentRelation.CROSSING).any():
+            return None
+        edge, other = np.concatenate([meet.pairs, meet.pairs[:, ::-1]]).T
+        # Who crosses a curve from its right to its left comes to where it winds once more.
+        step = orientation(self.tails[other], self.heads[other], self.heads[edge])
+        several = np.bincount(edge, minlength=len(self.ends))[edge] > 1
+        when = [self._when(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)]
+        steps: list[dict[tuple[int, Fraction], int]] = [{} for _ in self.loops]
+        for k in sorted(range(len(edge)), key=lambda k: (edge[k], when[k])):
+            still_at_it()
+            # What is crossed at the same point is crossed at once.
+            along = steps[self.loop_of[edge[k]]]
+            at = (int(edge[k]), when[k])
+            along[at] = along.get(at, 0) + int(step[k])
+        ranges = []
+        for index, along in enumerate(steps):
+            left = self._left_at_start(index) + np.cumsum([0, *along.values()])
+            ranges.append((left.min() - 1, left.max()))
+        return np.array(ranges, dtype=np.int64)
+
+    def _when(self, edge: int, other: int) -> Fraction:
+        """Where along an edge another crosses it, from 0 at its tail to 1 at its head."""
+        still_at_it()
+        (px, py), (qx, qy), (rx, ry), (sx, sy) = (
+            tuple(map(Fraction, self.positions[vertex].tolist())) for vertex in (*self.ends[edge], *self.ends[other])
+        )
+        tail = (sx - rx) * (py - ry) - (sy - ry) * (px - rx)
+        head = (sx - rx) * (qy - ry) - (sy - ry) * (qx - rx)
+        return tail / (tail - head)
+
+    def _left_at_start(self, index: int) -> int:
+        """Winding number just left of the lowest corner of a loop."""
+        own = self.loop_of == index
+        before, here, after = (self.positions[self.loops[index][k]] for k in (-1, 0, 1))
+        others, _ = winding(here[None], self.tails[~own], self.heads[~own])
+        # Below its lowest corner a loop does not wind; the corner's inner side is left of a left turn.
+        return int(others[0]) + int(orientation(before, here, after) > 0)
+
+
+class Corners:
+    """The angles of the target at its boundary vertices.
+
+    Attributes
+    ----------
+    known : (n,) bool
+        Boundary vertices.
+    """
+
+    def __init__(self, curves: BoundaryCurves) -> None:
+        n = len(curves.positions)
+        self.known = np.zeros(n, dtype=bool)
+        self.before, self.after = np.full((2, n), -1)
+        tails, heads = curves.ends.T
+        self.known[tails] = True
+        self.before[heads], self.after[tails] = tails, heads
+
+    def reflex(self, vertices: IntArray, where: FloatArray) -> BoolArray:
+        """Whether the angle inside is larger than π; (k,) bool."""
+        turns: BoolArray = orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
+        return turns
+
+    def opens_to(self, vertices: IntArray, points: FloatArray, where: FloatArray) -> BoolArray:
+        """Whether the way to a point starts strictly inside the angle; (k,) bool, False at pins."""
+        result = np.zeros(len(vertices), dtype=bool)
+        known = np.flatnonzero(self.known[vertices])
+        v, x = vertices[known], points[known]
+        left_of_last = orientation(where[self.before[v]], where[v], x) > 0
+        left_of_next = orientation(where[v], where[self.after[v]], x) > 0
+        reflex = self.reflex(v, where)
+        result[known] = np.where(reflex, left_of_last | left_of_next, left_of_last & left_of_next)
+        return result
+
+
+def _from_lowest(positions: FloatArray, loop: IntArray) -> IntArray:
+    """A loop from its lowest corner on; of several, the leftmost."""
+    return np.roll(loop, -int(np.lexsort(positions[loop].T)[0]))

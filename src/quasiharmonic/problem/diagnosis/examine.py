@@ -1,0 +1,260 @@
+"""Look for reasons why a problem has no map, the general ones first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.predicates import SegmentRelation
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis.curves import BoundaryCurves, Corners
+from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
+from quasiharmonic.problem.diagnosis.elements import (
+    collapsed_edges,
+    half_planes,
+    inverted_patches,
+    inverted_triangles,
+    misplaced_pins,
+)
+from quasiharmonic.problem.diagnosis.fixture import Fixture, stars
+from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_vertices
+from quasiharmonic.problem.diagnosis.shortcuts import Shortcuts
+from quasiharmonic.problem.diagnosis.sight import Sight, bad_chords
+from quasiharmonic.problem.diagnosis.witness import unplaced
+from quasiharmonic.util.arrays import IntArray, named, named_edges
+
+# What is spent on vertices that see too little, in about microseconds; where it ends, the rest are passed over.
+MOST_EFFORT = 3_000_000
+
+
+def diagnose(problem: Problem) -> Diagnosis:
+    """Check the known conditions that a problem must meet to have a map.
+
+    Every obstruction is proven, in exact arithmetic on the coordinates as stored: where one is
+    reported there is no map of the kind it forbids, not even with real numbers. The reverse does not
+    hold: a problem without known obstruction may still have no map.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    Diagnosis
+
+    Notes
+    -----
+    Write χ for the Euler characteristic of the surface. For any target, a map without inverted
+    triangles needs
+
+    - no edge collapsed, no triangle or patch of the mesh inverted by what is fixed around it;
+    - a signed area above zero, turning numbers that add up to χ or more (to exactly χ if no vertex
+      may be wound around twice), and a boundary that winds nowhere a negative number of times;
+    - for each free vertex a point to the left of all fixed edges that it forms triangles with;
+    - as many windings around a pin as there are pins at this position.
+
+    A bijective map also needs loops that are simple, disjoint and nested as holes in one outer loop,
+    and a surface without handles. Where the loops are, every map without inverted triangles is
+    injective on the whole interior, and further needs
+
+    - edges between fixed vertices strictly inside the target, clear of the boundary and each other;
+    - pins strictly inside;
+    - for each free vertex a point that sees all fixed vertices it is joined to, from the left of
+      the edges above;
+    - for any two boundary vertices no fewer edges from one to the other than the link distance of
+      their positions, the number of segments that it takes inside the target [2]_.
+
+    Link distances are compared for targets with one loop and vertices up to eight edges apart. Both
+    these and sight are given up where they would take more than some seconds, which ``unchecked`` then
+    says. Not checked is whether a curve that crosses itself bounds an immersed surface at all (for a
+    disk, Blank's theorem [1]_ decides).
+
+    References
+    ----------
+    .. [1] V. Poénaru, Extension des immersions en codimension 1 (d'après S. Blank). Séminaire
+       Bourbaki 342 (1968).
+    .. [2] S. Suri, A linear time algorithm for minimum link paths inside a simple polygon. Computer
+       Vision, Graphics, and Image Processing 35 (1986).
+    """
+    fixture = Fixture.of(problem)
+    curves = BoundaryCurves(fixture.positions, problem.domain.loops)
+    euler = problem.n - len(problem.domain.edges.interior) - len(problem.domain.edges.boundary) + len(problem.F)
+    area = _twice_area(fixture, curves)
+    if area < 0 and _fits_mirrored(curves, euler):
+        message = "The target is wound against the mesh: every loop runs the wrong way around."
+        loops = np.arange(len(problem.domain.loops))
+        reversed_ = Obstruction(Kind.REVERSED, Forbids.INJECTIVE, message, loops=loops)
+        return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",), problem)
+
+    proper = _proper(curves)
+    unchecked = list(_unchecked(curves, proper))
+    found = list(_global(problem, curves, euler, area))
+    found += misplaced_pins(problem, fixture, curves, proper)
+    found += collapsed_edges(problem, fixture)
+    found += inverted_triangles(problem, fixture)
+    found += inverted_patches(problem, fixture)
+    chords, corners = fixture.chords, None
+    if proper:
+        corners = Corners(curves)
+        bad = list(bad_chords(problem, fixture, curves, corners))
+        found += bad
+        wrong = {tuple(o.split[0].tolist()) for o in bad}
+        chords = np.array([c for c in chords.tolist() if tuple(c) not in wrong], dtype=np.int64).reshape(-1, 2)
+    # Nothing has a place in a target on a line parallel to an axis, and nothing more need be said.
+    if all(low < high for low, high in zip(fixture.lattice.low, fixture.lattice.high, strict=True)):
+        hidden, passed_over = _unplaced(problem, fixture, curves, corners, np.concatenate([curves.ends, chords]))
+        found += hidden
+        unchecked += passed_over
+    if corners is not None and len(problem.domain.loops) == 1:
+        shortcuts = Shortcuts(problem, fixture, corners)
+        found += shortcuts.find()
+        unchecked.append(f"link distances of boundary vertices that are {shortcuts.unchecked} or more edges apart")
+    elif proper:
+        unchecked.append("link distances of fixed vertices that are three or more edges apart, around holes")
+    return Diagnosis(tuple(found), tuple(unchecked), problem)
+
+
+def _unplaced(
+    problem: Problem, fixture: Fixture, curves: BoundaryCurves, corners: Corners | None, walls: IntArray
+) -> tuple[list[Obstruction], list[str]]:
+    """Free vertices for which there is no place, and what was left unchecked about them."""
+    around = stars(problem, fixture, curves.folds)
+    around = around.take(unplaced(around, fixture, corners, walls))
+    sight = None if corners is None else Sight(problem, fixture, corners, walls, Effort(MOST_EFFORT))
+    found = []
+    passed_over = []
+    for star in map(around.__getitem__, range(len(around))):
+        obstruction = half_planes(star, fixture)
+        if obstruction is None and sight is not None:
+            try:
+                obstruction = sight.hidden(star)
+            except EffortSpentError:
+                passed_over.append(star.vertex)
+        if obstruction is not None:
+            found.append(obstruction)
+    which = named_vertices(np.array(passed_over))
+    return found, [f"whether a place sees the fixed neighbours of {which}"] * bool(passed_over)
+
+
+def _twice_area(fixture: Fixture, curves: BoundaryCurves) -> int:
+    """Twice the signed area around which the boundary winds, in squared units of the lattice."""
+    tails, heads = fixture.points(curves.ends[:, 0]), fixture.points(curves.ends[:, 1])
+    return sum(px * qy - py * qx for (px, py), (qx, qy) in zip(tails, heads, strict=True))
+
+
+def _fits_mirrored(curves: BoundaryCurves, euler: int) -> bool:
+    """Whether the reflected target passes the conditions on whole curves."""
+    mirrored = BoundaryCurves(curves.positions * [-1.0, 1.0], curves.loops)
+    if mirrored.turning is None or sum(mirrored.turning) < euler:
+        return False
+    return mirrored.winding_range is None or bool((mirrored.winding_range[:, 0] >= 0).all())
+
+
+def _proper(curves: BoundaryCurves) -> bool:
+    """Whether the loops are simple, disjoint, and nested as holes in one outer loop."""
+    if not curves.simple or curves.turning is None or curves.winding_range is None:
+        return False
+    low, high = curves.winding_range.T
+    return curves.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
+
+
+def _global(problem: Problem, curves: BoundaryCurves, euler: int, area: int) -> Iterator[Obstruction]:
+    """Obstructions by the loops as a whole.
+
+    Parameters
+    ----------
+    problem : Problem
+    curves : BoundaryCurves
+    euler : int
+        Euler characteristic of the surface.
+    area : int
+        Any number of the sign of the area that the loops wind around.
+    """
+    every = np.arange(len(problem.domain.loops))
+    turning, ranges = curves.turning, curves.winding_range
+    proper = _proper(curves)
+    genus = (2 - len(problem.domain.loops) - euler) // 2
+
+    if area <= 0:
+        message = "The target encloses no positive area."
+        yield Obstruction(Kind.SIGNED_AREA, Forbids.INJECTIVE, message, loops=every)
+    if genus > 0:
+        handles = "a handle" if genus == 1 else f"{genus} handles"
+        message = f"The surface has {handles} and fits into no plane without overlap."
+        forbids = Forbids.INJECTIVE if proper else Forbids.BIJECTIVE
+        yield Obstruction(Kind.GENUS, forbids, message)
+    if ranges is not None and curves.simple and not proper:
+        yield _misnested(curves, euler)
+    elif ranges is not None and (ranges[:, 0] < 0).any():
+        loops = np.flatnonzero(ranges[:, 0] < 0)
+        message = f"Around some region beside {_named_loops(loops)} the target winds {ranges[:, 0].min()} times."
+        yield Obstruction(Kind.NEGATIVE_WINDING, Forbids.INJECTIVE, message, loops=loops)
+    if turning is not None and sum(turning) != euler and not curves.simple:
+        fewer = sum(turning) < euler
+        message = (
+            f"The target's loops turn {sum(turning)} times in all, "
+            f"and {'at least ' if fewer else ''}{euler} {'is' if euler == 1 else 'are'} needed for this surface."
+        )
+        forbids = Forbids.INJECTIVE if fewer else Forbids.UNBRANCHED
+        yield Obstruction(Kind.TURNING_NUMBER, forbids, message, loops=every)
+    yield from _meetings(curves)
+
+
+def _misnested(curves: BoundaryCurves, euler: int) -> Obstruction:
+    """Simple disjoint loops that are not holes in one outer loop."""
+    assert curves.winding_range is not None
+    assert curves.turning is not None
+    low, high = curves.winding_range.T
+    wrong = np.flatnonzero((low < 0) | (high > 1))
+    if not wrong.size:
+        wrong = np.flatnonzero(np.array(curves.turning) == 1)
+    # Where the curves wind at most once, a map would be injective onto what they enclose, and that
+    # is not this surface; where they wind more often, it would cover a part repeatedly.
+    hopeless = low.min() < 0 or high.max() <= 1
+    forbids = Forbids.INJECTIVE if hopeless else Forbids.UNBRANCHED
+    if not hopeless and sum(curves.turning) == euler:
+        forbids = Forbids.BIJECTIVE
+    message = f"The target's loops are not holes in one outer loop: see {_named_loops(wrong)}."
+    return Obstruction(Kind.NESTING, forbids, message, loops=wrong)
+
+
+def _meetings(curves: BoundaryCurves) -> Iterator[Obstruction]:
+    """Where the curves fold, cross or touch; forbids bijective maps only."""
+    if curves.folds.size:
+        message = f"At the boundary {named_vertices(curves.folds)} the target goes back the way it came."
+        yield Obstruction(Kind.FOLD, Forbids.BIJECTIVE, message, vertices=curves.folds)
+    meet = curves.contacts
+    consecutive = (curves.ends[meet.pairs][:, 0, :, None] == curves.ends[meet.pairs][:, 1, None, :]).any(axis=(1, 2))
+    pairs, relation = meet.pairs[~consecutive], meet.relation[~consecutive]
+    loops = np.sort(curves.loop_of[pairs], axis=1)
+    for a, b in np.unique(loops, axis=0):
+        here = (loops == [a, b]).all(axis=1)
+        crossing = bool((relation[here] == SegmentRelation.CROSSING).any())
+        who = f"{_named_loops(np.array([a])).capitalize()} of the target"
+        whom = "itself" if a == b else f"loop {b}"
+        count = f"{'' if meet.complete else 'at least '}{here.sum()} {'pair' if here.sum() == 1 else 'pairs'} of edges"
+        involved = curves.ends[pairs[here]].reshape(-1, 2)
+        message = (
+            f"{who} {'crosses' if crossing else 'touches'} {whom} ({count}), among them "
+            f"{named_edges(involved[:1])} and {named_edges(involved[1:2])}."
+        )
+        yield Obstruction(
+            Kind.CROSSING, Forbids.BIJECTIVE, message, edges=np.unique(involved, axis=0), loops=np.unique([a, b])
+        )
+
+
+def _unchecked(curves: BoundaryCurves, proper: bool) -> Iterator[str]:
+    """Conditions that were left out, and why."""
+    if proper:
+        return
+    yield "edges between fixed vertices and what vertices see, which matters where the target is simple"
+    if curves.turning is None:
+        yield "turning numbers, which boundary edges of length zero leave undefined"
+    if curves.winding_range is None:
+        yield "winding numbers, as the target touches or overlaps itself, or crosses itself too often"
+
+
+def _named_loops(loops: IntArray) -> str:
+    """Name the first few of some boundary loops."""
+    return named("loop", "loops", loops)

@@ -1,0 +1,161 @@
+"""What a problem fixes: positions, edges between them, and what is fixed around each free vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis.clipping import Convex, Lattice, line
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.progress import still_at_it
+
+
+@dataclass(frozen=True)
+class Fixture:
+    """Which elements of a mesh have given positions.
+
+    Attributes
+    ----------
+    positions : (n, 2) float64
+        Target positions, NaN at free vertices.
+    fixed : (n,) bool
+    chords : (c, 2) int64
+        Interior edges with both ends fixed.
+    lattice : Lattice
+        The fixed positions as integers, in the order of ``Problem.fixed``.
+    row : (n,) int64
+        Where in ``Problem.fixed`` a vertex is, -1 for free ones.
+    """
+
+    positions: FloatArray
+    fixed: BoolArray
+    chords: IntArray
+    lattice: Lattice
+    row: IntArray
+
+    @staticmethod
+    def of(problem: Problem) -> Fixture:
+        """Collect what is fixed in a problem."""
+        positions = np.full((problem.n, 2), np.nan)
+        positions[problem.fixed] = problem.target
+        row = np.full(problem.n, -1)
+        row[problem.fixed] = np.arange(len(problem.fixed))
+        interior = problem.domain.edges.interior
+        chords = interior[(row[interior] >= 0).all(axis=1)]
+        return Fixture(positions, row >= 0, chords, Lattice(problem.target), row)
+
+    def points(self, vertices: IntArray) -> list[tuple[int, int]]:
+        """Integer positions of fixed vertices."""
+        return [self.lattice.points[k] for k in self.row[vertices].tolist()]
+
+    def extent(self) -> Convex:
+        """The open box around all fixed vertices, which contains the image of every free one."""
+        return Convex.box(self.lattice.low, self.lattice.high)
+
+    def left_of(self, area: Convex | None, edges: IntArray) -> Convex | None:
+        """The part of an area to the left of fixed edges (k, 2), or None if there is none.
+
+        Edges of length zero have no left side and are passed over.
+        """
+        for p, q in zip(self.points(edges[:, 0]), self.points(edges[:, 1]), strict=True):
+            still_at_it()
+            if area is None:
+                return None
+            if p != q:
+                area = area.cut(line(p, q))
+        return area
+
+
+@dataclass(frozen=True)
+class Star:
+    """A free vertex and what is fixed around it.
+
+    Attributes
+    ----------
+    vertex : int
+    neighbours : (k,) int64
+        Fixed vertices joined to it.
+    opposite : (h, 2) int64
+        Fixed edges that form a triangle with it, which lies to their left.
+    """
+
+    vertex: int
+    neighbours: IntArray
+    opposite: IntArray
+
+
+@dataclass(frozen=True)
+class Stars:
+    """The stars of several free vertices.
+
+    Attributes
+    ----------
+    vertices : (s,) int64
+        Ascending.
+    of_neighbour : (k,) int64
+        Index of the star of each neighbour, ascending.
+    neighbours : (k,) int64
+    of_opposite : (h,) int64
+        Index of the star of each edge, ascending.
+    opposite : (h, 2) int64
+    """
+
+    vertices: IntArray
+    of_neighbour: IntArray
+    neighbours: IntArray
+    of_opposite: IntArray
+    opposite: IntArray
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def __getitem__(self, k: int) -> Star:
+        near = slice(*np.searchsorted(self.of_neighbour, (k, k + 1)))
+        beyond = slice(*np.searchsorted(self.of_opposite, (k, k + 1)))
+        return Star(int(self.vertices[k]), self.neighbours[near], self.opposite[beyond])
+
+    def take(self, chosen: IntArray) -> Stars:
+        """Some of the stars, named in ascending order."""
+        at = np.full(len(self), -1)
+        at[chosen] = np.arange(len(chosen))
+        near, beyond = at[self.of_neighbour], at[self.of_opposite]
+        a, b = near >= 0, beyond >= 0
+        return Stars(self.vertices[chosen], near[a], self.neighbours[a], beyond[b], self.opposite[b])
+
+
+def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
+    """Free vertices whose fixed surroundings could leave them no place.
+
+    Left out are those that always find one: with a single fixed neighbour, or with those of one or
+    two consecutive boundary edges, which are all seen from near the middle one.
+
+    Parameters
+    ----------
+    problem : Problem
+    fixture : Fixture
+    folds : (k,) int64
+        Vertices at which the boundary goes back along itself: nothing is near these.
+    """
+    fixed = fixture.fixed
+    interior = problem.domain.edges.interior
+    joined = interior[fixed[interior[:, 0]] != fixed[interior[:, 1]]]
+    joined = np.where(fixed[joined[:, :1]], joined[:, ::-1], joined)  # free, fixed
+    two = np.flatnonzero(fixed[problem.F].sum(axis=1) == 2)
+    free = np.argmin(fixed[problem.F[two]], axis=1)
+    corner = problem.F[two[:, None], (free[:, None] + [0, 1, 2]) % 3]  # free, then the fixed edge
+
+    neighbours = np.bincount(joined[:, 0], minlength=problem.n)
+    opposite = np.bincount(corner[:, 0], minlength=problem.n)
+    following = np.full(problem.n, -1)
+    following[problem.domain.edges.boundary[:, 0]] = problem.domain.edges.boundary[:, 1]
+    outer = np.bincount(corner[following[corner[:, 1]] == corner[:, 2], 0], minlength=problem.n)
+    placed = (neighbours <= 3) & (outer == neighbours - 1) & (outer == opposite)
+    placed[corner[np.isin(corner[:, 1], folds), 0]] = False
+
+    every = np.arange(problem.n)
+    joined = joined[np.argsort(joined[:, 0], kind="stable")]
+    corner = corner[np.argsort(corner[:, 0], kind="stable")]
+    around = Stars(every, joined[:, 0], joined[:, 1], corner[:, 0], corner[:, 1:])
+    return around.take(np.flatnonzero((neighbours >= 2) & ~placed))

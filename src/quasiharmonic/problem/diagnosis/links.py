@@ -1,0 +1,241 @@
+"""Link distance in a simple polygon: how few straight segments lead from one corner to another.
+
+The polygon is triangulated once. From a corner one sees as far as a window: the first edge of the
+shortest path, drawn on past the corner around which that path bends. From the window one sees as far
+as the next, and so on, greedily [1]_. All this in exact arithmetic: a window passes through a corner
+and one point found before, so that the integers grow by a fixed number of digits a step.
+
+Segments may touch the boundary. A path of segments strictly inside may need more of them, never fewer.
+
+References
+----------
+.. [1] S. Suri, A linear time algorithm for minimum link paths inside a simple polygon. Computer
+   Vision, Graphics, and Image Processing 35 (1986).
+.. [2] D. T. Lee, F. P. Preparata, Euclidean shortest paths in the presence of rectilinear barriers.
+   Networks 14 (1984).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.triangulation import triangulate
+from quasiharmonic.problem.diagnosis.clipping import MARGIN
+from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.progress import still_at_it
+
+Point = tuple[int, int, int]
+"""Homogeneous coordinates, the last positive."""
+
+# The line through a point and itself, of which every point lies on neither side.
+_NOWHERE: Point = (0, 0, 0)
+# Corners that are compared with a line in about the time of one step through a triangle.
+_AT_ONCE = 100
+
+
+class Polygon:
+    """A simple polygon, triangulated.
+
+    Parameters
+    ----------
+    corners : list of (int, int)
+        Counterclockwise, no two equal.
+
+    Attributes
+    ----------
+    triangles : list of (int, int, int)
+        As corners, counterclockwise. They form a tree, and the side from the last to the first
+        corner of each but the root leads to its parent.
+    work : int
+        Triangles and crossings gone through so far, a measure of the time spent.
+    """
+
+    def __init__(self, corners: list[tuple[int, int]]) -> None:
+        self._points: list[Point] = [(x, y, 1) for x, y in corners]
+        self._corner = {point: k for k, point in enumerate(self._points)}
+        self.triangles = triangulate(corners)
+        self._of_side = {side: t for t, (a, b, c) in enumerate(self.triangles) for side in ((a, b), (b, c), (c, a))}
+        self._parent, self._depth = [-1] * len(self.triangles), [0] * len(self.triangles)
+        self._plant()
+        self._at = {corner: t for t, triangle in enumerate(self.triangles) for corner in triangle}
+        xs, ys = zip(*corners, strict=True)
+        self._centre = (min(xs) + max(xs)) // 2, (min(ys) + max(ys)) // 2
+        self._unit = max(max(xs) - min(xs), max(ys) - min(ys))
+        (x, y), unit = self._centre, self._unit
+        self._near = np.array([((px - x) / unit, (py - y) / unit) for px, py in corners])
+        self.work = len(corners)
+
+    def _plant(self) -> None:
+        """Make the triangles a tree."""
+        reached = deque([0])
+        while reached:
+            t = reached.popleft()
+            a, b, c = self.triangles[t]
+            for p, q in ((a, b), (b, c), (c, a)):
+                child = self._of_side.get((q, p), -1)
+                if child >= 0 and child != self._parent[t]:
+                    self._parent[child], self._depth[child] = t, self._depth[t] + 1
+                    self.triangles[child] = _with_last(self.triangles[child], q)
+                    reached.append(child)
+
+    def link_distance(self, start: int, goal: int, limit: int) -> int:
+        """Number of segments that it takes from one corner to another.
+
+        Parameters
+        ----------
+        start, goal : int
+            Two corners.
+        limit : int
+            Where to stop counting.
+
+        Returns
+        -------
+        int
+            The number, or ``limit + 1`` when it is larger than the limit.
+        """
+        window = [(self._points[start], self._at[start])]
+        for count in range(1, limit + 1):
+            still_at_it()
+            ways = [self._shortest(point, t, goal) for point, t in window]
+            common = _common_end(ways)
+            if common == 1 or any(len(way) == common for way in ways):
+                return count  # the ways part at the goal: it is seen from between them
+            bend, after = ways[0][-common], ways[0][1 - common]
+            # Of all lines from the window past the bend, the one that has turned furthest already.
+            before, other = ways[0][-common - 1], ways[-1][-common - 1]
+            if _turn(bend, before, other) == _turn(before, bend, after):
+                before = other
+            window = [(bend, self._at[self._corner[bend]]), self._hit(before, bend)]
+        return limit + 1
+
+    def _shortest(self, start: Point, t: int, goal: int) -> list[Point]:
+        """The shortest path from a point in a triangle to a corner: start, bends, goal [2]_."""
+        left, right = self._portals(start, t, goal)
+        path, k = [start], 0
+        # What is seen from the last bend through all doors so far lies between these two corners.
+        at_left = at_right = 0
+        to_left = to_right = _NOWHERE
+        while (k := k + 1) < len(left):
+            self.work += 1
+            if _side(to_right, right[k]) >= 0:
+                if _side(to_left, right[k]) > 0:
+                    path.append(left[at_left])
+                    k = at_right = at_left
+                    to_left = to_right = _NOWHERE
+                    continue
+                at_right, to_right = k, _cross(path[-1], right[k])
+            if _side(to_left, left[k]) <= 0:
+                if _side(to_right, left[k]) < 0:
+                    path.append(right[at_right])
+                    k = at_left = at_right
+                    to_left = to_right = _NOWHERE
+                    continue
+                at_left, to_left = k, _cross(path[-1], left[k])
+        path.append(self._points[goal])
+        # A bend that the path touches without turning is none.
+        return [p for k, p in enumerate(path) if k in (0, len(path) - 1) or _turn(path[k - 1], p, path[k + 1])]
+
+    def _portals(self, start: Point, t: int, goal: int) -> tuple[list[Point], list[Point]]:
+        """Left and right ends of the sides crossed between a point and a corner, both points included."""
+        up, down = [t], [self._at[goal]]
+        while up[-1] != down[-1]:
+            if self._depth[up[-1]] >= self._depth[down[-1]]:
+                up.append(self._parent[up[-1]])
+            else:
+                down.append(self._parent[down[-1]])
+        sleeve = up + down[-2::-1]
+        # Triangles around the two ends need not be crossed.
+        corner = self._corner.get(start, -1)
+        first = max((k for k, t in enumerate(sleeve) if corner in self.triangles[t]), default=0)
+        last = next(k for k in range(first, len(sleeve)) if goal in self.triangles[sleeve[k]])
+        left, right = [start], [start]
+        for here, following in pairwise(sleeve[first : last + 1]):
+            if self._parent[here] == following:
+                a, _, c = self.triangles[here]
+            else:
+                c, _, a = self.triangles[following]
+            left.append(self._points[a])
+            right.append(self._points[c])
+        return [*left, self._points[goal]], [*right, self._points[goal]]
+
+    def _hit(self, before: Point, bend: Point) -> tuple[Point, int]:
+        """Where the way from a point through a corner leaves the polygon, and a triangle there."""
+        along = _cross(before, bend)
+        sides = self._sides(along)
+        # The distance from the bend, up to a positive factor.
+        x, y, w = before
+        dx, dy = bend[0] * w - x, bend[1] * w - y
+        origin = dx * bend[0] + dy * bend[1]
+
+        def distance(p: Point) -> Fraction:
+            return Fraction(dx * p[0] + dy * p[1], p[2]) - origin
+
+        exits: list[tuple[Fraction, Point, int]] = []
+        beside = np.flatnonzero(sides)
+        crossed = np.flatnonzero(sides[beside] != np.roll(sides[beside], -1))
+        self.work += crossed.size + len(sides) // _AT_ONCE
+        n = len(sides)
+        # From one corner beside the line to the next: across a side, or along corners on the line.
+        for start, end in zip(beside[crossed].tolist(), np.roll(beside, -1)[crossed].tolist(), strict=True):
+            if end == (start + 1) % n:
+                p = _cross(along, _cross(self._points[start], self._points[end]))
+                p = p if p[2] > 0 else (-p[0], -p[1], -p[2])
+                exits.append((distance(p), p, self._of_side[start, end]))
+            else:
+                on = (self._points[m % n] for m in range(start + 1, end if end > start else end + n))
+                far = max(on, key=distance)
+                exits.append((distance(far), far, self._at[self._corner[far]]))
+        _, point, t = min((e for e in exits if e[0] > 0), key=lambda e: e[0])
+        return point, t
+
+    def _sides(self, line: Point) -> IntArray:
+        """On which side of a line each corner lies: 1 for its left, -1 for its right, 0 on it."""
+        a, b, c = line
+        (x, y), unit, size = self._centre, self._unit, max(abs(a), abs(b))
+        # Quotients of integers are rounded once, whatever their size.
+        value = self._near @ (a / size, b / size) + (a * x + b * y + c) / (size * unit)
+        sides = np.where(value > 0, 1, -1)
+        for k in np.flatnonzero(np.abs(value) < MARGIN).tolist():
+            sides[k] = _side(line, self._points[k])
+        return sides
+
+
+def _with_last(triangle: tuple[int, int, int], corner: int) -> tuple[int, int, int]:
+    """The same triangle with a corner as the last."""
+    a, b, c = triangle
+    return (b, c, a) if corner == a else (c, a, b) if corner == b else triangle
+
+
+def _cross(p: Point, q: Point) -> Point:
+    """The line through two points, positive to the left of the way from one to the other."""
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+
+
+def _side(line: Point, p: Point) -> int:
+    """1 for a point to the left of a line, -1 for one to its right, 0 on it."""
+    value = line[0] * p[0] + line[1] * p[1] + line[2] * p[2]
+    return (value > 0) - (value < 0)
+
+
+def _turn(p: Point, q: Point, r: Point) -> int:
+    """1 where the way from p over q to r turns left, -1 where it turns right, 0 where it goes straight."""
+    if p[2] == q[2] == r[2] == 1:
+        value = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+        return (value > 0) - (value < 0)
+    return _side(_cross(p, q), r)
+
+
+def _common_end(ways: list[list[Point]]) -> int:
+    """Number of points that paths share at their ends, not counting the start of a single one."""
+    if len(ways) == 1:
+        return len(ways[0]) - 1
+    count = 0
+    for p, q in zip(reversed(ways[0]), reversed(ways[1]), strict=False):
+        if p != q:
+            break
+        count += 1
+    return count

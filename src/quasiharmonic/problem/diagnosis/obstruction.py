@@ -1,0 +1,248 @@
+"""What a diagnosis says: obstructions, each with its kind, its elements and what would help."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.util.arrays import IntArray, ReadOnly, named
+from quasiharmonic.util.display import Displayable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from quasiharmonic.problem import Problem
+
+
+class Forbids(Enum):
+    """The largest class of maps in which an obstruction leaves none; the value says so in words."""
+
+    INJECTIVE = "no map without inverted triangles exists"
+    UNBRANCHED = "a map without inverted triangles winds more than once around one of its vertices"
+    BIJECTIVE = "no bijective map exists, though one without inverted triangles may"
+
+
+class Kind(Enum):
+    """What stands in the way; the value is what would help."""
+
+    COLLAPSED_EDGE = "Give the two vertices different positions."
+    INVERTED_TRIANGLE = "Split the triangle's interior edges, or move one of its vertices."
+    INVERTED_PATCH = "Split the fixed edges around the patch, or move their vertices."
+    SIGNED_AREA = "Reflect the target or reverse its loops until it winds counterclockwise around the mesh."
+    HALF_PLANES = "Split the edges between the vertex and the edges it should lie to the left of."
+    REVERSED = "Reverse the winding of the triangles, F[:, ::-1], or reflect the target."
+    TURNING_NUMBER = "Untwist the target: reverse or move the loops until their turning numbers add up."
+    NEGATIVE_WINDING = "Untwist the target, or move the loops so that holes lie inside and are wound as holes."
+    GENUS = "Cut the handles of the surface open."
+    CROSSING = "Move the named boundary edges apart if the map must not overlap itself."
+    FOLD = "Open the angle at the named vertices if the map must not overlap itself."
+    NESTING = "Move the loops so that one lies outside all others and these outside each other."
+    CHORD = "Split the edge, so that it may bend, or move its ends."
+    PIN = "Move the pin."
+    LINK_DISTANCE = "Split the edges on the shortest paths between the two vertices, or move them."
+    HIDDEN = "Split the edges between the vertex and the fixed vertices it cannot all see."
+
+
+def _ints(values: ArrayLike, *shape: int) -> IntArray:
+    return np.array(values, dtype=np.int64).reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Obstruction(ReadOnly):
+    """One reason why there is no map.
+
+    Attributes
+    ----------
+    kind : Kind
+        Which condition is violated.
+    forbids : Forbids
+        Whether this rules out every injective map or only the bijective ones.
+    message : str
+        A sentence that names the elements.
+    vertices : (a,) int64
+        Vertices of the mesh; the one that finds no place comes first.
+    edges : (b, 2) int64
+        Edges of the mesh, by their vertices.
+    triangles : (c,) int64
+        Triangles of the mesh.
+    loops : (d,) int64
+        Boundary loops, as indices into ``Problem.loops``.
+    split : (s, 2) int64
+        Interior edges that would no longer be in the way if they had a vertex in the middle. Empty
+        where no refinement of the mesh helps.
+    """
+
+    kind: Kind
+    forbids: Forbids
+    message: str
+    vertices: IntArray = field(default_factory=lambda: _ints([], -1))
+    edges: IntArray = field(default_factory=lambda: _ints([], -1, 2))
+    triangles: IntArray = field(default_factory=lambda: _ints([], -1))
+    loops: IntArray = field(default_factory=lambda: _ints([], -1))
+    split: IntArray = field(default_factory=lambda: _ints([], -1, 2))
+
+    def __post_init__(self) -> None:
+        for name in ("vertices", "triangles", "loops"):
+            object.__setattr__(self, name, _ints(getattr(self, name), -1))
+        for name in ("edges", "split"):
+            object.__setattr__(self, name, _ints(getattr(self, name), -1, 2))
+        self._seal()
+
+    def _read_only(self) -> tuple[IntArray, ...]:
+        return self.vertices, self.edges, self.triangles, self.loops, self.split
+
+    @property
+    def advice(self) -> str:
+        """What would help, in a sentence."""
+        return self.kind.value
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: names in lower case, arrays as lists."""
+        return {
+            "kind": self.kind.name.lower(),
+            "forbids": self.forbids.name.lower(),
+            "message": self.message,
+            "advice": self.advice,
+            "vertices": self.vertices.tolist(),
+            "edges": self.edges.tolist(),
+            "triangles": self.triangles.tolist(),
+            "loops": self.loops.tolist(),
+            "split": self.split.tolist(),
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Displayable):
+    """All obstructions found, and what was not looked for.
+
+    Attributes
+    ----------
+    obstructions : tuple of Obstruction
+        Those of the whole target first, then those of single elements. Empty when none is known,
+        which does not prove that a map exists.
+    unchecked : tuple of str
+        Conditions that do not apply or were not decided for this problem, and why.
+    problem : Problem or None
+        What was examined, where it is a whole problem.
+    """
+
+    obstructions: tuple[Obstruction, ...]
+    unchecked: tuple[str, ...] = ()
+    problem: Problem | None = None
+
+    @property
+    def forbids_injective(self) -> bool:
+        """Whether it is proven that every map of this problem inverts a triangle."""
+        return any(o.forbids is Forbids.INJECTIVE for o in self.obstructions)
+
+    @property
+    def forbids_bijective(self) -> bool:
+        """Whether it is proven that no map of this problem is bijective."""
+        return bool(self.obstructions)
+
+    @property
+    def split(self) -> IntArray:
+        """Edges that the obstructions would have split, each once; (s, 2) int64, smaller index first."""
+        every = [np.sort(o.split, axis=1) for o in self.obstructions]
+        return np.unique(np.concatenate([_ints([], -1, 2), *every]), axis=0)
+
+    def summary(self, most: int = 5) -> str:
+        """The diagnosis as text.
+
+        Parameters
+        ----------
+        most : int
+            Obstructions of one kind that are spelled out before the rest is only counted.
+        """
+        if self.forbids_injective:
+            lines = ["No injective map exists: every map with these positions inverts a triangle."]
+        elif self.obstructions:
+            lines = ["No bijective map exists, though one without inverted triangles may."]
+        else:
+            lines = ["No known obstruction: a map may exist."]
+        counts = Counter(o.kind for o in self.obstructions)
+        for kind in counts:
+            same = [o for o in self.obstructions if o.kind is kind]
+            lines += [f"- {o.message} ({o.forbids.value})" for o in same[:most]]
+            if len(same) > most:
+                lines.append(f"- … and {len(same) - most} more of this kind")
+            lines.append(f"  {kind.value}")
+        if len(self.split):
+            edges = f"{len(self.split)} {'edge' if len(self.split) == 1 else 'edges'}"
+            lines.append(f"Splitting {edges} may help: refine_problem, or qhm refine on the command line.")
+        lines += [f"Not checked: {text}" for text in self.unchecked]
+        return "\n".join(lines)
+
+    def short_repr(self) -> str:
+        if not self.obstructions:
+            return "no known obstruction"
+        kinds = Counter(o.kind.name.lower().replace("_", " ") for o in self.obstructions)
+        found = ", ".join(f"{count} × {kind}" for kind, count in kinds.items())
+        return f"no {'injective' if self.forbids_injective else 'bijective'} map: {found}"
+
+    def plot(self) -> Figure:
+        """Draw the surface and where its fixed vertices go, what forbids a map in red.
+
+        Returns
+        -------
+        matplotlib Figure
+
+        Raises
+        ------
+        ValueError
+            When the problem is not known.
+        """
+        figure: Figure = self._draw("diagnosis")
+        return figure
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the verdicts, every obstruction, the edges to split."""
+        return {
+            "forbids_injective": self.forbids_injective,
+            "forbids_bijective": self.forbids_bijective,
+            "obstructions": [o.to_dict() for o in self.obstructions],
+            "split": self.split.tolist(),
+            "unchecked": list(self.unchecked),
+        }
+
+
+def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list[int]:
+    """Of conditions that cannot all hold, some that cannot either, but could if any one were left out.
+
+    Parameters
+    ----------
+    count : int
+        Number of conditions.
+    possible : callable
+        Whether those of given indices can hold together; False for all of them.
+
+    Returns
+    -------
+    list of int
+        Indices, ascending. Found with about ``log2(count)`` calls for each.
+    """
+    chosen: list[int] = []
+    end = count
+    while possible(chosen):
+        # The first condition that is too much, on top of the chosen ones and those before it.
+        low, high = 1, end
+        while low < high:
+            middle = (low + high) // 2
+            if possible([*range(middle), *chosen]):
+                low = middle + 1
+            else:
+                high = middle
+        end = high - 1
+        chosen.insert(0, end)
+    return chosen
+
+
+def named_vertices(vertices: IntArray) -> str:
+    """Name the first few of some vertices."""
+    return named("vertex", "vertices", vertices)

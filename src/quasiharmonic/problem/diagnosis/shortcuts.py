@@ -1,0 +1,177 @@
+"""Paths through the mesh with fewer edges than the target leaves room for.
+
+A path from one boundary vertex to another becomes a path of as many segments inside the target, so
+two vertices cannot be fewer edges apart than their link distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis.clearance import clear
+from quasiharmonic.problem.diagnosis.curves import Corners
+from quasiharmonic.problem.diagnosis.fixture import Fixture
+from quasiharmonic.problem.diagnosis.links import Polygon
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+# Pairs this many edges apart and more are not looked at.
+LONGEST = 8
+# Steps in the triangulated target, some microseconds each, after which the search ends: so many at
+# least, and more by so many for each boundary vertex.
+_WORK, _WORK_PER_VERTEX = 50_000, 10
+# More pairs than this are not collected.
+_MOST_PAIRS = 10_000_000
+# How far beside the middle between two corners both are looked for, in halves of their distance.
+_BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
+# Pairs of a line of sight and an edge near it that are looked at for each length.
+_MOST_NEAR = 1_000_000
+
+
+class Shortcuts:
+    """Looks for boundary vertices that are closer in the mesh than inside the target.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a single boundary loop, simple and counterclockwise in the target.
+    fixture : Fixture
+    corners : Corners
+
+    Attributes
+    ----------
+    unchecked : int
+        Pairs so many edges apart or more were not, or not all, looked at. Known after `find`.
+    """
+
+    def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
+        self._loop = problem.domain.loops[0]
+        free = ~fixture.fixed
+        interior = problem.domain.edges.interior
+        inner = interior[free[interior].all(axis=1)]
+        mixed = interior[free[interior[:, 0]] != free[interior[:, 1]]]
+        mixed = np.where(free[mixed[:, :1]], mixed[:, ::-1], mixed)  # fixed, free
+        place = np.full(problem.n, -1)
+        place[self._loop] = np.arange(len(self._loop))
+        mixed = mixed[place[mixed[:, 0]] >= 0]
+        both = np.concatenate([inner, inner[:, ::-1]])
+        self._inner = csr_array((np.ones(len(both)), both.T), shape=(problem.n, problem.n))
+        self._ends = csr_array(
+            (np.ones(len(mixed)), (place[mixed[:, 0]], mixed[:, 1])), shape=(len(self._loop), problem.n)
+        )
+        self._fixture = fixture
+        self._corners = corners
+        self._sides = np.stack([self._loop, np.roll(self._loop, -1)], axis=1)
+        self._polygon = Polygon(fixture.points(self._loop))
+        self.unchecked = LONGEST + 1
+
+    def find(self) -> Iterator[Obstruction]:
+        """Pairs of vertices that are fewer edges apart than segments, nearest ones first."""
+        n = len(self._loop)
+        budget = _WORK + _WORK_PER_VERTEX * n
+        reached, known = self._ends, np.empty(0, dtype=np.int64)
+        at_ends = np.bincount(self._ends.indices, minlength=self._ends.shape[1])
+        for k in range(2, LONGEST + 1):
+            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > _MOST_PAIRS:
+                self.unchecked = k
+                return
+            pairs = (reached @ self._ends.T).tocoo()
+            i, j = pairs.row.astype(np.int64), pairs.col.astype(np.int64)
+            keys = np.setdiff1d((i * n + j)[i < j], known, assume_unique=True)
+            known = np.concatenate([known, keys])
+            reached = reached @ self._inner + reached
+            reached.data[:] = 1
+            i, j = np.divmod(keys, n)
+            # Along the boundary it takes no more segments than edges, two where there is but one, and
+            # what a vertex sees of its neighbours has been looked at without this.
+            far = (np.minimum((i - j) % n, (j - i) % n) > k) & (k > 2)
+            i, j = i[far], j[far]
+            if not i.size:
+                continue
+            hidden = ~self.within(i, j, k)
+            for a, b in zip(i[hidden].tolist(), j[hidden].tolist(), strict=True):
+                if self._polygon.work > budget:
+                    self.unchecked = k
+                    return
+                if self._polygon.link_distance(a, b, k) > k:
+                    yield self._obstruction(a, b, k)
+
+    def within(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
+        """Whether corners are known to be no more than k > 2 segments apart.
+
+        Known is whether one sees the other, or a third one that is less than k sides from it, and
+        whether both see one of a few points between them.
+        """
+        n, tails, heads = len(self._loop), self._loop[i], self._loop[j]
+        where = self._fixture.positions
+        p, q = where[tails], where[heads]
+        result = self._clear(tails, heads, p, q)
+        seen = np.sort(np.concatenate([(i * n + j)[result], (j * n + i)[result]]))
+        for here, there in ((i, j), (j, i)) if seen.size else ():
+            at = np.searchsorted(seen, here * n + there)
+            for nearest in (seen[np.minimum(at, seen.size - 1)], seen[np.maximum(at - 1, 0)]):
+                result |= (nearest // n == here) & (np.abs(nearest % n - there) < k)
+        # Round a bend the two see one another from a place beside it, towards the inside of the bend.
+        inward = np.where((j - i) % n < (i - j) % n, 1.0, -1.0)
+        dx, dy = (q / 2 - p / 2).T
+        left = np.stack([-dy * inward, dx * inward], axis=1)
+        for height in _BESIDE:
+            open_ = np.flatnonzero(~result)
+            with np.errstate(over="ignore"):
+                place = p[open_] / 2 + q[open_] / 2 + height * left[open_]
+            once = self._clear(tails[open_], None, p[open_], place)
+            open_, place = open_[once], place[once]
+            result[open_] = self._clear(heads[open_], None, q[open_], place)
+        return result
+
+    def _clear(self, tails: IntArray, heads: IntArray | None, p: FloatArray, q: FloatArray) -> BoolArray:
+        """Whether segments that start at corners, and end at others or inside, are known to run inside."""
+        where = self._fixture.positions
+        inside: BoolArray = np.all(np.isfinite(q), axis=1)
+        inside[inside] = self._corners.opens_to(tails[inside], q[inside], where)
+        if heads is not None:
+            inside[inside] = self._corners.opens_to(heads[inside], p[inside], where)
+        ends = np.stack([tails, np.full(len(tails), -1) if heads is None else heads], axis=1)
+        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, _MOST_NEAR)
+        return inside
+
+    def _obstruction(self, a: int, b: int, k: int) -> Obstruction:
+        ends = self._loop[[a, b]]
+        message = (
+            f"A path of {k} edges inside the mesh joins the boundary {named_vertices(ends)}, and inside the target "
+            f"it takes more than {k} segments from one to the other."
+        )
+        path = self._paths(a, b, k)
+        return Obstruction(Kind.LINK_DISTANCE, Forbids.INJECTIVE, message, vertices=ends, edges=path, split=path)
+
+    def _paths(self, a: int, b: int, k: int) -> IntArray:
+        """All edges on shortest paths between two boundary vertices, (e, 2) int64."""
+        forth, back = self._rings(a, k), self._rings(b, k)
+        start, end = self._loop[[a, b]]
+        edges = [np.array([(start, v) for v in np.intersect1d(forth[0], back[k - 2])])]
+        for step in range(1, k - 1):
+            for v in np.intersect1d(forth[step - 1], back[k - 1 - step]).tolist():
+                onward = np.intersect1d(_row(self._inner, v), back[k - 2 - step])
+                edges.append(np.array([(v, w) for w in onward.tolist()]))
+        edges.append(np.array([(v, end) for v in np.intersect1d(forth[k - 2], back[0])]))
+        return np.concatenate(edges)
+
+    def _rings(self, corner: int, k: int) -> list[IntArray]:
+        """Free vertices that are exactly 1, 2, … k - 1 edges away from a boundary vertex."""
+        rings = [_row(self._ends, corner)]
+        inside = rings[0]
+        for _ in range(k - 2):
+            following = np.unique(np.concatenate([_row(self._inner, v) for v in rings[-1].tolist()]))
+            rings.append(np.setdiff1d(following, inside))
+            inside = np.union1d(inside, rings[-1])
+        return rings
+
+
+def _row(matrix: csr_array, k: int) -> IntArray:
+    """Column indices of the entries in a row."""
+    columns: IntArray = matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)
+    return columns

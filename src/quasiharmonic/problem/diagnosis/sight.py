@@ -1,0 +1,175 @@
+"""Conditions on targets whose loops are simple, disjoint and properly nested.
+
+A map without inverted triangles is then injective, onto the region between the loops, and takes
+interior points to interior points. So no two edges cross and every open edge lies strictly inside:
+an edge between fixed vertices where it is given, any other where its free end sees the fixed one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.loops import contacts
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis.clipping import Convex, Walls
+from quasiharmonic.problem.diagnosis.curves import MOST_CONTACTS, BoundaryCurves, Corners
+from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
+from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices, smallest_conflict
+from quasiharmonic.problem.diagnosis.views import Views
+from quasiharmonic.util.arrays import IntArray, named_edges
+
+# So many vertices are looked at before all others, however many have to be seen.
+_APART = 8
+
+
+def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves, corner: Corners) -> Iterator[Obstruction]:
+    """Interior edges with both ends fixed that do not lie strictly inside, free of all else that is fixed."""
+    chords, where = fixture.chords, fixture.positions
+    if not len(chords):
+        return
+    segments = np.concatenate([curves.ends, np.stack([problem.domain.pins, problem.domain.pins], axis=1), chords])
+    first = len(segments) - len(chords)
+    met: dict[int, list[IntArray]] = {}
+    for i, j in contacts(where, segments, MOST_CONTACTS).pairs.tolist():
+        if j >= first:
+            # Of two edges that cross one another it is enough to name one.
+            met.setdefault(j - first, []).append(segments[i])
+    outside = np.zeros(len(chords), dtype=bool)
+    for end, other in (chords.T, chords[:, ::-1].T):
+        outside |= corner.known[end] & ~corner.opens_to(end, where[other], where)
+    for k, chord in enumerate(chords):
+        if k not in met and not outside[k]:
+            continue
+        others = np.array(met.get(k, []), dtype=np.int64).reshape(-1, 2)
+        edges, points = others[others[:, 0] != others[:, 1]], others[others[:, 0] == others[:, 1], 0]
+        what = [named_edges(edges)] * bool(len(edges)) + [named_vertices(points)] * bool(len(points))
+        place = f"meets {' and '.join(what)} there" if what else "lies outside the target"
+        yield Obstruction(
+            Kind.CHORD,
+            Forbids.INJECTIVE,
+            f"Both ends of the interior {named_edges(chord[None])} are fixed, and the segment between them {place}.",
+            vertices=np.concatenate([chord, points]),
+            edges=np.concatenate([chord[None], edges]),
+            split=chord,
+        )
+
+
+class Sight:
+    """Looks for a place from which a vertex sees all its fixed neighbours.
+
+    Parameters
+    ----------
+    problem : Problem
+    fixture : Fixture
+    corners : Corners
+        Of a target that is simple and properly nested.
+    walls : (m, 2) int64
+        Edges that nothing sees through: of the boundary, and interior ones with both ends fixed.
+    effort : Effort
+        What may be spent on all that is asked.
+    """
+
+    def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray, effort: Effort) -> None:
+        self._fixture = fixture
+        ends = fixture.row[walls]
+        beside = np.stack([corners.after, corners.before], axis=1)[problem.fixed]
+        beside = np.where(beside >= 0, fixture.row[beside], -1)
+        self._walls = Walls(ends, fixture.lattice, effort)
+        self._views = Views(ends, problem.target, fixture.lattice, beside, effort)
+
+    def hidden(self, star: Star) -> Obstruction | None:
+        """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it.
+
+        Raises
+        ------
+        EffortSpentError
+            When to decide it takes more than may be spent.
+        """
+        neighbours, opposite = self._apart_first(star.neighbours), star.opposite
+        if self._place(neighbours, opposite):
+            return None
+        edges, seen = opposite, neighbours
+        # Where the effort ends before a smallest reason is found, a larger one is as true.
+        with suppress(EffortSpentError):
+            edges = opposite[smallest_conflict(len(opposite), lambda some: self._place(neighbours, opposite[some]))]
+            # Without anything to be seen, half-planes alone leave room: otherwise they were the reason.
+            seen = neighbours[
+                smallest_conflict(len(neighbours), lambda some: not some or self._place(neighbours[some], edges))
+            ]
+        vertex = np.array([star.vertex])
+        beside = f", from the left of {named_edges(edges)}" if len(edges) else ""
+        ends = np.unique(np.concatenate([seen, edges.ravel()]))
+        return Obstruction(
+            Kind.HIDDEN,
+            Forbids.INJECTIVE,
+            f"{named_vertices(vertex).capitalize()} is joined to the fixed {named_vertices(seen)}, "
+            f"which no point of the target sees together{beside}.",
+            vertices=np.concatenate([vertex, seen]),
+            edges=edges,
+            split=np.stack([np.full(len(ends), star.vertex), ends], axis=1),
+        )
+
+    def _apart_first(self, vertices: IntArray) -> IntArray:
+        """Fixed vertices in an order in which each of the first few is far from those before it.
+
+        What they cannot all see is then found out before many small pieces of it are looked at.
+        """
+        near = self._fixture.lattice.near[self._fixture.row[vertices]]
+        distance = np.full(len(vertices), np.inf)
+        first = [0]
+        while len(first) < min(_APART, len(vertices)):
+            distance = np.minimum(distance, np.hypot(*(near - near[first[-1]]).T))
+            distance[first] = -1.0
+            first.append(int(np.argmax(distance)))
+        return np.concatenate([vertices[first], np.delete(vertices, first)])
+
+    def _place(self, neighbours: IntArray, edges: IntArray) -> bool:
+        """Whether some point inside sees the neighbours and lies to the left of the edges."""
+        eyes, overlaps = self._least_in_common(self._fixture.row[neighbours].tolist())
+        if overlaps is not None and not len(overlaps):
+            return False
+        area = self._fixture.left_of(self._fixture.extent(), edges)
+        return area is not None and any(
+            self._walls.seeing(part, eyes) is not None for part in self._in_view(area, eyes, overlaps)
+        )
+
+    def _least_in_common(self, eyes: list[int]) -> tuple[list[int], IntArray | None]:
+        """Eyes in an order in which the first two have little in common, and their wedges that may overlap."""
+        order, least = eyes, None
+        for k in range(1, len(eyes)):
+            if least is not None and not len(least):
+                break
+            overlaps = self._views.wedges(eyes[0]).overlapping(self._views.wedges(eyes[k]))
+            if overlaps is not None and (least is None or len(overlaps) < len(least)):
+                order, least = [eyes[0], eyes[k], *eyes[1:k], *eyes[k + 1 :]], overlaps
+        return order, least
+
+    def _in_view(self, area: Convex, eyes: list[int], overlaps: IntArray | None) -> Iterator[Convex]:
+        """The parts of an area in wedges of all eyes; ``overlaps`` are those of the first two that may overlap."""
+        if not eyes:
+            yield area
+            return
+        # One eye within the other, however many there are.
+        ways = [self._parts(area, eyes[0], None if overlaps is None else overlaps[:, 0])]
+        while ways:
+            k, part = next(ways[-1], (-1, None))
+            if part is None:
+                ways.pop()
+            elif len(ways) == len(eyes):
+                yield part
+            else:
+                few = overlaps[overlaps[:, 0] == k, 1] if overlaps is not None and len(ways) == 1 else None
+                ways.append(self._parts(part, eyes[len(ways)], few))
+
+    def _parts(self, area: Convex, eye: int, wedges: IntArray | None) -> Iterator[tuple[int, Convex]]:
+        """The parts of an area in the wedges of an eye, or some of them, each with the index of its wedge."""
+        view = self._views.wedges(eye)
+        if wedges is None:
+            return view.parts(area)
+        some = np.zeros(len(view), dtype=bool)
+        some[wedges] = True
+        return view.parts(area, some)

@@ -1,0 +1,194 @@
+"""What can be seen past walls from a point, in all directions.
+
+From an eye, every direction ends at a wall, the nearest one. Directions that end at the same wall make
+a wedge between two rays through ends of walls. Which walls cover which directions is decided exactly;
+which of them is nearest by rounded distances. Where that errs the wedge reaches behind a nearer wall, so
+that wedges contain all that is seen, and may contain more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cmp_to_key
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.problem.diagnosis.clipping import Lattice, cross
+from quasiharmonic.problem.diagnosis.effort import Effort
+from quasiharmonic.problem.diagnosis.wedges import Wedges
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+SignArray = NDArray[np.int8]
+
+# Views that are kept, for eyes that are looked from again.
+_MOST_KEPT = 200
+
+
+class Views:
+    """What is seen from points among walls.
+
+    Parameters
+    ----------
+    ends : (m, 2) int64
+        The walls, as pairs of points.
+    positions : (k, 2) float64
+        The points.
+    lattice : Lattice
+        The same.
+    corner : (k, 2) int64
+        For each point that is a corner of the target the next one and the one before, else -1.
+    effort : Effort
+        Of which looking, and what is done with the views, takes.
+    """
+
+    def __init__(
+        self, ends: IntArray, positions: FloatArray, lattice: Lattice, corner: IntArray, effort: Effort
+    ) -> None:
+        self._ends, self._positions, self._lattice, self._corner = ends, positions, lattice, corner
+        # For what need not be exact: of magnitude one, so that nothing is too large.
+        self._scaled = np.ldexp(positions, -int(np.frexp(np.abs(positions).max())[1]))
+        self._kept: dict[int, Wedges] = {}
+        self._effort = effort
+
+    def wedges(self, eye: int) -> Wedges:
+        """What is seen from a point, from a corner to the inside only.
+
+        Walls that end in the point, or lie on a line with it, hide nothing.
+        """
+        if eye not in self._kept:
+            while len(self._kept) >= _MOST_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[eye] = self._look(eye)
+        return self._kept[eye]
+
+    def _look(self, eye: int) -> Wedges:
+        """Wedges of an eye; see `wedges`."""
+        self._effort.spend(500 + len(self._ends))
+        here, where = self._positions[eye], self._positions
+        turn = orientation(here, where[self._ends[:, 0]], where[self._ends[:, 1]])
+        turn[(self._ends == eye).any(axis=1)] = 0
+        walls = np.where(turn[:, None] > 0, self._ends, self._ends[:, ::-1])[turn != 0]
+        sides = self._corner[eye]
+        around, rank = self._sorted(eye, np.unique(np.append(walls, sides[sides >= 0])))
+        first, last = rank[walls.T]
+        count, owner = len(around), np.arange(len(walls))
+        # A wall that covers the direction in which counting begins is taken as two.
+        over = np.flatnonzero(last < first)
+        first, last = np.append(first, np.zeros_like(over)), np.append(np.where(last < first, count, last), last[over])
+        owner = np.append(owner, over)[first < last]
+        first, last = first[first < last], last[first < last]
+        tail, head = self._scaled[walls[owner].T] - self._scaled[eye]
+        ray = self._scaled[around] - self._scaled[eye]
+        with np.errstate(invalid="ignore"):  # a direction that is lost in rounding
+            ray /= np.hypot(*ray.T)[:, None]
+        between = ray + np.roll(ray, -1, axis=0)
+        nearest = _nearest(first, last, tail, head - tail, between)
+        if sides[0] >= 0:
+            # From the side that follows around to the one before is what is inside.
+            nearest[(np.arange(count) - rank[sides[0]]) % count >= (rank[sides[1]] - rank[sides[0]]) % count] = -1
+        begin = np.flatnonzero(np.append(-2, nearest[:-1]) != nearest) if count else around
+        end = np.append(begin[1:], 0)
+        seen = nearest[begin] >= 0
+        return Wedges(
+            self._lattice, eye, around[begin[seen]], around[end[seen]], walls[owner[nearest[begin[seen]]]], self._effort
+        )
+
+    def _sorted(self, eye: int, points: IntArray) -> tuple[IntArray, IntArray]:
+        """Sort points by direction from the eye, counterclockwise from that of the x axis.
+
+        Returns
+        -------
+        around : (r,) int64
+            One of the points in each direction, in order.
+        rank : (k,) int64
+            The place of the direction of a point in this order; of no meaning for other points.
+        """
+        here, where = self._positions[eye], self._positions
+        low = (where[:, 1] < here[1]) | ((where[:, 1] == here[1]) & (where[:, 0] < here[0]))
+        dx, dy = (self._scaled[points] - self._scaled[eye]).T
+        angle = np.arctan2(dy, dx)
+        angle[low[points] & (angle > 0)] = -np.pi
+        points = points[np.lexsort([angle, low[points]])]
+
+        def turns() -> SignArray:
+            """For all but the last: 1 where the next one comes later, 0 where it lies in the same direction."""
+            turn = orientation(here, where[points[:-1]], where[points[1:]])
+            turn[low[points[:-1]] != low[points[1:]]] = 1
+            return turn
+
+        turn = turns()
+        if np.any(turn < 0):
+            # Directions that differ by a rounding.
+            points = np.array(sorted(points.tolist(), key=self._direction(eye, low)), dtype=np.int64)
+            turn = turns()
+        new = np.append(True, turn > 0)[: len(points)]
+        rank = np.zeros(len(where), dtype=np.int64)
+        rank[points] = np.cumsum(new) - 1
+        return points[new], rank
+
+    def _direction(self, eye: int, low: BoolArray) -> Callable[[int], Any]:
+        """The key by which points are sorted, exact."""
+        points = self._lattice.points
+        (x, y), lower = points[eye], low.tolist()
+
+        def compare(i: int, j: int) -> int:
+            if lower[i] != lower[j]:
+                return 1 if lower[i] else -1
+            (px, py), (qx, qy) = points[i], points[j]
+            return (py - y) * (qx - x) - (px - x) * (qy - y)
+
+        return cmp_to_key(compare)
+
+
+def _nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArray, ray: FloatArray) -> IntArray:
+    """The nearest wall in each of a circle of directions.
+
+    Each wall is put where two overlapping runs of 2ᵏ directions cover it. Of the walls on the same run
+    the nearest is the same in all its directions, as they do not cross, and it is handed down from run
+    to half run.
+
+    Parameters
+    ----------
+    first, last : (m,) int64
+        Directions that each wall covers, from the first one on up to, not including, the last.
+    tail, along : (m, 2) float64
+        Where each wall begins, seen from the eye, and what leads from there to its end.
+    ray : (r, 2) float64
+        The directions.
+
+    Returns
+    -------
+    (r,) int64
+        Index of a wall, -1 where there is none.
+    """
+    best = np.full(len(ray), -1)
+    if not len(first):
+        return best
+    above = cross(tail, along)
+
+    def distance(wall: IntArray, direction: IntArray) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            result: FloatArray = above[wall] / cross(ray[direction], along[wall])
+        return result
+
+    def put(wall: IntArray, direction: IntArray) -> None:
+        held = best[direction]
+        nearer = (held < 0) | (distance(wall, direction) < distance(held, direction))
+        best[direction[nearer]] = wall[nearer]
+
+    level = np.frexp((last - first).astype(np.float64))[1] - 1
+    for k in range(int(level.max()), -1, -1):
+        if k < level.max():
+            # Each run of the level before is two of this one.
+            whole = np.flatnonzero(best >= 0)
+            put(best[whole], whole + (1 << k))
+        here = np.flatnonzero(level == k)
+        wall, start = np.concatenate([here, here]), np.concatenate([first[here], last[here] - (1 << k)])
+        order = np.lexsort([distance(wall, start), start])
+        wall, start = wall[order], start[order]
+        foremost = np.append(True, start[1:] != start[:-1])[: len(start)]
+        put(wall[foremost], start[foremost])
+    return best

@@ -1,0 +1,135 @@
+"""Places for free vertices, found by trial and proven exactly, for many vertices at once.
+
+Where a vertex has a place it is nearly always an obvious one, and showing that a point is one takes far
+less than showing that there is none.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.problem.diagnosis.clearance import clear
+from quasiharmonic.problem.diagnosis.curves import Corners
+from quasiharmonic.problem.diagnosis.fixture import Fixture, Stars
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+# How far from the edges around it a vertex is looked for, as parts of the distance of its neighbours.
+_MARGINS = 0.1, 0.01, 0.001
+# Steps towards such a place.
+_STEPS = 8
+# Pairs of a segment and a wall near it to be looked at in each trial: so many, and more for each star.
+_PAIRS, _PAIRS_PER_STAR = 1_000_000, 100
+
+
+def unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls: IntArray) -> IntArray:
+    """Stars for which no place was found by trial.
+
+    Parameters
+    ----------
+    stars : Stars
+    fixture : Fixture
+    corners : Corners or None
+        The target's, where it is simple and properly nested; None where vertices need not see their
+        neighbours.
+    walls : (m, 2) int64
+        Edges that nothing sees through.
+
+    Returns
+    -------
+    (k,) int64
+        Indices of stars, ascending.
+    """
+    waiting = np.arange(len(stars))
+    places = _middles(stars, fixture)
+    for margin in (0.0, *_MARGINS, None):
+        some = stars.take(waiting)
+        if margin is None:
+            places = _middles_of_rooms(some, fixture, corners)
+        elif margin > 0:
+            places = _shifted(some, places, fixture, corners, margin)
+        left = ~_suits(some, places, fixture, corners, walls)
+        waiting, places = waiting[left], places[left]
+        if not waiting.size:
+            break
+    return waiting
+
+
+def _middles(stars: Stars, fixture: Fixture) -> FloatArray:
+    """The mean of each star's neighbours, (s, 2) float64."""
+    number = np.bincount(stars.of_neighbour, minlength=len(stars))
+    share = fixture.positions[stars.neighbours] / number[stars.of_neighbour, None]
+    return np.stack([np.bincount(stars.of_neighbour, share[:, c], minlength=len(stars)) for c in (0, 1)], axis=1)
+
+
+def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, margin: float) -> FloatArray:
+    """Places moved to the left of the edges that they are to be left of, one edge after another."""
+    where = fixture.positions
+    of, edge = _sides(stars, fixture, corners)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        along = where[edge[:, 1]] - where[edge[:, 0]]
+        inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
+        size = np.zeros(len(stars))
+        np.maximum.at(size, stars.of_neighbour, np.hypot(*(where[stars.neighbours] - places[stars.of_neighbour]).T))
+        for _ in range(_STEPS):
+            lacking = margin * size[of] - np.einsum("ij,ij->i", places[of] - where[edge[:, 0]], inward)
+            order = np.lexsort([-lacking, of])
+            worst = order[np.append(True, of[order[1:]] != of[order[:-1]])[: len(order)]]
+            worst = worst[lacking[worst] > 0]
+            if not worst.size:
+                break
+            places = places.copy()
+            places[of[worst]] += lacking[worst, None] * inward[worst]
+    return places
+
+
+def _middles_of_rooms(stars: Stars, fixture: Fixture, corners: Corners | None) -> FloatArray:
+    """The middle of what lies to the left of the edges that each star is to be left of, NaN where nothing does."""
+    places = np.full((len(stars), 2), np.nan)
+    of, edge = _sides(stars, fixture, corners)
+    edge = edge[np.argsort(of, kind="stable")]
+    ends = np.cumsum(np.bincount(of, minlength=len(stars)))
+    for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()])):
+        room = fixture.left_of(fixture.extent(), edge[begin:end])
+        if room is not None:
+            places[k] = fixture.lattice.middle(room)
+    return places
+
+
+def _sides(stars: Stars, fixture: Fixture, corners: Corners | None) -> tuple[IntArray, IntArray]:
+    """Edges that stars are to be left of: the index of the star (h,) and the edge (h, 2)."""
+    of, edge = stars.of_opposite, stars.opposite
+    if corners is None:
+        return of, edge
+    # What a vertex sees from a convex corner is to the left of both edges there.
+    known = corners.known[stars.neighbours]
+    v, star = stars.neighbours[known], stars.of_neighbour[known]
+    convex = ~corners.reflex(v, fixture.positions)
+    v, star = v[convex], star[convex]
+    of = np.concatenate([of, star, star])
+    return of, np.concatenate([edge, np.stack([corners.before[v], v], 1), np.stack([v, corners.after[v]], 1)])
+
+
+def _suits(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, walls: IntArray) -> BoolArray:
+    """Whether places are ones, decided exactly where True; (s,) bool."""
+    where = fixture.positions
+    fixed = where[fixture.fixed]
+    # A map without inverted triangles stays within the box around what is fixed. Not so NaN.
+    good: BoolArray = np.all((fixed.min(axis=0) < places) & (places < fixed.max(axis=0)), axis=1)
+    places = np.where(good[:, None], places, 0.0)
+    of, edge = stars.of_opposite, stars.opposite
+    good[of[orientation(where[edge[:, 0]], where[edge[:, 1]], places[of]) <= 0]] = False
+    if corners is None:
+        return good
+    of, eye = stars.of_neighbour, stars.neighbours
+    known = corners.known[eye]
+    shut = ~corners.opens_to(eye[known], places[of[known]], where)
+    good[of[known][shut]] = False
+    look = np.flatnonzero(good[of])
+    ends = np.stack([eye[look], np.full(len(look), -1)], axis=1)
+    most = _PAIRS + _PAIRS_PER_STAR * len(stars)
+    seen = clear(where[eye[look]], places[of[look]], ends, walls, where, most)
+    good[of[look[~seen]]] = False
+    return good

@@ -1,1 +1,0 @@
-"""Displacement fields on grids of pixels: the nearest one without folds, and the inverse of one."""

@@ -1,1 +1,0 @@
-"""From a problem to a map: what is tried, in which order, and when it ends."""

@@ -1,0 +1,171 @@
+"""A map of a refined mesh onto a simple target: constructed, certified, and thinned out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.certificate import Certificate, certify
+from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.solver.construction.ancestry import as_refined, midpoints
+from quasiharmonic.solver.construction.cutting import Cutting, TooManyError
+from quasiharmonic.solver.construction.embedding import embedded
+from quasiharmonic.solver.construction.opening import thinned
+from quasiharmonic.solver.construction.simplicity import is_simple
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Vertices added for each of the mesh's, at which another way to cut is tried first; and so many at which cutting ends
+# where none is left, for walks around many pins that lie elsewhere in the mesh can grow without bound.
+_MANY, _MOST = 50, 60_000
+
+
+@dataclass(frozen=True, eq=False)
+class Construction:
+    """A map of a refined mesh.
+
+    Attributes
+    ----------
+    refined : Refined
+        How the mesh came from the problem's.
+    uv : (n + s, 2) float64
+        The map, fixed vertices exactly at their target.
+    certificate : Certificate
+        The exact verdict on it: bijective, or else doubles have no room where triangles are not positive.
+    crowded : (c,) int64
+        Fixed vertices nearest to these, none if there are none.
+    cut : bool
+        Whether the mesh could be cut with as many vertices as are allowed; if not, the map is one of the mesh as it is.
+    """
+
+    refined: Refined
+    uv: FloatArray
+    certificate: Certificate
+    crowded: IntArray
+    cut: bool = True
+
+
+def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Construction]:
+    """Constructions near a map at hand and without one, each better than those before: the last adds fewest vertices.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a target that `is_simple`.
+    best_map : (n, 2) float64
+        The best map known, though it inverts triangles.
+
+    Yields
+    ------
+    Construction
+        One at least. A map is there as soon as it is certified, before what it can do without is taken out. Where no
+        way to cut does with as many vertices as are allowed, the map at hand, and that it was not cut.
+    """
+    least = None
+    # Around a bad map walks may grow without end, each along those before it.
+    most = _MANY * (problem.n + _MANY)
+    for guide, limit in ((best_map, most), (None, most), (best_map, max(most, _MOST))):
+        if least is not None and (limit > most or not least[1]):
+            break
+        try:
+            for made in _constructions(problem, guide, most=limit):
+                rank = not made.certificate.bijective, len(made.refined.parents)
+                if least is None or rank <= least:
+                    least = rank
+                    yield made
+        except TooManyError:
+            continue
+    if least is None:
+        certificate = certify(problem.F, best_map, loops=problem.domain.loops)
+        nowhere = np.empty(0, dtype=np.int64)
+        yield Construction(as_refined(problem.V, problem.F, problem.F, []), best_map, certificate, nowhere, cut=False)
+
+
+def construct(problem: Problem, guide: FloatArray | None = None, *, thin: bool = True) -> Construction:
+    """Construct a map onto a simple target.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a target that `is_simple`.
+    guide : (n, 2) array, optional
+        A map, whatever it inverts, near which the mesh is to be cut. Without it the mesh is cut open near Tutte's
+        embedding, and then near the map of the disk that it has become into a circle.
+    thin : bool
+        Take out again what vertices the map can do without.
+
+    Returns
+    -------
+    Construction
+        What the proof says exists; where rounding leaves inverted triangles, with these. Where the target's coordinates
+        span so much that no scale bears products of all of them: the mesh as it is.
+    """
+    *_, made = islice(_constructions(problem, guide), None if thin else 1)
+    return made
+
+
+def _constructions(problem: Problem, guide: FloatArray | None, *, most: int | None = None) -> Iterator[Construction]:
+    """A construction as it comes, and, if it is certified, once more with what it can do without taken out.
+
+    Raises
+    ------
+    TooManyError
+        When more vertices would be added than ``most``.
+    """
+    # Of magnitude about one, so that no product overflows.
+    exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
+
+    def judged(refined: Refined, uv: FloatArray) -> Construction:
+        uv = np.ldexp(uv, exponent)
+        uv[problem.fixed] = problem.target
+        certificate = certify(refined.F, uv, loops=problem.domain.loops)
+        return Construction(refined, uv, certificate, _nearest(problem, refined.F, uv, certificate))
+
+    if not np.array_equal(np.ldexp(unit.target, exponent), problem.target) and not is_simple(unit):
+        whole = as_refined(problem.V, problem.F, problem.F, [])
+        yield judged(whole, np.zeros((problem.n, 2)) if guide is None else np.ldexp(guide, -exponent))
+        return
+    near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
+    refined, uv = _embedded(unit, Cutting(unit, near, most))
+    made = judged(refined, uv)
+    yield made
+    if len(refined.parents) and certify(refined.F, uv, loops=problem.domain.loops).bijective:
+        yield judged(*thinned(unit, refined, uv))
+
+
+def _embedded(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
+    """The mesh as cutting has left it, in one piece again, and the map of its pieces into convex polygons."""
+    sheet = cutting.sheet
+    triangles = np.array(sheet.vertex)[sheet.rows()]
+    refined = as_refined(problem.V, problem.F, triangles, midpoints(problem.n, sheet.parents))
+    fine = refined_problem(problem, refined)
+    uv = np.zeros((len(refined.V), 2))
+    uv[problem.fixed] = problem.target
+    walked = np.array(sorted(cutting.places), dtype=np.int64)
+    for vertex in walked.tolist():
+        uv[vertex] = cutting.places[vertex].real, cutting.places[vertex].imag
+    held = np.concatenate([problem.fixed, walked])
+    return refined, fine.positions(embedded(fine, fine.frame.inward(uv), held))
+
+
+def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
+    """The fixed vertices nearest to triangles that are not positive, ascending."""
+    from scipy.spatial import cKDTree
+
+    bad = np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
+    if not bad.size:
+        return bad
+    # Of magnitude about one, so that distances neither over- nor underflow.
+    scale = -int(np.frexp(np.abs(problem.target).max())[1])
+    middles = np.nan_to_num(np.ldexp(uv[F[bad]], scale)).mean(axis=1)
+    _, nearest = cKDTree(np.ldexp(problem.target, scale)).query(middles)
+    return np.unique(problem.fixed[nearest])
+
+
+def refined_problem(problem: Problem, refined: Refined) -> Problem:
+    """A problem on a refinement of its mesh, whose triangles may be as thin as they like at rest."""
+    return Problem.on(Domain(refined.V, refined.F, problem.fixed), problem.target, reference=problem.reference)

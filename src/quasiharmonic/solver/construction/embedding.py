@@ -1,0 +1,104 @@
+"""Tutte's embedding of the pieces of a cut mesh, and what is done where doubles do not bear it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.problem import Problem
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods import Patches, RandomRestarts, Untangling
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+
+# How often weights are renewed: as the areas to this power, and no further from each other than by this factor.
+_RENEWALS, _POWER, _SPAN = 4, 0.5, 1e6
+# What rights the last triangles, where vertices on cuts may move too; each has its limit, for doubles may have no room.
+_REPAIRS = Patches(tries=30), Untangling(iterations=200), RandomRestarts(in_vain=20, tries=20)
+
+
+def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:
+    """Put every free vertex into the weighted middle of its neighbours.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    w : (n,) complex128
+        Places; only those of held vertices are read.
+    held : (k,) int64
+        Vertices that stay, on every part of the mesh.
+    weights : (f,) float64
+        Positive; an edge weighs as much as the triangles beside it together.
+
+    Returns
+    -------
+    (n,) complex128
+
+    Raises
+    ------
+    quasiharmonic.linsolve.NotPositiveDefinite
+        When rounding leaves no positive definite system.
+    """
+    if len(np.unique(held)) == len(w):
+        return w
+    alike = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
+    stiffness = ReferenceMesh(np.zeros((len(w), 2)), F, "equilateral").edge_stiffness(alike * weights)
+    return Laplacian(F, len(w), held).factor(stiffness).extend(w)
+
+
+def embedded(problem: Problem, w: ComplexArray, held: IntArray) -> ComplexArray:
+    """Embed convex pieces into their polygons, and right what rounding has inverted.
+
+    Parameters
+    ----------
+    problem : Problem
+    w : (n,) complex128
+        Places of the held vertices in the problem's frame.
+    held : (k,) int64
+        Vertices on the boundaries of pieces.
+
+    Returns
+    -------
+    (n,) complex128
+        The map of the fewest inverted triangles that was met, by the positions that it stands for.
+    """
+    best, least = w, len(problem.F) + 1
+    for now in _candidates(problem, w, held):
+        flipped = flipped_triangles(problem.F, problem.positions(now)).size
+        if flipped < least:
+            best, least = now, flipped
+        if least == 0:
+            break
+    return best
+
+
+def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[ComplexArray]:
+    """Embeddings by ever other weights, then what is righted of the best of them."""
+    weights, best, least = np.ones(len(problem.F)), w, np.inf
+    for _ in range(1 + _RENEWALS):
+        try:
+            w = tutte(problem.F, w, held, weights)
+        except NotPositiveDefinite:
+            break
+        yield w
+        flipped = flipped_triangles(problem.F, problem.positions(w)).size
+        if flipped < least:
+            best, least = w, flipped
+        # What is crowded gets softer springs.
+        areas = np.abs(signed_areas(problem.F, w))
+        weights = weights * np.clip(areas / areas.max(), 1 / _SPAN, 1.0) ** _POWER
+    objective = Objective(problem)
+    here = objective.of_map(best)
+    for repair in _REPAIRS:
+        try:
+            for step in repair.iterates(objective, here):
+                again, here = step.w is here.w, step
+                if not again:
+                    yield here.w
+        except NotPositiveDefinite:
+            return

@@ -1,0 +1,92 @@
+"""A constructed map opened up, and thinned out as it gets room."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import cycle, islice
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.problem import Frame, Problem
+from quasiharmonic.solver.construction.ancestry import as_refined, shares_of
+from quasiharmonic.solver.construction.thinning import Thinning
+from quasiharmonic.solver.methods.local_repair import Patch
+from quasiharmonic.solver.methods.untangling import GRADINGS, opened, untangled
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
+
+# Opened and thinned at most so often; what does not go even then is tried harder, so many vertices at most, the map
+# around each untangled within so many rings, in so many steps.
+_ROUNDS, _TRIES, _RINGS, _STEPS = 6, 30, 2, 20
+
+
+def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined, FloatArray]:
+    """Take vertices out of a refinement as long as its map stays bijective.
+
+    Parameters
+    ----------
+    problem : Problem
+        On the old mesh.
+    refined : Refined
+    uv : (n + s, 2) float64
+        A bijective map of it.
+
+    Returns
+    -------
+    refined : Refined
+        With as many vertices or fewer.
+    uv : (n + s, 2) float64
+        A bijective map of it, to the last bit where it was if no vertex went.
+    """
+    # Of magnitude about one, so that no product overflows.
+    exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    given, uv = uv, np.ldexp(uv, -exponent)
+    if not np.array_equal(np.ldexp(uv, exponent), given):
+        # Coordinates that span so much stay as they are: what is left of them may fold.
+        return refined, given
+    unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent))
+    gradings = cycle(GRADINGS)
+    for _ in range(_ROUNDS):
+        refined, uv = _taken_out(unit, refined, uv)
+        if not len(refined.parents):
+            break
+        uv = _opened(unit, refined, uv, next(gradings))
+    refined, uv = _taken_out(unit, refined, uv, _TRIES)
+    uv = np.ldexp(uv, exponent)
+    uv[problem.fixed] = problem.target
+    return refined, uv
+
+
+def _opened(problem: Problem, refined: Refined, uv: FloatArray, grading: float) -> FloatArray:
+    """The map with its triangles evened out, or as it was where rounding would invert one."""
+    loose = problem.frame.outward(opened(refined.F, problem.frame.inward(uv), problem.fixed, grading=grading))
+    loose[problem.fixed] = problem.target
+    return loose if is_injective(refined.F, loose) else uv
+
+
+def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
+    """Take out what can be taken out, and with so many tries what can be made to go."""
+    shares = shares_of(refined)
+    thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ np.array([1, 1j]))
+    thinning.thin()
+    for vertex in sorted(thinning.left, reverse=True)[:tries]:
+        thinning.try_hard(vertex, partial(_untangled, problem.frame), _RINGS)
+    if len(thinning.left) == len(shares):
+        return refined, uv
+    left = sorted(thinning.left)
+    kept = np.concatenate([np.arange(problem.n), left]).astype(np.int64)
+    number = np.full(len(uv), -1)
+    number[kept] = np.arange(len(kept))
+    V = refined.V[: problem.n]
+    triangles = number[np.array(thinning.mesh.triangles(), dtype=np.int64)]
+    refined = as_refined(V, problem.F, triangles, [shares[vertex - problem.n] for vertex in left])
+    return refined, thinning.w[kept].view(np.float64).reshape(-1, 2)
+
+
+def _untangled(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray:
+    """Where untangling a map of a patch ends, in the units of the target."""
+    inward = frame.inward(w.view(np.float64).reshape(-1, 2))
+    steps = untangled(patch.F, inward, np.flatnonzero(patch.held), grading=GRADINGS[0])
+    *_, last = inward, *islice(steps, _STEPS)
+    return np.where(patch.held, w, frame.outward(last).view(np.complex128).ravel())

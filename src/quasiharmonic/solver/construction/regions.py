@@ -1,0 +1,208 @@
+"""A target cut into convex regions without further points, and the order in which the cuts are made.
+
+Constrained Delaunay triangles, of which neighbours are joined as long as what comes out is convex [1]_. What is left of
+their edges, the *cuts*, connects all loops and pins, since a convex region surrounds none.
+
+References
+----------
+.. [1] S. Hertel, K. Mehlhorn, Fast triangulation of simple polygons. Foundations of Computation Theory, Lecture Notes
+   in Computer Science 158 (1983).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from heapq import heappop, heappush
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.solver.construction.halfedges import Edge
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# A turn at a point is none when the point is off the line by no more than so many roundings of the largest coordinate.
+_ROUNDINGS = 4.0
+
+
+class Regions:
+    """A region of the plane within loops, around points, and how it is cut into convex regions.
+
+    Parameters
+    ----------
+    points : (k, 2) float64
+        Places, pairwise distinct, of magnitude about one.
+    loops : sequence of (l,) int64
+        Loops of points, the region to their left; simple, disjoint and nested.
+    pins : (p,) int64
+        Points strictly inside. All points are on a loop or a pin.
+
+    Attributes
+    ----------
+    apex : dict
+        The third corner of the triangle to the left of a half-edge of the triangulation, inside the loops.
+    kept : set of (int, int)
+        The cuts, by half-edges, each both ways.
+    """
+
+    def __init__(self, points: FloatArray, loops: Sequence[IntArray], pins: IntArray) -> None:
+        self.points = points
+        self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
+        self._off = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
+        rim = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
+        self.apex: dict[Edge, int] = {}
+        for a, b, c in _triangles_within(points, rim).tolist():
+            self.apex[a, b], self.apex[b, c], self.apex[c, a] = c, a, b
+        self.kept = {(a, b) for a, b in self.apex if (b, a) in self.apex}
+        self._join()
+        self._loop = np.full(len(points), -1)
+        for number, loop in enumerate([*loops, *pins[:, None]]):
+            self._loop[loop] = number
+        self._number_of_loops = len(loops) + len(pins)
+
+    def turn(self, a: int, b: int, c: int) -> int:
+        """The sign of the turn at b from a to c: 0 where it is none as far as rounded places can tell."""
+        x, y = self._x, self._y
+        ux, uy, vx, vy = x[c] - x[a], y[c] - y[a], x[b] - x[a], y[b] - y[a]
+        cross = vx * uy - vy * ux
+        # Straight on, and not back.
+        if abs(cross) <= self._off * np.hypot(ux, uy) and vx * (ux - vx) + vy * (uy - vy) > 0:
+            return 0
+        return self.exact_turn(a, b, c)
+
+    def exact_turn(self, a: int, b: int, c: int) -> int:
+        """The sign of the turn at b from a to c."""
+        return int(orientation(self.points[a], self.points[b], self.points[c]))
+
+    def length(self, a: int, b: int) -> float:
+        """The distance of two points."""
+        return float(np.hypot(self._x[b] - self._x[a], self._y[b] - self._y[a]))
+
+    def bridges(self) -> list[Edge]:
+        """Cuts that make one loop of all: each from what is connected with the first loop to one that is not yet."""
+        at: dict[int, list[tuple[float, int, int]]] = {}
+        for a, b in sorted(self.kept):
+            if self._loop[a] != self._loop[b]:
+                at.setdefault(int(self._loop[a]), []).append((self.length(a, b), a, b))
+        connected, found = {0}, list[Edge]()
+        waiting: list[tuple[float, int, int]] = []
+        for cut in at.get(0, []):
+            heappush(waiting, cut)
+        while waiting and len(connected) < self._number_of_loops:
+            _, a, b = heappop(waiting)
+            loop = int(self._loop[b])
+            if loop not in connected:
+                connected.add(loop)
+                found.append((a, b))
+                for cut in at.get(loop, []):
+                    heappush(waiting, cut)
+        return found
+
+    def diagonals(self, bridges: Sequence[Edge]) -> list[Edge]:
+        """The other cuts, each so that what it parts is of about the same size, as the earlier ones have left it."""
+        closed = set(bridges) | {(b, a) for a, b in bridges}
+        region = self._numbered()
+        beside: dict[int, list[tuple[int, Edge]]] = {}
+        weight = dict.fromkeys(region.values(), 0)
+        for (a, b), number in region.items():
+            weight[number] += 1
+            if (a, b) in self.kept and (a, b) not in closed:
+                beside.setdefault(number, []).append((region[b, a], (a, b)))
+        return _halving(weight, beside)
+
+    def _join(self) -> None:
+        """Join neighbouring triangles and what came of them where that is convex, across the longest edges first."""
+        after: dict[int, dict[int, int]] = {}
+        before: dict[int, dict[int, int]] = {}
+        # Around each point the edges in order, the next one counterclockwise; of all to begin with.
+        for (a, b), c in self.apex.items():
+            after.setdefault(a, {})[b] = c
+            before.setdefault(a, {})[c] = b
+        inner = sorted((edge for edge in self.kept if edge[0] < edge[1]), key=lambda e: (-self.length(*e), e))
+        for a, b in inner:
+            if self._may_go(a, before[a][b], after[a][b]) and self._may_go(b, before[b][a], after[b][a]):
+                self.kept -= {(a, b), (b, a)}
+                for at, other in ((a, b), (b, a)):
+                    low, high = before[at].pop(other), after[at].pop(other)
+                    after[at][low], before[at][high] = high, low
+
+    def _may_go(self, at: int, low: int, high: int) -> bool:
+        """Whether the angle from one edge counterclockwise to another is at most straight."""
+        return low != high and self.turn(low, at, high) <= 0 and not self._folded(at, low, high)
+
+    def _folded(self, at: int, low: int, high: int) -> bool:
+        x, y = self._x, self._y
+        flat = orientation(self.points[low], self.points[at], self.points[high]) == 0
+        along = (x[low] - x[at]) * (x[high] - x[at]) + (y[low] - y[at]) * (y[high] - y[at])
+        return bool(flat) and along > 0
+
+    def _numbered(self) -> dict[Edge, int]:
+        """The number of the region to the left of each half-edge."""
+        region: dict[Edge, int] = {}
+        for count, first in enumerate(sorted(self.apex)):
+            waiting = [first] if first not in region else []
+            while waiting:
+                a, b = waiting.pop()
+                if (a, b) in region:
+                    continue
+                region[a, b] = count
+                c = self.apex[a, b]
+                waiting += [(b, c), (c, a)]
+                if (b, a) in self.apex and (a, b) not in self.kept:
+                    waiting.append((b, a))
+        return region
+
+
+def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
+    """Constrained Delaunay triangles to the left of directed edges that make loops."""
+    low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
+    frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    k = len(points)
+    T = constrained_delaunay(np.concatenate([points, frame]), rim, k + np.arange(4))
+    walls = {(a, b) for a, b in rim.tolist()}
+    sides = zip(T.ravel().tolist(), np.roll(T, -1, axis=1).ravel().tolist(), strict=True)
+    left = {side: k // 3 for k, side in enumerate(sides)}
+    inside = np.zeros(len(T), dtype=np.bool_)
+    waiting = [left[edge] for edge in walls]
+    while waiting:
+        t = waiting.pop()
+        if not inside[t]:
+            inside[t] = True
+            corners = T[t].tolist()
+            ahead = zip(corners, corners[1:] + corners[:1], strict=True)
+            waiting += [left[b, a] for a, b in ahead if (a, b) not in walls]
+    return T[inside]
+
+
+def _halving(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:
+    """The edges of a tree in an order in which each parts the tree that the earlier ones left about in halves.
+
+    Parameters
+    ----------
+    weight : dict
+        Of every node.
+    beside : dict
+        Neighbours of a node, with the name of the edge as seen from it.
+    """
+    found: list[Edge] = []
+    gone: set[Edge] = set()
+    trees = [next(iter(weight))] if weight else []
+    while trees:
+        root = trees.pop()
+        order, up = [root], {root: (root, (-1, -1))}
+        for node in order:
+            for other, edge in beside.get(node, []):
+                if edge not in gone and other not in up:
+                    up[other] = node, edge
+                    order.append(other)
+        if len(order) == 1:
+            continue
+        below = {node: weight[node] for node in order}
+        for node in reversed(order[1:]):
+            below[up[node][0]] += below[node]
+        best = min(order[1:], key=lambda node: abs(2 * below[node] - below[root]))
+        a, b = up[best][1]
+        gone |= {(a, b), (b, a)}
+        found.append((a, b))
+        trees += [root, best]
+    return found

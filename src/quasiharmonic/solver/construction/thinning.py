@@ -1,0 +1,220 @@
+"""Added vertices taken out of a map again, wherever it stays injective.
+
+What is left where a vertex was, a polygon, is triangulated so that every triangle is positive in the map and lies
+within a triangle of the old mesh; where that can be done the choice of the best worst shape is found by dynamic
+programming [1]_. Where it cannot, the triangulation that is best at rest is taken, and the map untangled around it.
+
+References
+----------
+.. [1] G. T. Klincsek, Minimal triangulations of polygonal domains. Annals of Discrete Mathematics 9 (1980).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.solver.construction.halfedges import HalfEdges, Triangle
+from quasiharmonic.solver.methods.local_repair import Patch
+from quasiharmonic.util.arrays import ComplexArray, IntArray
+from quasiharmonic.util.progress import still_at_it
+
+# Rounding of a determinant relative to the sum of its terms' magnitudes, with room.
+_FLAT = 1e-15
+# Around vertices of more neighbours nothing is tried.
+_MOST = 24
+
+
+class Thinning:
+    """A refined mesh, its map, and where its vertices lie in the old mesh.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        The old mesh.
+    fixed : (k,) int64
+        Vertices that stay.
+    triangles : (t, 3) int64
+        The refined mesh.
+    shares : sequence of dict
+        Of each added vertex the old ones that it lies between, with their shares.
+    w : (n + s,) complex128
+        An injective map.
+
+    Attributes
+    ----------
+    mesh : HalfEdges
+        By the numbers that vertices had, also after some were taken out.
+    left : set of int
+        The added vertices that are still there.
+    w : (n + s,) complex128
+    """
+
+    def __init__(
+        self,
+        F: IntArray,
+        fixed: IntArray,
+        triangles: IntArray,
+        shares: Sequence[dict[int, float]],
+        w: ComplexArray,
+    ) -> None:
+        n = len(w) - len(shares)
+        self.mesh = HalfEdges(triangles)
+        self.left = set(range(n, len(w)))
+        self.w = w.copy()
+        self._fixed = fixed
+        self._old = {frozenset(row): row for row in F.tolist()}
+        self._shares = [*({vertex: 1.0} for vertex in range(n)), *shares]
+
+    def thin(self) -> None:
+        """Take out what can be taken out, the last added first, and again until nothing can."""
+        # Whether a vertex can go is a matter of its star, which changes only as a neighbour goes.
+        waiting = set(self.left)
+        while waiting:
+            for vertex in sorted(waiting, reverse=True):
+                still_at_it()
+                waiting.discard(vertex)
+                cut = self._without(vertex, self._in_map)
+                if cut is not None:
+                    beside = {tail for tail, _ in self.mesh.link(vertex)}
+                    self._take_out(vertex, cut)
+                    waiting |= beside & self.left
+
+    def try_hard(self, vertex: int, untangle: Callable[[Patch, ComplexArray], ComplexArray], rings: int) -> bool:
+        """Take a vertex out if the map can be untangled around where it was.
+
+        Parameters
+        ----------
+        vertex : int
+            One of ``left``.
+        untangle : callable
+            From a patch and its map to another map of it.
+        rings : int
+            How far around it vertices move.
+
+        Returns
+        -------
+        bool
+            Whether it was taken out; if not all is as before.
+        """
+        still_at_it()
+        cut = self._without(vertex, self._bent)
+        if cut is None:
+            return False
+        ring = [tail for tail, _ in self.mesh.link(vertex)]
+        star = [(vertex, a, b) for a, b in self.mesh.link(vertex)]
+        self._take_out(vertex, cut)
+        before = self.w
+        patch = self._patch(ring, rings)
+        if patch is not None:
+            self.w = before.copy()
+            self.w[patch.vertices] = untangle(patch, before[patch.vertices])
+            if all(self._in_map(*corners) > 0 for corners in patch.vertices[patch.F].tolist()):
+                return True
+        self.w = before
+        self.mesh.remove(cut)
+        self.mesh.add(star)
+        self.left.add(vertex)
+        return False
+
+    def _take_out(self, vertex: int, cut: list[Triangle]) -> None:
+        """Put other triangles in the place of a vertex's."""
+        self.mesh.remove([(vertex, a, b) for a, b in self.mesh.link(vertex)])
+        self.mesh.add(cut)
+        self.left.remove(vertex)
+
+    def _without(self, vertex: int, worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
+        """Triangles that cover the star of an added vertex, or None where none are worth anything."""
+        ring = [tail for tail, _ in self.mesh.link(vertex)]
+        polygons = [ring]
+        edge = self._shares[vertex].keys()
+        if len(edge) == 2:
+            # On either side of the old edge that it is on.
+            i, j = (k for k, other in enumerate(ring) if self._shares[other].keys() <= edge)
+            polygons = [ring[i : j + 1], ring[j:] + ring[: i + 1]]
+        found = []
+        for polygon in polygons:
+            cut = best_triangles(polygon, worth) if len(polygon) <= _MOST else None
+            if cut is None:
+                return None
+            found += cut
+        return found
+
+    def _in_map(self, a: int, b: int, c: int) -> float:
+        """The worse of the shapes of a triangle in the map and in the old one that it is a part of."""
+        there = shape(*(complex(self.w[vertex]) for vertex in (a, b, c)))
+        return min(there, self._at_rest(a, b, c)) if there > 0 else there
+
+    def _bent(self, a: int, b: int, c: int) -> float:
+        """As `_in_map`, where an inverted triangle of the map is worth something too, though less than any other."""
+        rest = self._at_rest(a, b, c)
+        there = shape(*(complex(self.w[vertex]) for vertex in (a, b, c)))
+        return 1.0 + there if rest > 0 else rest
+
+    def _at_rest(self, a: int, b: int, c: int) -> float:
+        """The shape of a triangle within the old one that it is a part of, drawn as half a square."""
+        rows = [self._shares[vertex] for vertex in (a, b, c)]
+        old = self._old.get(frozenset().union(*rows))
+        if old is None:
+            return 0.0
+        return shape(*(complex(row.get(old[1], 0.0), row.get(old[2], 0.0)) for row in rows))
+
+    def _patch(self, ring: list[int], rings: int) -> Patch | None:
+        """Triangles within some rings of some vertices; None where none of their vertices may move."""
+        inside = set(ring)
+        for _ in range(rings):
+            inside |= {end for vertex in inside for side in self.mesh.link(vertex) for end in side}
+        rows = [
+            (vertex, a, b)
+            for vertex in sorted(inside)
+            for a, b in self.mesh.link(vertex)
+            if vertex < a and vertex < b and a in inside and b in inside
+        ]
+        vertices, F = np.unique(np.array(rows), return_inverse=True)
+        F = F.reshape(-1, 3).astype(np.int64)
+        held = np.isin(vertices, self._fixed)
+        held[boundary_edges(F, len(vertices))] = True
+        return None if held.all() else Patch(F, vertices, held)
+
+
+def shape(p: complex, q: complex, r: complex) -> float:
+    """Twice the signed area of a triangle over the sum of its squared sides, up to 0.58; its sign is exact."""
+    left = (p.real - r.real) * (q.imag - r.imag)
+    right = (p.imag - r.imag) * (q.real - r.real)
+    sides = abs(q - p) ** 2 + abs(r - q) ** 2 + abs(p - r) ** 2
+    if abs(left - right) > _FLAT * (abs(left) + abs(right)) + 1e-300:
+        return (left - right) / sides
+    # For a single triangle fractions are far quicker than the predicates of many.
+    (px, py), (qx, qy), (rx, ry) = ((Fraction(z.real), Fraction(z.imag)) for z in (p, q, r))
+    difference = (px - rx) * (qy - ry) - (py - ry) * (qx - rx)
+    return 1e-300 * ((difference > 0) - (difference < 0))
+
+
+def best_triangles(polygon: list[int], worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
+    """The triangulation of a polygon whose worst triangle is worth most; None where that is nothing or less."""
+    k = len(polygon)
+    best = {(i, i + 1): (float("inf"), -1) for i in range(k - 1)}
+    for span in range(2, k):
+        for i in range(k - span):
+            j = i + span
+            choice = 0.0, -1
+            for m in range(i + 1, j):
+                value = min(best[i, m][0], best[m, j][0])
+                if value > choice[0]:
+                    value = min(value, worth(polygon[i], polygon[m], polygon[j]))
+                    if value > choice[0]:
+                        choice = value, m
+            best[i, j] = choice
+    if best[0, k - 1][0] <= 0:
+        return None
+    found, waiting = list[Triangle](), [(0, k - 1)]
+    while waiting:
+        i, j = waiting.pop()
+        m = best[i, j][1]
+        if m >= 0:
+            found.append((polygon[i], polygon[m], polygon[j]))
+            waiting += [(i, m), (m, j)]
+    return found

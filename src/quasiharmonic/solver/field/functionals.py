@@ -1,0 +1,381 @@
+"""Functionals of the tensor field by which injective maps are found (§7.3).
+
+============  =================================================  ======================
+name          value, summed over u and v                         solves beyond (u, v)
+============  =================================================  ======================
+neumann       V₁ = ½ ‖L w − g‖²                                  1
+sobolev       V₂ = ½ ‖L w − g‖² in the norm of L†                1, with another factor
+dirichlet     V₃ = ½ wᴴ L w − area                               0
+poisson       V₄ = ½ gᴴ L† g − area                              1, with another factor
+edge-poisson  V₄ in Crouzeix–Raviart elements                    1, of three times the size
+============  =================================================  ======================
+
+Here ``L = Gᵀ A G``, ``w = u + i v`` is the quasi-harmonic map, and ``g = g_u + i g_v = −i D w`` the
+Neumann data that an injective map onto the target must have (eq. 17). ``V₂ = V₃ + V₄``.
+
+Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh, from which the
+gradient in the Beltrami coefficient μ and then that in ξ follow (`quasiharmonic.solver.field.tensor`).
+
+V₁, V₂ and V₃ are never negative, and zero at the tensors of injective maps and there only (Theorem 6.4).
+
+V₄ is zero at the tensors of injective maps, and elsewhere too. It sees the target through ``C b`` only: it is blind to
+interior pins, and to a boundary loop's position relative to the others. Nor is it bounded below by zero, as its
+continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual, so at a rough tensor field V₄
+may be negative, and on the way there it passes through zero at maps with inverted triangles. In Crouzeix–Raviart
+elements it is bounded, for there it is V₃ again, but for pins and for where loops lie (`EdgePoisson`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from copy import copy
+from typing import Protocol
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.reference import Derivatives, ReferenceMesh
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian
+from quasiharmonic.problem import Problem
+from quasiharmonic.solver.field.tensor import TensorField
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
+
+
+class Functional(ABC):
+    """A functional V of the tensor field, for one problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    mesh : ReferenceMesh
+    """
+
+    name: str
+    #: Whether the value is never negative, and zero for injective maps with pins and loops in their places only.
+    sees_positions = True
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
+        self.problem = problem
+        self.mesh = mesh
+
+    @abstractmethod
+    def value(self, at: QuasiHarmonicMap) -> float:
+        """V at a tensor field and its map.
+
+        Parameters
+        ----------
+        at : QuasiHarmonicMap
+
+        Returns
+        -------
+        float
+            In the units of area of the problem's frame; that of V₁ depends on the mesh.
+        """
+
+    @abstractmethod
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """Gradient of V by ξ there, of map and tensors together.
+
+        Parameters
+        ----------
+        at : QuasiHarmonicMap
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂V/∂Re ξ + i ∂V/∂Im ξ``.
+        """
+
+
+class QuasiHarmonicMap(Protocol):
+    """What a functional looks at.
+
+    Attributes
+    ----------
+    field : TensorField
+    operator : FactoredLaplacian
+        Its Laplacian on the problem's free vertices.
+    w : (n,) complex128
+        The quasi-harmonic map of ``field``, in the problem's frame.
+    dw : Derivatives
+        Its derivatives.
+    dirichlet : float
+        Its V₃.
+    dirichlet_gradient : (f,) complex128
+        The gradient of V₃ in ξ.
+    """
+
+    @property
+    def field(self) -> TensorField: ...
+    @property
+    def operator(self) -> FactoredLaplacian: ...
+    @property
+    def w(self) -> ComplexArray: ...
+    @property
+    def dw(self) -> Derivatives: ...
+    @property
+    def dirichlet(self) -> float: ...
+    @property
+    def dirichlet_gradient(self) -> ComplexArray: ...
+
+
+class Dirichlet(Functional):
+    """V₃, the weighted Dirichlet energy (eq. 27): the default.
+
+    Written as the energy of the Beltrami residual it has no cancellation and is its own adjoint:
+
+        V₃ = Σ 2m |q − μp|² / (1 − |μ|²),     dV₃/dμ = −4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²
+    """
+
+    name = "dirichlet"
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        return at.dirichlet
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        return at.dirichlet_gradient
+
+
+class Neumann(Functional):
+    """V₁, the plain norm of the Neumann residual (eq. 24, 25).
+
+    Its residual includes the pins, where an injective map's flux is zero.
+    """
+
+    name = "neumann"
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        residual = neumann_residual(self.problem, at.operator, at.w)
+        return 0.5 * work(residual, residual)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        residual = neumann_residual(self.problem, at.operator, at.w)
+        spread = self.mesh.derivatives(at.operator.extend(residual))
+        return at.field.pull(at.field.pull_twist(*twist(self.mesh, at.dw, spread)))
+
+
+class Poisson(Functional):
+    """V₄, the Poisson functional (eq. 29, 44), dual to V₃.
+
+    ``L†`` is applied by solving with one vertex held: L is singular only in the constants, and the
+    Neumann data sum to zero.
+    """
+
+    name = "poisson"
+    sees_positions = False
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
+        super().__init__(problem, mesh)
+        self._one_held: Laplacian | None = None
+        self._known: tuple[TensorField, ComplexArray] | None = None
+
+    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """``L† g`` up to a constant: the map that the target's Neumann data alone would bring about."""
+        # Another thread may overwrite what is kept between any two lines: what is returned is a local.
+        known = self._known
+        if known is None or known[0] is not at.field:
+            if self._one_held is None:
+                first, solver = self.problem.fixed[:1], at.operator.pattern.solver.name
+                self._one_held = Laplacian(self.problem.F, self.problem.n, first, solver)
+            held = self._one_held.factor(self.mesh.edge_stiffness(at.field.entries()))
+            known = self._known = at.field, held.respond(neumann_target(self.problem, at.w))
+        return known[1]
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        return 0.5 * work(neumann_target(self.problem, at.w), self.response(at) - at.w)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        d = self.mesh.derivatives(self.response(at))
+        return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
+
+
+class EdgePoisson(Functional):
+    """V₄ in Crouzeix–Raviart elements: linear on each triangle, continuous at the middles of edges.
+
+    Their discrete rotated gradients are orthogonal to those of linear elements, and together both are all vector
+    fields that are constant on triangles, on a disk (Arnold and Falk 1989). So the flux of the solution is the rotated
+    gradient of a linear element with the target's boundary, and since ``det 𝒜 = 1`` both have the same energy. The
+    least of the one being the least of the other, on a disk this is V₃ at the map without pins; with holes V₃ where
+    each inner loop may be carried anywhere as a whole. Hence it is never negative.
+    """
+
+    name = "edge-poisson"
+    sees_positions = False
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
+        super().__init__(problem, mesh)
+        F, n = problem.F, problem.n
+        opposite = edge_keys(F[:, (1, 2, 0)], F[:, (2, 0, 1)], n)
+        keys, number = np.unique(opposite, return_inverse=True)
+        #: Edge opposite each corner, (f, 3).
+        self._edges = number.reshape(-1, 3)
+        self._tail, self._head = problem.domain.edges.boundary.T
+        self._rim = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
+        # The same triangles with corners of their own.
+        self._apart = copy(mesh)
+        self._apart.F = np.arange(F.size).reshape(-1, 3)
+        self._apart.n = F.size
+        self._one_held: Laplacian | None = None
+        self._known: tuple[TensorField, ComplexArray] | None = None
+
+    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """``L† g`` at the middles of edges, up to a constant; (e,) complex128, edges ascending by their ends."""
+        # As of `Poisson.response`.
+        known = self._known
+        if known is None or known[0] is not at.field:
+            size = int(self._edges.max()) + 1
+            if self._one_held is None:
+                solver = at.operator.pattern.solver.name
+                self._one_held = Laplacian(self._edges, size, self._rim[:1], solver)
+            # The element of an edge has -2 times the gradient of the opposite corner's hat function.
+            held = self._one_held.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
+            load = np.zeros(size, dtype=np.complex128)
+            load[self._rim] = self._neumann_target(at.w)
+            known = self._known = at.field, held.respond(load)
+        return known[1]
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        middle = 0.5 * (at.w[self._tail] + at.w[self._head])
+        return 0.5 * work(self._neumann_target(at.w), self.response(at)[self._rim] - middle)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        middles = self.response(at)[self._edges]
+        corners = middles.sum(axis=1, keepdims=True) - 2 * middles
+        d = self._apart.derivatives(corners.ravel())
+        return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
+
+    def _neumann_target(self, w: ComplexArray) -> ComplexArray:
+        """Neumann data that the target asks for, by boundary edge; (k,) complex128."""
+        return -1j * (w[self._head] - w[self._tail])
+
+
+class Sobolev(Poisson):
+    """V₂ = V₃ + V₄, the Neumann residual in the norm of L† (eq. 26).
+
+    That is the energy of the difference of the maps that the Dirichlet and the Neumann data bring about.
+    """
+
+    name = "sobolev"
+    sees_positions = True
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        residual = neumann_residual(self.problem, at.operator, at.w)
+        return 0.5 * work(residual, at.w - self.response(at))
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        return at.dirichlet_gradient + super().gradient(at)
+
+
+FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson, EdgePoisson)}
+
+
+def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
+    """V₃ of any map, its A-Dirichlet energy less its signed area (eq. 27).
+
+    Parameters
+    ----------
+    mesh : ReferenceMesh
+    field : TensorField
+    dw : Derivatives
+        Of the map, as `ReferenceMesh.derivatives` has them.
+
+    Returns
+    -------
+    float
+        ``Σ 2m |q − μp|² / (1 − |μ|²)``, in the target's units of area; never negative.
+    """
+    return beltrami_gradient(mesh, field, dw)[0]
+
+
+def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[float, ComplexArray]:
+    """V₃ of any map and its gradient in μ with the map held; at the quasi-harmonic map that is all of it.
+
+    Parameters
+    ----------
+    mesh, field, dw
+        As of `beltrami_energy`.
+
+    Returns
+    -------
+    energy : float
+        ``Σ 2m |q − μp|² / (1 − |μ|²)``: the map's A-Dirichlet energy less its signed area.
+    gradient : (f,) complex128
+        ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
+    """
+    density, gradient = beltrami_terms(mesh.m, field, dw.p, dw.q)
+    return 2.0 * float(density.sum()), gradient
+
+
+def beltrami_terms(
+    m: FloatArray, field: TensorField, p: ComplexArray, q: ComplexArray
+) -> tuple[FloatArray, ComplexArray]:
+    """As `beltrami_gradient`, with half of the energy of each triangle, (f,) float64, in place of their sum."""
+    residual = q - field.mu * p
+    weight = m / field.defect
+    density = residual.real**2 + residual.imag**2
+    density *= weight
+    gradient = q.conj()
+    gradient *= field.mu
+    np.subtract(p.conj(), gradient, out=gradient)
+    gradient *= residual
+    weight /= field.defect
+    weight *= -4.0
+    gradient *= weight
+    return density, gradient
+
+
+def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatArray, ComplexArray]:
+    """Derivative of ``Re xᴴ L y`` by the tensor ``c·I − [[Re w, Im w], [Im w, −Re w]]`` of each triangle.
+
+    Equal to ``sp(Gx)ᵀ G y`` summed over both coordinates, in other entries.
+
+    Returns
+    -------
+    by_c : (f,) float64
+    by_w : (f,) complex128
+        ``∂/∂Re w + i ∂/∂Im w``.
+    """
+    by_c = 2.0 * mesh.m * (dx.p * dy.p.conj() + dx.q * dy.q.conj()).real
+    by_w = -2.0 * mesh.m * (dx.p.conj() * dy.q + dy.p.conj() * dx.q)
+    return by_c, by_w
+
+
+def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
+    """Neumann data that the target asks for, ``R (g_u + i g_v)``: ``g_u = C b_v``, ``g_v = −C b_u`` (Theorem 6.4).
+
+    Parameters
+    ----------
+    problem : Problem
+    w : (n,) complex128
+        A map; only its values at the boundary count.
+
+    Returns
+    -------
+    (n,) complex128
+        Zero but at the boundary.
+    """
+    g = np.zeros(problem.n, dtype=np.complex128)
+    for loop in problem.domain.loops:
+        b = w[loop]
+        g[loop] = -0.5j * (np.roll(b, -1) - np.roll(b, 1))
+    return g
+
+
+def neumann_residual(problem: Problem, operator: FactoredLaplacian, w: ComplexArray) -> ComplexArray:
+    """What the Neumann data of a map lack, ``L w − R g`` (eq. 24).
+
+    Parameters
+    ----------
+    problem : Problem
+    operator : FactoredLaplacian
+        Of the tensors in question.
+    w : (n,) complex128
+        Their quasi-harmonic map.
+
+    Returns
+    -------
+    (n,) complex128
+        Zero but at the fixed vertices.
+    """
+    # A boundary vertex is fixed, so both terms are zero at free vertices.
+    return operator.flux(w) - neumann_target(problem, w)

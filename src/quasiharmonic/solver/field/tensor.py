@@ -1,0 +1,266 @@
+"""One complex number a triangle to an elliptic tensor of unit determinant, and back down (§8).
+
+    ξ ──r──▶ μ = r(|ξ|) ξ/|ξ|  ──eq. 33──▶  𝒜 = c·I − [[Re w, Im w], [Im w, −Re w]]
+
+with ``c = (1 + |μ|²)/(1 − |μ|²)`` and ``w = 2μ/(1 − |μ|²)``. Any ξ gives a positive definite tensor, so
+the search over ξ has no constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, named
+
+# Stands in for a divisor of zero, where the dividend vanishes too, so that the quotient is not NaN.
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Parameterisation:
+    """The sigmoid ``r`` that carries ξ to the Beltrami coefficient μ (§8.2).
+
+    Attributes
+    ----------
+    name : str
+        How a user calls it.
+    number : int
+        How kernels do: its place in `PARAMETERISATIONS`.
+    bound : float
+        Largest ``|ξ|`` at which the tensor, rounded to doubles, is still safely positive definite.
+    radial : callable
+        ``ρ ↦ (r/ρ, 1 − r², r')`` elementwise, each in its limit at ρ = 0.
+    inverse : callable
+        ``r ↦ ρ`` elementwise.
+    bend : callable
+        ``ρ ↦ r''`` elementwise.
+    """
+
+    name: str
+    number: int
+    bound: float
+    radial: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+    inverse: Callable[[FloatArray], FloatArray]
+    bend: Callable[[FloatArray], FloatArray]
+
+    def field(self, xi: ComplexArray) -> TensorField:
+        """The tensor field of some ξ.
+
+        Parameters
+        ----------
+        xi : (f,) complex128
+
+        Returns
+        -------
+        TensorField
+        """
+        return TensorField(xi, self)
+
+    def invert(self, mu: ComplexArray) -> ComplexArray:
+        """The ξ of Beltrami coefficients.
+
+        Parameters
+        ----------
+        mu : (f,) complex128
+
+        Returns
+        -------
+        (f,) complex128
+            Clipped where ``|μ| ≥ 1`` or ξ would exceed the bound.
+        """
+        modulus = np.sqrt(mu.real**2 + mu.imag**2)
+        safe = np.where(modulus > 0, modulus, 1.0)
+        rho = self.inverse(np.minimum(modulus, np.nextafter(1.0, 0.0)))
+        return np.minimum(rho, self.bound) / safe * mu
+
+
+@dataclass(frozen=True)
+class TensorField:
+    """𝒜 on every triangle, with what is needed to differentiate it, each computed when first asked for.
+
+    Attributes
+    ----------
+    xi, mu : (f,) complex128
+        The variable and the Beltrami coefficient.
+    rho, ratio, defect, slope : (f,) float64
+        ``|ξ|``, ``r/ρ``, ``1 − |μ|²`` (accurate where ``|μ|`` rounds to 1) and ``r'``.
+    """
+
+    xi: ComplexArray
+    parameterisation: Parameterisation
+
+    def __getitem__(self, part: slice) -> TensorField:
+        """The field on some of the triangles."""
+        return TensorField(self.xi[part], self.parameterisation)
+
+    @cached_property
+    def _square(self) -> FloatArray:
+        return self.xi.real**2 + self.xi.imag**2
+
+    @cached_property
+    def rho(self) -> FloatArray:
+        return np.sqrt(self._square)
+
+    @cached_property
+    def _radial(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self.parameterisation.radial(self.rho)
+
+    @property
+    def ratio(self) -> FloatArray:
+        return self._radial[0]
+
+    @property
+    def defect(self) -> FloatArray:
+        return self._radial[1]
+
+    @property
+    def slope(self) -> FloatArray:
+        return self._radial[2]
+
+    @cached_property
+    def mu(self) -> ComplexArray:
+        return self.ratio * self.xi
+
+    def entries(self) -> FloatArray:
+        """The tensors themselves (eq. 33), without the area factor.
+
+        Returns
+        -------
+        (3, f) float64
+            Rows a11, a12, a22.
+        """
+        a = np.empty((3, self.mu.size))
+        double = 2.0 / self.defect
+        real = double * self.mu.real
+        np.subtract(double, 1.0, out=a[2])
+        np.subtract(a[2], real, out=a[0])
+        a[2] += real
+        np.multiply(double, -self.mu.imag, out=a[1])
+        return a
+
+    def pull_twist(self, by_c: FloatArray, by_w: ComplexArray) -> ComplexArray:
+        """Gradient in μ from the derivatives by c and w: the transpose of d(c, w)/dμ.
+
+        Parameters
+        ----------
+        by_c : (f,) float64
+        by_w : (f,) complex128
+            ``∂/∂Re w + i ∂/∂Im w``.
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂/∂Re μ + i ∂/∂Im μ``.
+        """
+        # c = 2/D − 1 and w = 2μ/D with D = 1 − |μ|², so dD = −2 Re(μ̄ dμ).
+        double = 2.0 / self.defect
+        inner = by_c + (np.conj(self.mu) * by_w).real
+        return double * (by_w + double * inner * self.mu)
+
+    def pull(self, grad: ComplexArray) -> ComplexArray:
+        """Gradient in ξ from the gradient in μ: the transpose of dμ/dξ, which is symmetric.
+
+        Parameters
+        ----------
+        grad : (f,) complex128
+            ``∂/∂Re μ + i ∂/∂Im μ``.
+
+        Returns
+        -------
+        (f,) complex128
+            ``∂/∂Re ξ + i ∂/∂Im ξ``.
+        """
+        # ρ² that vanishes needs no care but in the division: the term it divides vanishes with it.
+        radial = (self.slope - self.ratio) / np.maximum(self._square, _TINY)
+        radial *= (self.xi.conj() * grad).real
+        out: ComplexArray = self.ratio * grad
+        out += radial * self.xi
+        return out
+
+
+def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
+    """What a caller hands over as Beltrami coefficients of ``f`` tensors, checked; zeros where nothing is.
+
+    Raises
+    ------
+    ValueError
+        When it has another shape, holds no numbers, or is not below 1 in modulus; names the first triangles.
+    """
+    coefficients = np.zeros(f) if mu is None else np.asarray(mu)
+    if coefficients.shape != (f,) or coefficients.dtype.kind not in "iufc":
+        raise ValueError(f"mu must hold {f} numbers, one a triangle, not an array of {coefficients.shape}")
+    bad = np.flatnonzero(~(np.abs(coefficients) < 1))
+    if bad.size:
+        raise ValueError(f"mu is not below 1 in modulus at {named('triangle', 'triangles', bad)}")
+    return coefficients.astype(np.complex128)
+
+
+def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:
+    """The μ that makes V₃ least with the map held (eq. 39).
+
+    The energy ``2m |q − μp|² / (1 − |μ|²)`` of a triangle is least at its own Beltrami coefficient ``μ = q/p`` where it
+    is positive, and at ``conj(p/q)`` where it is inverted; the least values are 0 and twice the inverted area.
+
+    Parameters
+    ----------
+    p, q : (f,) complex128
+        Derivatives ``∂w/∂z`` and ``∂w/∂z̄`` of the map on each triangle.
+
+    Returns
+    -------
+    (f,) complex128
+        Of modulus 1 where a triangle has no area, and 0 where its sides have no length, or none to divide by.
+    """
+    inverted = np.abs(q) > np.abs(p)
+    small, large = np.where(inverted, p.conj(), q), np.where(inverted, q.conj(), p)
+    return np.divide(small, large, out=np.zeros_like(p), where=np.abs(large) >= np.finfo(np.float64).tiny)
+
+
+def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    decay = np.exp(-2.0 * rho)
+    defect = 4.0 * decay
+    decay += 1.0
+    decay *= decay
+    defect /= decay
+    rho = np.maximum(rho, _TINY)
+    return np.tanh(rho) / rho, defect, defect
+
+
+def _si_log(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    log = np.log1p(rho)
+    omega = 1.0 / (1.0 + log)
+    ratio = np.where(rho > 0, log * omega / np.maximum(rho, _TINY), 1.0)
+    return ratio, omega * (2.0 - omega), omega**2 / (1.0 + rho)
+
+
+def _bend_tanh(rho: FloatArray) -> FloatArray:
+    return -2.0 * np.tanh(rho) * _tanh(rho)[1]
+
+
+def _bend_si_log(rho: FloatArray) -> FloatArray:
+    omega = 1.0 / (1.0 + np.log1p(rho))
+    return -((omega / (1.0 + rho)) ** 2) * (1.0 + 2.0 * omega)
+
+
+def _invert_si_log(r: FloatArray) -> FloatArray:
+    # The largest r below 1 would ask for a ρ of e^(2⁵³).
+    with np.errstate(over="ignore"):
+        return np.expm1(r / (1.0 - r))
+
+
+# The eigenvalues of 𝒜 are e^{±2ρ} for tanh, and its entries are rounded at e^{2ρ} · 1e-16: beyond ρ = 9 the
+# smaller eigenvalue drowns. si-log comes nowhere near: its bound, which keeps |ξ|² finite, stands for
+# |μ| = 0.997, and what needs more distortion than that needs tanh.
+TANH = Parameterisation("tanh", 0, 8.8, _tanh, np.arctanh, _bend_tanh)
+SI_LOG = Parameterisation("si-log", 1, 1e150, _si_log, _invert_si_log, _bend_si_log)
+PARAMETERISATIONS = {p.name: p for p in (TANH, SI_LOG)}
+
+
+def parameterisation_of(number: int) -> Parameterisation:
+    """The parameterisation of this number."""
+    return (TANH, SI_LOG)[number]

@@ -1,0 +1,31 @@
+"""Methods that lower a functional over tensor fields, or move vertices, one per module.
+
+The package builds on `solver.field` and `energies`. Start reading in `base`, which says what a method is, then
+`vector_adam`.
+"""
+
+from __future__ import annotations
+
+from quasiharmonic.solver.methods.alternating import Alternating
+from quasiharmonic.solver.methods.base import Descent
+from quasiharmonic.solver.methods.composite import Composite
+from quasiharmonic.solver.methods.lbfgs import LBFGS
+from quasiharmonic.solver.methods.line_shift import Combing
+from quasiharmonic.solver.methods.local_repair import Patches
+from quasiharmonic.solver.methods.newton import Newton
+from quasiharmonic.solver.methods.random_restarts import RandomRestarts
+from quasiharmonic.solver.methods.untangling import Untangling
+from quasiharmonic.solver.methods.vector_adam import VectorAdam
+
+__all__ = [
+    "LBFGS",
+    "Alternating",
+    "Combing",
+    "Composite",
+    "Descent",
+    "Newton",
+    "Patches",
+    "RandomRestarts",
+    "Untangling",
+    "VectorAdam",
+]

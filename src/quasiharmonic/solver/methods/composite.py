@@ -1,0 +1,186 @@
+"""The composite of two maps through a disk, as a place to begin.
+
+    mesh ──Tutte──▶ disk of chords ◀──same triangles── target, triangulated between its boundary vertices
+
+Tutte's embedding onto a convex outline is injective. A triangulation of the target that has no vertices but those of
+the boundary is one of any convex polygon with as many corners too: corner by corner it is a bijective map of the disk
+onto the target, affine on every triangle. Every vertex goes through both. Were the mesh's triangles ever smaller, that
+would be an injective map; what is inverted are triangles across which the second map bends, few as a rule, and a
+descent from the tensors of this map has not far to go. (Weber and Zorin 2014 compose such maps for injectivity
+itself, and split the mesh for it.)
+
+It takes a single boundary loop, whose image is simple.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import ClassVar
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay, delaunay_of_polygon
+from quasiharmonic.geometry.exact.loops import simple_loops
+from quasiharmonic.geometry.exact.point_location import PointLocator
+from quasiharmonic.geometry.mesh.topology import edge_keys, linked
+from quasiharmonic.solver.field.objective import Iterate, Objective
+from quasiharmonic.solver.methods.base import Iterates
+from quasiharmonic.solver.methods.vector_adam import VectorAdam
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
+
+# Corners of the disk are spread half by the target's arc length and half evenly: none come too close to each other.
+_EVENLY = 0.5
+# Room around the target for the box that it is triangulated in, as a fraction of its extent.
+_MARGIN = 0.1
+# Up to so many corners it is triangulated by itself: that takes no longer, and SciPy's Qhull need not be loaded for it,
+# which takes longer than all else that is done with so small a mesh.
+_FEW = 100
+# From the composite short steps suffice, and long ones would lead away from it.
+NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Composite(VectorAdam):
+    """Descend by VectorAdam, after a few steps anew from the composite of two maps through a disk, if there is one.
+
+    Attributes
+    ----------
+    direct : int
+        Steps before, from where any descent begins; easy maps need no more, and the composite takes as long as some 5
+        to 15 of them.
+    """
+
+    direct: int = 6
+
+    word: ClassVar[str] = "composite"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number("direct", self.direct, least=0)
+
+    @property
+    def patience(self) -> tuple[int, float]:
+        """From near a solution it is found soon; what is left are triangles for local repair."""
+        return 10, 0.5
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`; without a composite all steps are as `VectorAdam` has them."""
+        steps = super().iterates(objective, start)
+        yield from islice(steps, self.direct)
+        left = self.iterations - self.direct - 1
+        w = composite_map(objective) if left > 0 else None
+        if w is None:
+            # None where the steps before were all.
+            return bool((yield from steps))
+        there = objective.near_map(w)
+        yield there
+        nearby = VectorAdam(
+            functional=self.functional,
+            parameterisation=self.parameterisation,
+            iterations=left,
+            schedule=self.schedule or NEARBY_STEPS,
+            momenta=self.momenta,
+            placing=self.placing,
+        )
+        return (yield from nearby.iterates(objective, there))
+
+
+def composite_map(objective: Objective) -> ComplexArray | None:
+    """Every vertex by way of a disk to the target.
+
+    Parameters
+    ----------
+    objective : Objective
+        Its problem's loop, target and Laplacian are what counts.
+
+    Returns
+    -------
+    (n,) complex128 or None
+        In the problem's frame, fixed vertices in their places. None where there are several loops or pins, or where
+        the target's outline meets itself or is too narrow for doubles.
+    """
+    problem = objective.problem
+    if len(problem.domain.loops) != 1 or problem.domain.pins.size:
+        return None
+    loop = problem.domain.loops[0]
+    w = problem.held.copy()
+    outline = w[loop]
+    F = polygon_triangles(outline)
+    if F is None:
+        return None
+    onto_disk = np.zeros(problem.n, dtype=np.complex128)
+    onto_disk[loop] = _corners_of_disk(outline)
+    unit = objective.parameterisation.field(np.zeros(len(problem.F), dtype=np.complex128))
+    onto_disk = objective.operator(unit).extend(onto_disk)
+    free = objective.laplacian.free
+    corners = onto_disk[loop][F]
+    locator = PointLocator(_points(corners))
+    points = _points(onto_disk[free])
+    triangle = locator.find(points)
+    if (triangle < 0).any():
+        return None
+    w[free] = (locator.barycentric(points, triangle) * outline[F[triangle]]).sum(axis=1)
+    return w
+
+
+def polygon_triangles(outline: ComplexArray) -> IntArray | None:
+    """Triangulate a simple polygon without further vertices.
+
+    Parameters
+    ----------
+    outline : (k,) complex128
+        Its corners, of magnitude about one.
+
+    Returns
+    -------
+    (k - 2, 3) int64 or None
+        Strictly positive triangles. None where the polygon meets itself, or runs clockwise.
+    """
+    k = len(outline)
+    ring = np.arange(k)
+    points = _points(outline)
+    if not simple_loops([ring], points).all():
+        return None
+    if k <= _FEW:
+        return delaunay_of_polygon(points)
+    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
+    box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    sides = np.stack([ring, np.roll(ring, -1)], axis=1)
+    try:
+        F = constrained_delaunay(np.concatenate([points, box]), sides, k + np.arange(4))
+    except (BlockedError, ValueError):
+        return None
+    # To the left of what runs clockwise lies the rest of the box, of k + 4 triangles.
+    F = F[_within(F, k)]
+    return F if len(F) == k - 2 else None
+
+
+def _within(F: IntArray, k: int) -> BoolArray:
+    """Which triangles lie to the left of the sides 0→1→…→k−1→0: those that no side parts from one that does."""
+    tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.repeat(np.arange(len(F)), 3)
+    corners = (tails < k) & (heads < k)
+    forward, backward = corners & (heads == (tails + 1) % k), corners & (tails == (heads + 1) % k)
+    open_ = np.flatnonzero(~(forward | backward))
+    keys = edge_keys(tails[open_], heads[open_], k + 4)
+    order = np.argsort(keys, kind="stable")
+    pair = np.flatnonzero(keys[order][1:] == keys[order][:-1])
+    one, other = owner[open_[order[pair]]], owner[open_[order[pair + 1]]]
+    part = linked(one, other, len(F))
+    inside: BoolArray = np.zeros(len(F), dtype=bool)
+    inside[part[owner[forward]]] = True
+    return inside[part]
+
+
+def _corners_of_disk(outline: ComplexArray) -> ComplexArray:
+    """Points of the unit circle for the corners of an outline."""
+    k = len(outline)
+    length = np.abs(np.roll(outline, -1) - outline)
+    share = (1 - _EVENLY) * length / length.sum() + _EVENLY / k
+    along: ComplexArray = np.exp(2j * np.pi * (np.cumsum(share) - share))
+    return along
+
+
+def _points(w: ComplexArray) -> FloatArray:
+    return np.stack([w.real, w.imag], axis=-1)

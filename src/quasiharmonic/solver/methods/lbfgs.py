@@ -1,0 +1,123 @@
+"""L-BFGS, in units of one's own for every triangle if need be, with steps that never raise the objective (§9.1).
+
+What a step of ξ does differs by many orders of magnitude between triangles, and plain L-BFGS spends itself on finding
+that out. Each triangle's ξ may be measured in given units, and an objective may be infinite: steps that lead there
+are shortened.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from quasiharmonic.energies.newton.line_search import backtrack
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.solver.field.objective import Iterate, Objective
+from quasiharmonic.solver.methods.base import FunctionalDescent, Iterates
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
+
+# Pairs of steps and changes of gradient that are remembered.
+_MEMORY = 10
+# No triangle's ξ moves farther in a step than so many times 1 + |ξ|; the latter in steps from a gradient alone. With
+# si-log |μ| = 0.9 is 8,102 away.
+_LONGEST, _FIRST = 1.0, 0.1
+# A step is shortened this often before the direction is given up.
+_TRIES = 20
+# The descent is at rest when so many steps together have lowered the objective by less than the tolerance.
+_WINDOW = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class LBFGS(FunctionalDescent):
+    """Descend by limited-memory BFGS; the objective has a finite value at the start.
+
+    Attributes
+    ----------
+    iterations : int
+        Evaluations at most, those of the line search included.
+    stiffness : (f,) float64, optional
+        The diagonal that stands for the second derivative until something better is known, up to a factor; positive,
+        and all alike by default.
+    tolerance : float
+        Ten steps that lower the objective by less than this fraction of it are the end.
+    """
+
+    stiffness: FloatArray | None = None
+    tolerance: float = 0.0
+
+    word: ClassVar[str] = "l-bfgs"
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """As of `Descent`, each of less value than the one before; at rest also where no step lowers it any more."""
+        stiffness = np.ones(start.xi.size) if self.stiffness is None else self.stiffness
+        here, left = start, self.iterations
+        pairs: deque[tuple[ComplexArray, ComplexArray, float]] = deque(maxlen=_MEMORY)
+        values = deque([here.value], maxlen=_WINDOW + 1)
+        while left > 0:
+            before = here.value
+            direction = _direction(here.gradient, pairs, stiffness)
+            slope = work(here.gradient, direction)
+            if not slope < 0:
+                if not pairs:
+                    return True
+                pairs.clear()
+                continue
+
+            def trial(
+                t: float, bound: float, xi: ComplexArray = here.xi, along: ComplexArray = direction
+            ) -> tuple[float, Iterate | None]:
+                nonlocal left
+                left -= 1
+                try:
+                    there = objective.evaluate(objective.bounded(xi + t * along))
+                except NotPositiveDefinite:
+                    return np.inf, None
+                return there.value, there if there.value < bound else None
+
+            def shorter(t: float, after: float, before: float = before, slope: float = slope) -> float:
+                """By how much: to the minimum of the parabola through what is known, within reason."""
+                if not np.isfinite(after):
+                    return 0.25
+                return float(np.clip(-0.5 * slope * t / (after - before - slope * t), 0.1, 0.5))
+
+            farthest = float((np.abs(direction) / (1 + np.abs(here.xi))).max())
+            longest = min(1.0, (_LONGEST if pairs else _FIRST) / farthest)
+            taken = backtrack(trial, before, -slope, longest=longest, tries=min(_TRIES, left), factor=shorter)
+            if taken is None:
+                if not pairs or left <= 0:
+                    return left > 0
+                pairs.clear()
+                continue
+            there = taken.there
+            step, change = there.xi - here.xi, there.gradient - here.gradient
+            curvature = work(step, change)
+            if curvature > 1e-10 * np.sqrt(work(step, step) * work(change, change)):
+                pairs.append((step, change, curvature))
+            here = there
+            yield here
+            values.append(here.value)
+            if len(values) > _WINDOW and values[0] - values[-1] < self.tolerance * abs(values[-1]):
+                return True
+        return False
+
+
+def _direction(
+    gradient: ComplexArray, pairs: deque[tuple[ComplexArray, ComplexArray, float]], stiffness: FloatArray
+) -> ComplexArray:
+    """The two-loop recursion (Nocedal and Wright 2006, algorithm 7.4) from the diagonal ``stiffness``."""
+    direction = -gradient
+    shares = []
+    for step, change, curvature in reversed(pairs):
+        share = work(step, direction) / curvature
+        direction -= share * change
+        shares.append(share)
+    direction /= stiffness
+    if pairs:
+        _, change, curvature = pairs[-1]
+        direction *= curvature / work(change, change / stiffness)
+    for (step, change, curvature), share in zip(pairs, reversed(shares), strict=True):
+        direction += (share - work(change, direction) / curvature) * step
+    return direction

@@ -1,0 +1,286 @@
+"""The ladder: the mesh as it is; edges split that a diagnosis names; more around what stays inverted; the construction.
+
+    as given, shortly ──▶ constructed, if no vertex has to be added
+                      ──▶ as given ──▶ named edges ──▶ around what is inverted ──▶ constructed
+
+A rung is climbed where those below have not led to a map. The construction takes little time, where a whole search that
+finds nothing takes much: so it is made as soon as the first stages of the search have failed, if the target is one that
+it is for. What it adds says whether the rungs between are worth their time, of which they then get a part only; it is
+taken where they come to nothing, or to more.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.sliding import moved_onto
+from quasiharmonic.energies.polishing import energy_named, polished
+from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.exact.certificate import Certificate, certify
+from quasiharmonic.geometry.mesh.refinement import Refined, composed, split_edges
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import MapResult, Rung, Stage, Status, Step
+from quasiharmonic.solver.construction.constructing import Construction, constructions, refined_problem
+from quasiharmonic.solver.construction.opening import thinned
+from quasiharmonic.solver.construction.simplicity import is_simple
+from quasiharmonic.solver.refine.refining import refine_problem
+from quasiharmonic.solver.search.solving import solve
+from quasiharmonic.solver.search.stages import Stages
+from quasiharmonic.solver.search.strategy import soonest, stages_of, without_restarts
+from quasiharmonic.targets.boundary.chords import flattened_edges
+from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.progress import heard
+
+AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
+    "as given",
+    "edges split that the diagnosis names",
+    "edges split around inverted triangles",
+    "constructed",
+)
+_Choice = Callable[[Stages], Stages]
+_Search = Callable[[Problem, ArrayLike | None, int, _Choice], MapResult]
+# Iterations of a search while a construction is there to be taken, and on large meshes so many triangles' iterations;
+# how often edges are split around what such a search leaves inverted; the latter where there is no construction.
+_FEW_ITERATIONS, _FEW_TRIANGLES, _FEW_ROUNDS, _ROUNDS = 600, 1_500_000, 1, 3
+# A construction that adds so few vertices is taken as soon as no map of the mesh as given was found.
+_LEAST = 1
+
+
+@heard
+def climb(
+    problem: Problem,
+    *,
+    strategy: str | Stages = "speed",
+    polish: str | Energy | None = None,
+    start: ArrayLike | None = None,
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+    record: int = 0,
+    slide: bool | Rails = False,
+) -> MapResult:
+    """Solve a problem, on a finer mesh where that is needed.
+
+    Parameters
+    ----------
+    problem : Problem
+    strategy, polish, start, max_iterations, linear_solver, callback, record, slide
+        As of `injective_map`; those of the search are for the mesh as given.
+
+    Returns
+    -------
+    MapResult
+        As of `injective_map` with ``refine``.
+
+    Raises
+    ------
+    ValueError, ImportError
+        As `solve`.
+    """
+    began = time.perf_counter()
+    lower = None if polish is None else energy_named(polish)
+    if slide is not False:
+        if lower is None:
+            raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+        problem = moved_onto(slide, problem)
+
+    def search(on: Problem, first: ArrayLike | None, budget: int, some: _Choice) -> MapResult:
+        return solve(
+            on,
+            strategy=some(stages_of(strategy, on)),
+            start=first,
+            max_iterations=min(budget, max_iterations),
+            linear_solver=linear_solver,
+            callback=callback,
+            record=record if on is problem else 0,
+        )
+
+    result = _Ladder(problem, search).climb(start, max_iterations)
+    if lower is not None and result.status is Status.INJECTIVE:
+        fine = on_refinement(problem, result.refined)
+        result = polished(fine, result, energy=lower, linear_solver=linear_solver, callback=callback, slide=slide)
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+def on_refinement(problem: Problem, refined: Refined | None) -> Problem:
+    """The problem that a result is of, if its mesh was refined."""
+    return problem if refined is None else refined_problem(problem, refined)
+
+
+class _Ladder:
+    """A problem, how it is searched, and what was tried so far."""
+
+    def __init__(self, problem: Problem, search: _Search) -> None:
+        self._problem = problem
+        self._search = search
+        # Of a strategy's stages those that are run.
+        self._some: _Choice = list
+        # Inner edges that a straight side of the target flattens.
+        self._flat = flattened_edges(problem.F, problem.fixed, problem.target)
+        self._rungs: list[Rung] = []
+        # The latest result, with the stages and the history of all before it; and the best.
+        self._last: MapResult | None = None
+        self._best: MapResult | None = None
+
+    def climb(self, start: ArrayLike | None, budget: int) -> MapResult:
+        """The result of the rung that adds the fewest vertices; where none leads to a map, of the last."""
+        try:
+            return replace(self._climb(start, budget), rungs=self._rungs)
+        except KeyboardInterrupt:
+            if self._last is None or self._best is None:
+                raise
+            best = self._taken(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
+            best = replace(best, stages=self._last.stages, history=self._last.history)
+            return replace(best, status=Status.INTERRUPTED, rungs=self._rungs)
+
+    def _climb(self, start: ArrayLike | None, budget: int) -> MapResult:
+        problem = self._problem
+        few = min(budget, _FEW_ITERATIONS, 1 + _FEW_TRIANGLES // len(problem.F))
+        if not is_simple(problem):
+            # What a straight side flattens seldom has a map, and then by little more than a rounding error.
+            first = self._searched(AS_GIVEN, None, start, few if len(self._flat) else budget)
+            # Where a finer mesh is no better, what is told is about the one given.
+            return first if first.injective else self._between(first, budget, _ROUNDS) or first
+        self._some = soonest
+        first = self._searched(AS_GIVEN, None, start, budget)
+        if first.injective:
+            return first
+        made = self._constructed(first)
+        self._some = without_restarts if made.injective else list
+        if not made.added and made.injective:
+            return self._taken(made)
+        if first.status is not Status.IMPOSSIBLE:
+            first = self._searched(AS_GIVEN, None, start, few if made.injective else budget)
+            if first.injective:
+                return first
+        if made.injective and made.added <= _LEAST:
+            return self._taken(made)
+        found = self._between(first, few, _FEW_ROUNDS)
+        if found is not None and (not made.injective or found.added <= made.added):
+            return found
+        return self._taken(made)
+
+    def _taken(self, made: MapResult) -> MapResult:
+        """The constructed map, with what was done before it is handed back."""
+        self._rungs.append(Rung(CONSTRUCTED, made.added, made.injective, made.stages[-1].seconds))
+        return made
+
+    def _between(self, first: MapResult, budget: int, rounds: int) -> MapResult | None:
+        """Split the edges that a diagnosis names, then others around what stays inverted; a map, if one is found."""
+        problem = self._problem
+        straight = split_edges(problem.V, problem.F, self._flat)
+        named = refine_problem(refined_problem(problem, straight))
+        if named.diagnosis.forbids_injective:
+            return None
+        refined, result = composed(straight, named.refined), first
+        if len(refined.parents):
+            result = self._searched(NAMED, refined, None, budget)
+        for _ in range(rounds):
+            if result.injective:
+                return result
+            finer = split_edges(refined.V, refined.F, _around(refined, result.certificate))
+            refined = composed(refined, finer)
+            result = self._searched(AROUND, refined, finer.extend(result.uv), budget)
+        return result if result.injective else None
+
+    def _searched(self, name: str, refined: Refined | None, start: ArrayLike | None, budget: int) -> MapResult:
+        """Search for a map of the mesh as given, or of a finer one, which then is thinned out.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            When the search was interrupted.
+        """
+        began = time.perf_counter()
+        problem = self._problem
+        result = self._search(on_refinement(problem, refined), start, budget, self._some)
+        if refined is not None:
+            uv = result.uv
+            try:
+                if result.certificate.bijective:
+                    refined, uv = thinned(problem, refined, uv)
+            except KeyboardInterrupt:
+                result = replace(result, status=Status.INTERRUPTED)
+            certificate = certify(refined.F, uv, loops=problem.domain.loops)
+            result = replace(result, uv=uv, certificate=certificate, mu=None, V=refined.V, refined=_if_any(refined))
+        result = self._continued(result)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        self._rungs.append(Rung(name, result.added, result.injective, time.perf_counter() - began))
+        return result
+
+    def _constructed(self, first: MapResult) -> MapResult:
+        """A constructed map, certified, or where doubles have no room for one."""
+        began, before, result = time.perf_counter(), self._last, first
+        for made in constructions(self._problem, first.uv):
+            # In place of the one before it, and there if an interrupt keeps it from getting better.
+            self._last = before
+            result = self._continued(self._as_result(made, first, time.perf_counter() - began))
+        # Other constructions were tried after the best.
+        *others, last = result.stages
+        return replace(result, stages=[*others, replace(last, seconds=time.perf_counter() - began)])
+
+    def _as_result(self, made: Construction, first: MapResult, seconds: float) -> MapResult:
+        bad = made.certificate.flipped.size + made.certificate.degenerate.size
+        stage = Stage(CONSTRUCTED, 0, seconds, (len(self._problem.F), bad), (np.inf, np.inf))
+        return replace(
+            first,
+            uv=made.uv,
+            status=_status(made),
+            certificate=made.certificate,
+            stages=[stage],
+            history=[],
+            diagnosis=None,
+            mu=None,
+            path=[],
+            V=made.refined.V,
+            refined=_if_any(made.refined),
+            crowded=made.crowded,
+        )
+
+    def _continued(self, result: MapResult) -> MapResult:
+        """A result with what was done before it, which is the latest from here on."""
+        last, best = self._last, self._best
+        if last is not None:
+            result = replace(result, stages=last.stages + result.stages, history=last.history + result.history)
+        self._last = result
+        if best is None or _rank(result) <= _rank(best):
+            self._best = result
+        return result
+
+
+def _status(made: Construction) -> Status:
+    if made.certificate.bijective:
+        return Status.INJECTIVE
+    return Status.NO_ROOM if made.cut else Status.ENTANGLED
+
+
+def _rank(result: MapResult) -> tuple[int, bool, int]:
+    """The lower, the better."""
+    certificate = result.certificate
+    bad = certificate.flipped.size + certificate.degenerate.size + certificate.nonfinite.size
+    return bad, not certificate.bijective, result.added
+
+
+def _if_any(refined: Refined) -> Refined | None:
+    """A refinement, if it has added anything."""
+    return refined if len(refined.parents) else None
+
+
+def _around(refined: Refined, certificate: Certificate) -> IntArray:
+    """Inner edges (s, 2) of the triangles that are not positive, and of those around them."""
+    F, n = refined.F, len(refined.V)
+    bad = np.concatenate([certificate.flipped, certificate.degenerate])
+    near = np.zeros(n, dtype=np.bool_)
+    near[F[bad]] = True
+    tail, head = F[near[F].any(axis=1)], np.roll(F[near[F].any(axis=1)], -1, axis=1)
+    beside = np.unique(edge_keys(tail.ravel(), head.ravel(), n))
+    inner = edges(F, n).interior
+    return inner[np.isin(edge_keys(inner[:, 0], inner[:, 1], n), beside)]

@@ -1,0 +1,199 @@
+"""Rounds of descent of a quasi-harmonised energy (§11).
+
+    map ──▶ ξ of its own tensors ──▶ VectorAdam, a few steps ──▶ L-BFGS in the units it has learnt ──▶ map
+     ▲                                                                                               │
+     └───────────────────────────────── next round, η as the schedule has it ────────────────────────┤
+                                                                                                     ▼
+                                        the injective map of least energy on the way ◀── last flips righted by V₃
+
+A large η moves far and leaves a few triangles inverted where the energy wants them so; a smaller one rights them. Each
+round begins at the map's own tensors, at which V₃ vanishes if the map is injective: what V₃ has come to cost is waived,
+and the descent converges to a minimum of E among the injective maps and not to a compromise with V₃.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.problem.result import Stage, Step
+from quasiharmonic.solver.field.objective import Iterate, Objective
+from quasiharmonic.solver.methods import LBFGS, Newton, Patches, VectorAdam
+from quasiharmonic.solver.methods.base import Steps
+from quasiharmonic.solver.search.harmonised import Harmonised
+from quasiharmonic.util.arrays import FloatArray
+
+# Of a round's evaluations, this part goes to VectorAdam; the length of its steps, halved where they leave the energy's
+# domain; and how much of its mean squares a gradient leaves.
+_PROBING, _LENGTH, _MEMORY = 0.4, 0.1, 0.9
+# Of the mean stiffness that VectorAdam has learnt, the least that a triangle is given.
+_SOFTEST = 1e-3
+# Newton steps and local repairs for the last flips.
+RIGHTING = 40
+
+
+class HarmonicDescent:
+    """The map at hand, the best on the way, and how to get to the next.
+
+    Parameters
+    ----------
+    objective : Objective
+        V₃ of the problem with its fixed vertices where ``uv`` has them, in the tanh parameterisation.
+    energy : callable
+        From η to what a round descends.
+    uv : (n, 2) float64
+        The map to begin with.
+    callback : callable or None
+        Called with a `Step` at every map.
+
+    Attributes
+    ----------
+    uv : (n, 2) float64
+        The map of fewest inversions so far, of least distortion among those.
+    best : (int, float)
+        Its inverted triangles, and ``E + κR₁``.
+    history : list of Step
+    stages : list of Stage
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        energy: Callable[[float], Harmonised],
+        uv: FloatArray,
+        callback: Callable[[Step], object] | None,
+    ) -> None:
+        self.uv = uv
+        self._objective, self._energy = objective, energy
+        self._problem, self._callback = objective.problem, callback
+        self._measure = energy(1.0)
+        self.history: list[Step] = []
+        self.stages: list[Stage] = []
+        self._squares = np.zeros(len(self._problem.F))
+        self.back()
+        flipped = flipped_triangles(self._problem.F, uv).size
+        distortion = self._measure.distortion if flipped else self._measure.distortion_of_map
+        self.best = flipped, distortion(self._last)
+        self._report(self.best)
+
+    def back(self) -> None:
+        """Go back to the best map."""
+        self._last = self._objective.of_map(self._problem.frame.inward(self.uv))
+
+    def run(self, name: str, eta: float, iterations: int, tolerance: float) -> bool:
+        """One round; whether it came to rest."""
+        objective = self._objective.descending(self._energy(eta))
+        with self._stage(name):
+            start = self._restart(objective)
+            if not np.isfinite(start.value):
+                return False
+            lowest, left = self._probe(objective, start, iterations)
+            if not self._squares.any():
+                return True
+            if not np.isfinite(self._squares).all():
+                return False  # gradients that leave the numbers' range give no units to go on in
+            stiffness = np.sqrt(self._squares)
+            stiffness += _SOFTEST * stiffness.mean()
+            self._last = lowest
+            if left < 1:
+                return False
+            method = LBFGS(iterations=left, stiffness=stiffness, tolerance=tolerance)
+            steps = Steps(method.iterates(objective, lowest))
+            for at in steps:
+                self._visit(at)
+            return steps.at_rest
+        return False
+
+    def right(self) -> bool:
+        """Right the last inverted triangles by descending V₃ alone, close to where the rounds have ended.
+
+        Whether there are none in the end.
+        """
+        if self.history[-1].flipped == 0:
+            return True
+        for method in (Newton(iterations=RIGHTING), Patches(tries=RIGHTING)):
+            with self._stage(f"{method.word}, tanh"):
+                self._last = self._objective.evaluate(self._last.xi)
+                for at in method.iterates(self._objective, self._last):
+                    self._visit(at)
+                    if self.history[-1].flipped == 0:
+                        return True
+        return False
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        """Write down what runs; where rounding leaves no Laplacian, it is over."""
+        began, done, best = time.perf_counter(), len(self.history), self.best
+        try:
+            yield
+        except NotPositiveDefinite:
+            pass
+        finally:
+            first, last = self.history[done - 1], self.history[-1]
+            self.stages.append(
+                Stage(
+                    name=name,
+                    iterations=len(self.history) - done,
+                    seconds=time.perf_counter() - began,
+                    flipped=(first.flipped, last.flipped),
+                    energy=(first.energy, last.energy),
+                    kept=self.best < best,
+                )
+            )
+
+    def _restart(self, objective: Objective) -> Iterate:
+        """The map at hand by its own tensors, or as it is where these have no factorisation."""
+        try:
+            return objective.near_map(self._last.w)
+        except NotPositiveDefinite:
+            return objective.evaluate(self._last.xi)
+
+    def _probe(self, objective: Objective, start: Iterate, iterations: int) -> tuple[Iterate, int]:
+        """Learn each triangle's stiffness by VectorAdam, which moves all of them at one pace.
+
+        Returns the lowest iterate and the evaluations left.
+        """
+        lowest = here = start
+        count = left = int(np.ceil(_PROBING * iterations))
+        length = _LENGTH
+        while left > 0:
+            for at in VectorAdam(iterations=left, schedule=((0, length),)).iterates(objective, here):
+                left -= 1
+                if not np.isfinite(at.value):
+                    length *= 0.5
+                    break
+                gradient = at.gradient
+                self._squares *= _MEMORY
+                self._squares += (1 - _MEMORY) * (gradient.real**2 + gradient.imag**2)
+                here = at
+                self._visit(at)
+                if at.value < lowest.value:
+                    lowest = at
+        return lowest, iterations - count
+
+    def _visit(self, at: Iterate) -> None:
+        """Take note of a map."""
+        self._last = at
+        flipped, distortion = at.flipped, self._measure.distortion(at)
+        if flipped == 0:
+            # Decided on the coordinates that are handed back, not on the solver's own.
+            uv = self._problem.positions(at.w)
+            flipped = flipped_triangles(self._problem.F, uv).size
+            self._compare((flipped, self._measure.distortion_of_map(at)), uv)
+        elif flipped <= self.best[0]:
+            self._compare((flipped, distortion), self._problem.positions(at.w))
+        self._report((flipped, distortion))
+
+    def _compare(self, state: tuple[int, float], uv: FloatArray) -> None:
+        if state < self.best:
+            self.best, self.uv = state, uv
+
+    def _report(self, state: tuple[int, float]) -> None:
+        self.history.append(Step(len(self.history), *state))
+        if self._callback is not None:
+            self._callback(self.history[-1])

@@ -1,0 +1,93 @@
+"""Quasi-harmonised energies: any distortion energy, held within the injective maps by V₃ (§11).
+
+``Q(ξ) = V₃(ξ)/|Ω| + η (E(w(ξ)) + κ R₁(ξ))`` for the quasi-harmonic map w of the tensors of ξ. The first term is zero
+exactly where that map is injective, so E need not mind inversions; and every injective map is the map of some tensors
+(Theorem 6.4), so nothing is lost by descending over ξ.
+
+The paper's Q is this times the area |Ω| of the target, which it scales to the surface's: here all three terms are pure
+numbers, η means the same, and no map is scaled.
+"""
+
+from __future__ import annotations
+
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Deformation
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.problem import Problem
+from quasiharmonic.solver.field.functionals import Functional, QuasiHarmonicMap, twist
+from quasiharmonic.solver.field.regularisers import Conformal
+from quasiharmonic.util.arrays import ComplexArray
+
+
+class Harmonised(Functional):
+    """``V₃/|Ω| + η (E + κ R₁)``.
+
+    The gradient of E passes through the solution of the Laplacian: with the adjoint ``L λ = ∂E/∂w`` (zero at fixed
+    vertices), a change of the tensors by dA changes E by ``−Re λᴴ dL w``. That is one more solve with the factor at
+    hand.
+
+    Parameters
+    ----------
+    problem : Problem
+    mesh : ReferenceMesh
+    area : float
+        |Ω|, the area that the target encloses, in the problem's frame; positive.
+    energy : DeformationEnergy or None
+        E, for maps in the frame; None for zero.
+    regulariser : Conformal
+        R₁.
+    eta, conformal : float
+        η and κ.
+    """
+
+    name = "harmonised"
+
+    def __init__(
+        self,
+        problem: Problem,
+        mesh: ReferenceMesh,
+        area: float,
+        energy: DeformationEnergy | None,
+        regulariser: Conformal,
+        *,
+        eta: float,
+        conformal: float,
+    ) -> None:
+        super().__init__(problem, mesh)
+        self.area = area
+        self.energy = energy
+        self.regulariser = regulariser
+        self.eta = eta
+        self.conformal = conformal
+        self._known: tuple[ComplexArray, Deformation] | None = None
+
+    def value(self, at: QuasiHarmonicMap) -> float:
+        return at.dirichlet / self.area + self.eta * self.distortion(at)
+
+    def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
+        gradient = at.dirichlet_gradient / self.area
+        if self.energy is not None:
+            pull = self.energy.gradient_of(self._deformation(self.energy, at), at.w.size)
+            adjoint = self.mesh.derivatives(at.operator.respond(pull))
+            by_mu = at.field.pull_twist(*twist(self.mesh, adjoint, at.dw))
+            gradient = gradient - self.eta * at.field.pull(by_mu)
+        return gradient + self.eta * self.conformal * self.regulariser.gradient(at.field)
+
+    def distortion(self, at: QuasiHarmonicMap) -> float:
+        """``E + κ R₁``; ``inf`` where E is a barrier and a triangle inverted."""
+        return self._energy(at) + self.conformal * self.regulariser.value(at.field)
+
+    def distortion_of_map(self, at: QuasiHarmonicMap) -> float:
+        """The same with R₁ taken at the map's own tensors: a property of the map alone, ``inf`` if it is inverted."""
+        return self._energy(at) + self.conformal * self.regulariser.of_map(at.dw)
+
+    def _energy(self, at: QuasiHarmonicMap) -> float:
+        return 0.0 if self.energy is None else self.energy.value_of(self._deformation(self.energy, at))
+
+    def _deformation(self, energy: DeformationEnergy, at: QuasiHarmonicMap) -> Deformation:
+        """The map's Jacobians, which value and gradient both need."""
+        # As of `Poisson.response`: what is returned is a local, whoever overwrites what is kept.
+        known = self._known
+        if known is None or known[0] is not at.w:
+            known = self._known = at.w, energy.deform(at.w)
+        return known[1]

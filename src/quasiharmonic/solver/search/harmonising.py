@@ -1,0 +1,287 @@
+"""Injective maps of little distortion, whether or not the energy minds inversions: quasi-harmonisation (§11)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet, UnsignedARAP
+from quasiharmonic.energies.springs import MassSpring
+from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
+from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.problem.diagnosis import diagnose
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.regularisers import Conformal
+from quasiharmonic.solver.search.harmonic_descent import HarmonicDescent
+from quasiharmonic.solver.search.harmonised import Harmonised
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_callback,
+    check_choice,
+    kind_of,
+    map_array,
+    named,
+    not_negative,
+    real_array,
+    true_or_false,
+    whole_number,
+)
+from quasiharmonic.util.progress import heard
+
+#: What can be lowered, by name: each makes its energy from the rest mesh.
+ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
+    "arap": lambda V, F: ARAP(),
+    "arap-unsigned": lambda V, F: UnsignedARAP(),
+    "area": lambda V, F: AreaPreserving(),
+    "springs": MassSpring,
+    "mips": lambda V, F: MIPS(),
+    "symmetric-dirichlet": lambda V, F: SymmetricDirichlet(),
+}
+#: η by round. Barriers keep the map injective by themselves; the others need V₃ to have the last word.
+BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
+ETA = (0.1, 0.1, 0.01, 0.001)
+
+
+@takes_mesh
+@heard
+def harmonise(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    fixed: ArrayLike,
+    energy: str | Energy | None = "arap",
+    eta: float | Sequence[float] | None = None,
+    conformal: float = 1e-3,
+    weights: ArrayLike | None = None,
+    scaled: bool = True,
+    max_iterations: int = 40,
+    tolerance: float = 1e-3,
+    reference: Reference = "rest",
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> MapResult:
+    """Lower any distortion energy within the injective maps, by quasi-harmonisation (§11).
+
+    For energies that are finite for inverted triangles, and for those of which only first derivatives are known.
+    `quasiharmonic.polish` needs barriers with second derivatives, and is faster for these.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles.
+    uv : (n, 2) array
+        A map to begin with, as `quasiharmonic.injective_map` finds it. It need not be injective unless the energy
+        is a barrier.
+    fixed : (k,) array of int
+        Vertices that stay where they are in ``uv``, to the last bit: the whole boundary and any pins.
+    energy : str, Energy or None
+        E, the mean over the surface's area:
+
+        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)², rigid where it can be, with σ₂ < 0 for inverted triangles;
+        - ``"arap-unsigned"``: the same with σ₂ ≥ 0, as the paper has it: mirroring costs nothing;
+        - ``"area"``: (σ₁σ₂ − 1)², areas and nothing else;
+        - ``"springs"``: (l − l⁰)² summed over the mesh's edges;
+        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles and nothing else;
+        - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻² − 4, lengths.
+
+        Or any `Energy`. None leaves R₁ alone, which is MIPS in the end and no barrier on the way.
+    eta : float or sequence of float, optional
+        η in ``V₃/|Ω| + η (E + κ R₁)``, one for each round. By default four rounds, that end at 1 for barriers and at
+        0.001 for other energies. (The paper has one, of 1e-4, for all.)
+    conformal : float
+        κ, the weight of the regulariser R₁ (eq. 35). A little of it keeps triangles from collapsing.
+    weights : (f,) array, optional
+        How much each triangle's distortion counts in E; not negative, 1 by default. R₁ counts all alike: it keeps the
+        others from collapsing.
+    scaled : bool
+        Compare lengths and areas after scaling the map to the surface's area. With False they are taken as they are:
+        what part of the mesh has weight can be at rest then whatever room the whole is given.
+    max_iterations : int
+        Linear solves of each round at most.
+    tolerance : float
+        A round is at rest when ten steps have lowered its objective by less than this fraction. Not negative.
+    reference : {"equilateral", "rest", "corrected"}
+        Triangles in which V₃ and R₁ are taken. R₁ means the surface's angles in those of the rest mesh alone.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every map on the way, and with the last one again at least every half second in between,
+        but not within a single factorisation; its ``energy`` is E + κR₁.
+
+    Returns
+    -------
+    MapResult
+        The injective map of least E + κR₁ on the way, ``uv`` included; certified. With status ``POLISHED`` when the
+        last round came to rest, ``STILL_FALLING`` when it did not, ``UNIMPROVED`` when no injective map on the way was
+        better than ``uv``, ``INTERRUPTED`` by Ctrl-C; or, with the map of fewest inversions, where none was injective,
+        ``IMPOSSIBLE`` if the ``diagnosis`` names what forbids one and else ``SETTLED``. The history holds E + κR₁ at
+        every map.
+
+    Raises
+    ------
+    ValueError
+        When the input is malformed (see `Problem`), a rest triangle has no area, or the energy is a barrier and
+        ``uv`` not injective; the message names the triangles. When an option has no such value.
+
+    Examples
+    --------
+    A disk whose triangles crowd at the middle, of which areas alone are to be kept:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import distortion
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(6)
+    >>> crowded = V * np.linalg.norm(V, axis=1, keepdims=True)
+    >>> result = harmonise(V, F, crowded, fixed=np.arange(len(V) - 36, len(V)), energy="area")
+    >>> result.injective, bool(distortion(V, F, result.uv).area_ratio.std() < 0.1)
+    (True, True)
+    """
+    began = time.perf_counter()
+    domain = Domain(V, F, fixed)
+    domain.check_boundary_fixed()
+    if energy is None and reference == "rest":
+        domain.check_areas()
+    result = harmonise_map(
+        domain,
+        uv,
+        energy=energy,
+        eta=eta,
+        conformal=conformal,
+        weights=weights,
+        scaled=scaled,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        reference=reference,
+        linear_solver=linear_solver,
+        callback=callback,
+    )
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+@heard
+def harmonise_map(
+    domain: Domain,
+    uv: ArrayLike,
+    *,
+    energy: str | Energy | None = "arap",
+    eta: float | Sequence[float] | None = None,
+    conformal: float = 1e-3,
+    weights: ArrayLike | None = None,
+    scaled: bool = True,
+    max_iterations: int = 40,
+    tolerance: float = 1e-3,
+    reference: Reference = "rest",
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> MapResult:
+    """Harmonise a map of a `Domain` at hand; the rest as `harmonise` has it.
+
+    The domain's ``fixed`` vertices stay where they are in ``uv``.
+    """
+    began = time.perf_counter()
+    chosen = _energy(energy, domain)
+    barrier = chosen is not None and chosen.barrier
+    schedule = _schedule(eta, barrier)
+    not_negative("conformal", conformal)
+    if chosen is None and conformal == 0:
+        raise ValueError("conformal must be positive where there is no energy, not 0")
+    if weights is not None and chosen is None:
+        raise ValueError("weights are the energy's, and there is none")
+    check_choice("reference", reference, get_args(Reference))
+    whole_number("max_iterations", max_iterations, least=1)
+    not_negative("tolerance", tolerance)
+    true_or_false("scaled", scaled)
+    check_callback(callback)
+    start = map_array("uv", uv, domain.n)
+    flipped = flipped_triangles(domain.F, start)
+    if barrier and flipped.size:
+        raise ValueError(
+            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area, where "
+            "this energy is infinite; begin with an injective map, or lower R₁ (energy=None)"
+        )
+    name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
+    problem = Problem.on(domain, start[domain.fixed])
+    with problem.exclusive() as own, np.errstate(all="ignore"):
+        area = float(signed_areas(own.F, own.frame.inward(start)).sum())
+        if not area > 0:
+            raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
+        deformation = None
+        if chosen is not None:
+            # In the frame's unit map and surface compare as they do in the caller's.
+            V, asked = (own.V, area) if scaled else (own.frame.lengths(own.V), None)
+            deformation = DeformationEnergy(V, own.F, chosen, area=asked, weights=weights)
+        objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
+        regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
+
+        def descended(eta: float) -> Harmonised:
+            return Harmonised(own, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
+
+        descent = HarmonicDescent(objective, descended, start, callback)
+        first, status = descent.best, Status.STILL_FALLING
+        try:
+            for values in (schedule, len(schedule) * schedule[-1:]):
+                for value in values:
+                    rest = descent.run(f"harmonise, {name}, η = {value:g}", value, max_iterations, tolerance)
+                    status = Status.POLISHED if rest else Status.STILL_FALLING
+                done = descent.right() and (descent.best < first or status is Status.POLISHED)
+                if done or values == len(schedule) * schedule[-1:]:
+                    break
+                # The schedule's long steps left triangles that cannot be righted, or are still above the map given:
+                # from the start once more, with the last η alone.
+                descent.back()
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+    certificate = certify(domain.F, descent.uv)
+    diagnosis = None
+    if status is not Status.INTERRUPTED:
+        converged = status is Status.POLISHED and descent.history[-1].flipped == 0
+        if not certificate.injective:
+            try:
+                diagnosis = diagnose(problem)
+                status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
+            except KeyboardInterrupt:
+                status = Status.INTERRUPTED
+        elif not (descent.best < first or converged):
+            status = Status.UNIMPROVED
+    return MapResult(
+        uv=descent.uv,
+        status=status,
+        certificate=certificate,
+        stages=descent.stages,
+        history=descent.history,
+        diagnosis=diagnosis,
+        linear_solver=objective.laplacian.solver.name,
+        seconds=time.perf_counter() - began,
+        V=domain.V,
+    )
+
+
+def _energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
+    """The energy of a name, made for this mesh."""
+    if energy is None or isinstance(energy, Energy):
+        return energy
+    if energy not in ENERGIES:
+        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {kind_of(energy)}")
+    return ENERGIES[energy](domain.V, domain.F)
+
+
+def _schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float, ...]:
+    if eta is None:
+        return BARRIER_ETA if barrier else ETA
+    schedule = np.atleast_1d(real_array("eta", eta))
+    if schedule.ndim != 1 or not schedule.size or not np.all((schedule > 0) & (schedule < np.inf)):
+        raise ValueError(f"eta must be a positive number, or one for every round, not {eta!r}")
+    return tuple(float(value) for value in schedule)

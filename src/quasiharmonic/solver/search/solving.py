@@ -1,0 +1,152 @@
+"""From a problem to a map without inverted triangles: the strategy (§9.2).
+
+The search stops at the first map whose every triangle is strictly positive, decided exactly on the coordinates that are
+handed back.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import get_args
+
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.sliding import moved_onto
+from quasiharmonic.energies.polishing import energy_named, polished
+from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.problem import Frame, Problem
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
+from quasiharmonic.solver.search.stages import Search, Stages
+from quasiharmonic.solver.search.strategy import stages_of
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    check_callback,
+    check_choice,
+    kind_of,
+    map_array,
+    whole_number,
+)
+from quasiharmonic.util.progress import heard
+
+
+@heard
+def solve(
+    problem: Problem,
+    *,
+    strategy: str | Stages = "speed",
+    polish: str | Energy | None = None,
+    start: ArrayLike | None = None,
+    max_iterations: int = 2000,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+    record: int = 0,
+    slide: bool | Rails = False,
+) -> MapResult:
+    """Solve a problem at hand.
+
+    Parameters
+    ----------
+    problem : Problem
+        It has the kind of reference triangles too, and is not changed but for what it keeps to be solved again sooner.
+    strategy, polish, start, max_iterations, linear_solver, callback, record, slide
+        As of `injective_map`.
+
+    Returns
+    -------
+    MapResult
+        As of `injective_map`.
+
+    Raises
+    ------
+    ValueError
+        When an option is none that there is, or ``start`` has another shape than (n, 2) or a place that is not finite.
+    ImportError
+        When the linear solver named is not installed.
+    """
+    began = time.perf_counter()
+    whole_number("max_iterations", max_iterations, least=1)
+    whole_number("record", record, least=0)
+    check_callback(callback)
+    lower = None if polish is None else energy_named(polish)
+    if not isinstance(problem, Problem):
+        raise TypeError(f"solve takes a Problem, not {kind_of(problem)}: injective_map takes the arrays of one")
+    first = None if start is None else _first_map(problem, start)
+    if slide is not False:
+        if lower is None:
+            raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+        problem = moved_onto(slide, problem)
+    with problem.exclusive() as own:
+        search = Search(own, linear_solver, callback, max_iterations, record, first)
+        status = search.run(stages_of(strategy, own))
+    uv = problem.positions(search.best_map)
+    certificate = certify(problem.F, uv, loops=problem.domain.loops)
+    field = search.best_field
+    result = MapResult(
+        uv=uv,
+        status=Status.INJECTIVE if certificate.injective else status,
+        certificate=certificate,
+        stages=search.stages,
+        history=search.history,
+        path=search.path,
+        diagnosis=search.diagnosis,
+        linear_solver=search.linear_solver,
+        mu=None if field is None else field.mu,
+        reference=search.best_reference,
+        V=problem.V,
+    )
+    if lower is not None and status is Status.INJECTIVE:
+        result = polished(problem, result, energy=lower, linear_solver=linear_solver, callback=callback, slide=slide)
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+def quasi_harmonic_map(
+    problem: Problem,
+    mu: ComplexArray | None = None,
+    *,
+    reference: Reference = "equilateral",
+    linear_solver: str = "auto",
+) -> FloatArray:
+    """The quasi-harmonic map of a tensor field, or Tutte's embedding where no field is given (equation 12).
+
+    Parameters
+    ----------
+    problem : Problem
+    mu : (f,) complex128, optional
+        Beltrami coefficients of the tensors, below 1 in modulus; zero by default.
+    reference : {"equilateral", "rest", "corrected"}
+        The triangles in whose frames they are expressed, unless the problem itself names others.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+
+    Returns
+    -------
+    (n, 2) float64
+        Positions, the fixed vertices exactly at their target. Injective only where the target is convex
+        or μ is right.
+
+    Raises
+    ------
+    ValueError
+        When μ has another shape or is not below 1 in modulus; the message names the triangles.
+    quasiharmonic.linsolve.NotPositiveDefinite
+        When rounding leaves no positive definite Laplacian.
+    """
+    check_choice("reference", reference, get_args(Reference))
+    coefficients = beltrami_coefficients(mu, len(problem.F))
+    with problem.exclusive() as own:
+        objective = Objective(own, reference=reference, linear_solver=linear_solver)
+        return own.positions(objective.evaluate(TANH.invert(coefficients)).w)
+
+
+def _first_map(problem: Problem, start: ArrayLike) -> ComplexArray:
+    """The caller's first map, checked, as complex numbers in a frame of its own: only its tensors count."""
+    uv = map_array("start", start, problem.n)
+    return Frame(uv).inward(uv)

@@ -1,1 +1,0 @@
-"""The page ``qhm studio``: a surface beside its map, to be taken hold of."""

@@ -1,0 +1,4 @@
+"""Which boundary vertex goes where on an outline.
+
+The package builds on the outlines and on `problem`. Start reading in `boundary_to`, then `correspondence`.
+"""

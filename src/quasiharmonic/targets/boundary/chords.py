@@ -1,0 +1,106 @@
+"""Chords, interior edges between two boundary vertices, which have to fit into the target in one piece."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.geometry.mesh.topology import edges, trace_loops
+from quasiharmonic.io.adapters.objects import mesh_triangles
+from quasiharmonic.targets.outlines.contours import as_complex
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    held_places,
+    held_vertices,
+    named,
+    triangle_array,
+    triangle_rows,
+)
+
+# How far a line may bend outwards and count as straight, as a share of the outline's larger side.
+STRAIGHT = 1e-9
+
+
+def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
+    """Interior edges between two vertices of a loop, as positions in it, the smaller one first; (c, 2) int64.
+
+    Parameters
+    ----------
+    loop : (l,) int64
+    interior : (e, 2) int64
+    n : int
+        Number of vertices of the mesh.
+    """
+    position = np.full(n, -1)
+    position[loop] = np.arange(len(loop))
+    found = position[interior]
+    return np.sort(found[(found >= 0).all(axis=1)], axis=1)
+
+
+def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolerance: float = STRAIGHT) -> IntArray:
+    """Interior edges that the target lays along its own boundary, so that what they cut off has no room.
+
+    Between the ends of such an edge the boundary bends nowhere outwards: it runs straight, as along a
+    side of a polygon, or goes around a notch. A triangle with two boundary edges on one side of a
+    rectangle is the common case. No map without inverted triangles exists then (`diagnose` proves it
+    on the exact coordinates, which may say otherwise by a rounding error); `refine` splits the edges.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+        Triangles of a surface.
+    fixed : (k,) array of int
+        Vertices with given positions, the whole boundary among them.
+    target : (k, 2) float
+        Their positions.
+    tolerance : float
+        How far outwards counts as straight, as a share of the target's larger side.
+
+    Returns
+    -------
+    (s, 2) int64
+        The edges, smaller vertex first.
+
+    Raises
+    ------
+    ValueError
+        When an array is malformed, or a boundary vertex is not in ``fixed``.
+    """
+    F = triangle_rows(mesh_triangles(F))
+    n = int(F.max(initial=-1)) + 1
+    F = triangle_array(F, n)
+    fixed = held_vertices(fixed, n)
+    places = held_places(target, len(fixed))
+    found = edges(F, n)
+    missing = np.setdiff1d(found.boundary, fixed)
+    if missing.size:
+        raise ValueError(f"the boundary {named('vertex', 'vertices', missing)} not in fixed")
+    # Of magnitude about one, so that nothing over- or underflows.
+    places = np.ldexp(places, -int(np.frexp(np.abs(places).max(initial=0))[1]))
+    position = np.full((n, 2), np.nan)
+    position[fixed] = places
+    least = tolerance * float(np.ptp(places, axis=0).max()) if len(places) else 0.0
+    flat = [np.empty((0, 2), dtype=np.int64)]
+    for loop in trace_loops(found.boundary):
+        chords = chords_of(loop, found.interior, n)
+        flat.append(np.sort(loop[chords[list(flat_chords(chords, position[loop], least))]], axis=1))
+    return np.concatenate(flat)
+
+
+def flat_chords(chords: IntArray, places: FloatArray, least: float) -> Iterator[int]:
+    """Rows of chords between whose ends the loop's places reach outwards by no more than ``least``."""
+    w = as_complex(places)
+    for k, (i, j) in enumerate(chords.tolist()):
+        if min(_bulge(w[i : j + 1]), _bulge(np.concatenate([w[j:], w[: i + 1]]))) <= least:
+            yield k
+
+
+def _bulge(w: NDArray[np.complex128]) -> float:
+    """How far a curve reaches to the right of the straight line from its beginning to its end."""
+    across = w[-1] - w[0]
+    if across == 0:
+        return 0.0
+    return float(-((w[1:-1] - w[0]) * np.conj(across / abs(across))).imag.min())

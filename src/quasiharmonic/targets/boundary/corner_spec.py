@@ -1,0 +1,202 @@
+"""Corners of a boundary as a user writes them: vertices, places, or ``auto``; and which vertices that are."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.textual import integer
+from quasiharmonic.targets.boundary.pins import Corners
+from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array
+
+FORMS = "V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
+_NEAR = "near:"
+
+Place: TypeAlias = tuple[float, float, float]
+Goal: TypeAlias = int | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class AskedCorners:
+    """Corners that somebody asks for, whatever the surface.
+
+    Attributes
+    ----------
+    entries : tuple of (int or (x, y, z), int or (x, y) or None), or "auto"
+        A vertex, or a place in space to which the nearest boundary vertex is meant; and the corner or the point of the
+        outline to which it goes. None where corners go to those of the outline in order; then for all.
+    """
+
+    entries: tuple[tuple[int | Place, Goal | None], ...] | Literal["auto"]
+
+    def within(self, vertices: IntArray) -> AskedCorners | None:
+        """The corners asked for of an island, by its own numbers.
+
+        Parameters
+        ----------
+        vertices : (m,) int64
+            Which vertex of the mesh each of its own is, ascending; of one that is there twice the first is meant.
+
+        Returns
+        -------
+        AskedCorners or None
+            Without those of other islands; None if none is left.
+        """
+        if isinstance(self.entries, str) or np.array_equal(vertices, np.arange(len(vertices))):
+            return self
+        own = [
+            (int(np.searchsorted(vertices, who)) if isinstance(who, int) else who, goal)
+            for who, goal in self.entries
+            if not isinstance(who, int) or who in vertices
+        ]
+        return AskedCorners(tuple(own)) if own else None
+
+    def on(self, V: ArrayLike, F: ArrayLike) -> Corners | Literal["auto"]:
+        """The corners of a surface, as `boundary_to` takes them.
+
+        Parameters
+        ----------
+        V : (n, 2) or (n, 3) array
+        F : (f, 3) array of int
+
+        Raises
+        ------
+        ValueError
+            When a vertex is asked for twice.
+        """
+        if isinstance(self.entries, str):
+            return "auto"
+        places = [who for who, _ in self.entries if isinstance(who, tuple)]
+        found = iter(nearest_on_boundary(V, F, places).tolist() if places else [])
+        named: dict[int, str] = {}
+        for who, _ in self.entries:
+            vertex = next(found) if isinstance(who, tuple) else who
+            word = f"{_NEAR}{','.join(f'{x:g}' for x in who)}" if isinstance(who, tuple) else f"vertex {who}"
+            if vertex in named and {word, named[vertex]} == {f"vertex {vertex}"}:
+                raise ValueError(f"{word} is named more than once")
+            if vertex in named:
+                raise ValueError(f"{named[vertex]} and {word} are the same boundary vertex, {vertex}")
+            named[vertex] = word
+        goals = {v: goal for v, (_, goal) in zip(named, self.entries, strict=True) if goal is not None}
+        return goals or list(named)
+
+
+def read_corners(text: str) -> AskedCorners:
+    """Read what is written of corners, or the file that it names.
+
+    Parameters
+    ----------
+    text : str
+        ``auto``; or ``V,V,…`` with vertices counted from 0, for the outline's corners in order. In the place of ``V``
+        there may stand ``near:x,y,z``, the boundary vertex nearest to a place; and ``V:K`` or ``V:X:Y``, for the corner
+        ``K`` or the point ``(X, Y)`` of the outline. Or a text file with one of these on each line, blanks in the place
+        of colons if need be, ``#`` before comments.
+
+    Returns
+    -------
+    AskedCorners
+
+    Raises
+    ------
+    ValueError
+        When that is not what stands there.
+
+    Examples
+    --------
+    >>> read_corners("near:0,0.5,0:2,17:3").entries
+    (((0.0, 0.5, 0.0), 2), (17, 3))
+    """
+    if text == "auto":
+        return AskedCorners("auto")
+    if os.path.isfile(text):
+        lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
+        words = [re.sub(r"\s*,\s*", ",", line.split("#")[0]).replace(":", " ").split() for line in lines]
+        entries = [_entry(":".join(line)) for line in words if line]
+    else:
+        entries = [_entry(part) for part in _parted(text)]
+    if not entries:
+        raise ValueError(f"the file names none: on each line it should have one of {FORMS}")
+    lone = [who for who, goal in entries if goal is None]
+    if lone and len(lone) < len(entries):
+        who = f"vertex {lone[0]}" if isinstance(lone[0], int) else f"what is near {lone[0]}"
+        raise ValueError(f"where does {who} go? Others have a corner or a point")
+    return AskedCorners(tuple(entries))
+
+
+@takes_mesh
+def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArray:
+    """Find the boundary vertex nearest to each of some places.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Vertices.
+    F : (f, 3) array of int
+        Triangles, consistently oriented.
+    places : (k, 3) or (k, 2) array
+        What they lack of a third coordinate is 0, as with vertices.
+
+    Returns
+    -------
+    (k,) int64
+        Of several equally near ones the first, as of those along a cut.
+
+    Raises
+    ------
+    ValueError
+        When arrays are malformed, or the surface is closed.
+    """
+    points, wanted = vertex_array(V), vertex_array(places, "places")
+    loops = boundary_loops(triangle_array(F, len(points)), len(points))
+    if not loops:
+        raise ValueError("the surface is closed: it has no boundary vertices")
+    border = np.sort(np.concatenate(loops))
+    here, there = _spatial(points[border]), _spatial(wanted)
+    # In units of the largest coordinate, a power of two, so that no square overflows or vanishes.
+    exponent = int(np.frexp(max(np.abs(here).max(), np.abs(there).max(initial=0)))[1])
+    here, there = np.ldexp(here, -exponent), np.ldexp(there, -exponent)
+    return np.array([border[np.argmin(((here - place) ** 2).sum(axis=1))] for place in there], dtype=np.int64)
+
+
+def _spatial(points: FloatArray) -> FloatArray:
+    return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
+
+
+def _parted(text: str) -> list[str]:
+    """Entries with commas between them; a place has two of its own."""
+    parts, entries = [part.strip() for part in text.split(",")], []
+    while parts:
+        size = 3 if parts[0].startswith(_NEAR) else 1
+        entries.append(",".join(parts[:size]))
+        del parts[:size]
+    return entries
+
+
+def _entry(text: str) -> tuple[int | Place, Goal | None]:
+    """A vertex or a place, and where it goes if that is said."""
+    vertex, *goal = text.removeprefix(_NEAR).split(":")
+    try:
+        who = _place(vertex) if text.startswith(_NEAR) else integer(vertex.strip().encode())
+        if not goal:
+            return who, None
+        if len(goal) == 1:
+            return who, integer(goal[0].strip().encode())
+        x, y = map(float, goal)
+        return who, (x, y)
+    except ValueError:
+        raise ValueError(f"{text[:40]!r} is none of {FORMS}") from None
+
+
+def _place(text: str) -> Place:
+    x, y, z = map(float, text.split(","))
+    if not np.isfinite((x, y, z)).all():
+        raise ValueError("no place")
+    return x, y, z

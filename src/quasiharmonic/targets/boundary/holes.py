@@ -1,0 +1,146 @@
+"""Which hole of a surface goes to which hole of an outline, and how it is turned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.problem import Domain
+from quasiharmonic.targets.outlines.contours import as_complex
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
+
+# Choices for a loop that are looked into closely.
+_PROMISING = 8
+
+
+def match_holes(
+    surface: Domain, outer: int, places: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
+) -> dict[int, int]:
+    """Give every loop without a contour one that lies near to it.
+
+    The surface, its holes filled, is laid into the outer contour by Tutte's embedding; the sum of
+    squared distances between its holes' middles and those of the contours is to be least.
+
+    Parameters
+    ----------
+    surface : Domain
+        The mesh; its own positions play no part.
+    outer : int
+        Which of its loops goes to the outer contour,
+    places : (l, 2) float64
+        and where.
+    contours : list of (k, 2) float64
+    to : mapping of int to int
+        Contours of loops that are given, ``outer`` among them.
+
+    Returns
+    -------
+    dict of int to int
+        Contours of the others.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    loops = [i for i in range(len(surface.loops)) if i not in to]
+    holes = [c for c in range(len(contours)) if c not in to.values()]
+    if len(loops) < 2:
+        return dict(zip(loops, holes, strict=True))
+    middles = _middles(surface, outer, places)
+    centres = np.array([_centroid(contours[c]) for c in holes])
+    rows, columns = linear_sum_assignment(np.abs(middles[loops, None] - centres) ** 2)
+    return {loops[i]: holes[c] for i, c in zip(rows, columns, strict=True)}
+
+
+def least_stretch(
+    surface: Domain, given: Mapping[int, FloatArray], choices: Mapping[int, list[FloatArray]]
+) -> dict[int, FloatArray]:
+    """Choose among places for some loops those for which Tutte's embedding has the least Dirichlet energy.
+
+    A hole that is turned against the surface around it winds the embedding up, and its energy shows it.
+    The energy is a quadratic form in the boundary's positions. Its part that is linear in those of one
+    loop shrinks where that loop does as the others, given or shrunk to points, would have it; it takes
+    one solve for all choices and leaves the few most promising, for which the whole form is found. Then
+    one loop after another takes its best choice until none changes.
+
+    Parameters
+    ----------
+    surface : Domain
+        The mesh; its own positions play no part.
+    given : mapping of int to (l, 2) float64
+        Places of some loops.
+    choices : mapping of int to list of (l, 2) float64
+        For every other loop the places it may take.
+
+    Returns
+    -------
+    dict of int to (l, 2) float64
+        The chosen ones.
+    """
+    loops = surface.loops
+    if all(len(places) == 1 for places in choices.values()):
+        return {i: places[0] for i, places in choices.items()}
+    pattern = Laplacian(surface.F, surface.n, np.concatenate(loops))
+    # Equilateral triangles, but for a factor.
+    laplacian = pattern.factor(np.full((3, len(surface.F)), -1.0))
+
+    def forces(places: Mapping[int, ComplexArray]) -> ComplexArray:
+        w = np.zeros(surface.n, dtype=np.complex128)
+        for i, points in places.items():
+            w[loops[i]] = points
+        return laplacian.flux(laplacian.extend(w))
+
+    def work(i: int, offsets: list[ComplexArray], force: ComplexArray) -> FloatArray:
+        return np.array([np.vdot(offset, force[loops[i]]).real for offset in offsets])
+
+    of_given = {i: as_complex(places) for i, places in given.items()}
+    offsets = {}
+    for i, places in choices.items():
+        turned = [as_complex(points) for points in places]
+        of_given[i] = np.full(len(loops[i]), np.mean([points.mean() for points in turned]))
+        offsets[i] = [points - of_given[i] for points in turned]
+    pull = forces(of_given)
+    kept, answers, own = {}, {}, {}
+    for i in choices:
+        linear = 2 * work(i, offsets[i], pull)
+        kept[i] = np.argsort(linear, kind="stable")[:_PROMISING]
+        offsets[i] = [offsets[i][k] for k in kept[i]]
+        answers[i] = [forces({i: offset}) for offset in offsets[i]]
+        # The quadratic part of each choice by itself.
+        alone = [work(i, [offset], answer)[0] for offset, answer in zip(offsets[i], answers[i], strict=True)]
+        own[i] = linear[kept[i]] + alone
+    taken = {i: int(np.argmin(own[i])) for i in choices}
+    # Descent over finitely many combinations ends; rounding must not keep it going.
+    for _ in range(100):
+        before = dict(taken)
+        for i in choices:
+            others = sum((answers[j][k] for j, k in taken.items() if j != i), np.zeros(surface.n, dtype=np.complex128))
+            taken[i] = int(np.argmin(own[i] + 2 * work(i, offsets[i], others)))
+        if taken == before:
+            break
+    return {i: choices[i][kept[i][k]] for i, k in taken.items()}
+
+
+def _middles(surface: Domain, outer: int, places: FloatArray) -> ComplexArray:
+    """Where the middles of the holes come to lie, each filled by a fan around it; a number for every loop."""
+    fans = [surface.F]
+    for i, loop in enumerate(surface.loops):
+        if i != outer:
+            # The loop has the surface to its left, and the fan to its right.
+            apex = np.full(len(loop), surface.n + i)
+            fans.append(np.stack([np.roll(loop, -1), loop, apex], axis=1))
+    F, n = np.concatenate(fans), surface.n + len(surface.loops)
+    # The outer loop's own number stands for no vertex, and is held like its loop.
+    fixed = np.append(surface.loops[outer], surface.n + outer)
+    laplacian = Laplacian(F, n, fixed).factor(np.full((3, len(F)), -1.0))
+    w = np.zeros(n, dtype=np.complex128)
+    w[surface.loops[outer]] = as_complex(places)
+    return laplacian.extend(w)[surface.n :]
+
+
+def _centroid(contour: FloatArray) -> complex:
+    """Centre of the area within a contour."""
+    w = as_complex(contour - contour[0])
+    following = np.roll(w, -1)
+    cross = (w.conj() * following).imag
+    return complex(*contour[0]) + complex((cross * (w + following)).sum() / (3 * cross.sum()))

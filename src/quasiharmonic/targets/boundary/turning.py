@@ -1,0 +1,288 @@
+"""How the boundary of a surface turns, measured along the surface, and where its corners are.
+
+At a boundary vertex the boundary turns by π less the angles of the triangles there: by π/2 at the corner of a square,
+however the square is bent in space, by nothing along a straight side, by less than nothing at a notch. A single vertex
+tells little where the boundary is ragged, as that of a scan is. So corners are sought together: as many as asked for,
+such that the runs between them are as straight as they can be. With Φ the direction in which the boundary runs, which
+leaps at each vertex by the turning there, that is the sum over runs of ∫ (Φ − mean of Φ)² ds, to be least: Φ is
+approached by a function with so many steps.
+
+Corners are taken away one after another, that one for which the sum grows least; its turning goes to its neighbours as
+a load on a beam goes to the ends. Then each moves to the best place between its neighbours until all are there.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array, whole_number
+
+# Radians by which a straight loop is taken to turn in all, evenly: corners on a straight side divide it evenly then.
+_BEND = 0.01
+# Times that corners move; the first few lower the sum by nearly all that can be had.
+_MOST_ROUNDS = 50
+# What a move must lower the sum by, as a share: more than rounding does.
+_LEAST = 1e-9
+# Edges of no length get this, as a share of the loop's.
+_SHORTEST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryLoop:
+    """A boundary loop of a surface and how it turns.
+
+    Attributes
+    ----------
+    vertices : (l,) int64
+        In order, the surface to the left.
+    lengths : (l,) float64
+        Of the edges from each vertex to the next, in the surface's unit.
+    turning : (l,) float64
+        Radians by which the loop turns at each vertex: π less the angles of the triangles there, positive at a corner
+        of the surface, negative at a notch. Of a disk they sum to 2π less the curvature within (Gauss and Bonnet).
+    """
+
+    vertices: IntArray
+    lengths: FloatArray
+    turning: FloatArray
+
+    def corners(self, count: int) -> tuple[IntArray, FloatArray]:
+        """Find vertices between which the loop is as straight as it can be; on a circle they are evenly spread.
+
+        Parameters
+        ----------
+        count : int
+            How many, at least one.
+
+        Returns
+        -------
+        positions : (count,) int64
+            In ``vertices``, ascending.
+        turning : (count,) float64
+            Radians from the mean direction of the run before each to that of the run after it.
+
+        Raises
+        ------
+        ValueError
+            When the loop has fewer vertices, or they coincide.
+        """
+        whole_number("count", count, least=1)
+        if count > len(self.vertices):
+            raise ValueError(
+                f"the loop has {len(self.vertices)} vertices, too few for {count} corners: refine the boundary"
+            )
+        longest = self.lengths.max()
+        if longest == 0:
+            raise ValueError(f"all vertices of the boundary loop at vertex {self.vertices[0]} coincide")
+        lengths = np.maximum(self.lengths / longest, _SHORTEST)
+        lengths /= lengths.sum()
+        bent = self.turning + _BEND * (lengths + np.roll(lengths, 1)) / 2
+        found = _settled(lengths, bent, _left_over(lengths, bent, count))
+        return found, mean_turns(lengths, self.turning, found)
+
+
+@takes_mesh
+def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
+    """Measure how the boundary of a surface turns at each of its vertices.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles, consistently oriented; in as many pieces as they like.
+
+    Returns
+    -------
+    list of BoundaryLoop
+        In the order of `quasiharmonic.geometry.mesh.topology.boundary_loops`; none where the surface is closed.
+
+    Raises
+    ------
+    ValueError
+        When arrays are malformed, or the boundary does not form loops.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import grid
+    >>> [loop] = boundary_turning(*grid(2, 2))
+    >>> np.degrees(loop.turning).round().astype(int).tolist()
+    [90, 0, 90, 0, 90, 0, 90, 0]
+    """
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    # In units of their size, a power of two, so that no square overflows or vanishes.
+    exponent = int(np.frexp(np.abs(V).max())[1])
+    V = np.ldexp(V, -exponent)
+    loops = boundary_loops(F, len(V))
+    on_boundary = np.zeros(len(V), dtype=bool)
+    for loop in loops:
+        on_boundary[loop] = True
+    angle = _angle_sums(V, F[on_boundary[F].any(axis=1)])
+    lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
+    return [
+        BoundaryLoop(loop, np.ldexp(length, exponent), np.pi - angle[loop])
+        for loop, length in zip(loops, lengths, strict=True)
+    ]
+
+
+@takes_mesh
+def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
+    """Find corners of a surface by angle: boundary vertices between which the boundary is as straight as it can be.
+
+    Angles are measured along the surface, so that a sheet has its corners however it is bent. Where there are fewer
+    than asked for, the others divide what is straight or round evenly; a ragged boundary's zigzag does not count.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles, consistently oriented.
+    count : int
+        How many.
+
+    Returns
+    -------
+    (count,) int64
+        Vertices of the boundary loop that encloses the largest area, in order, the surface to the left; as
+        `boundary_to` takes them for ``corners``. `boundary_turning` has the other loops' too.
+
+    Raises
+    ------
+    ValueError
+        As `boundary_turning`; when the surface is closed, or the loop has fewer vertices.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import grid
+    >>> boundary_corners(*grid(8, 5), 4).tolist()
+    [0, 8, 53, 45]
+    """
+    loops = boundary_turning(V, F)
+    if not loops:
+        raise ValueError("the surface is closed: it has no boundary with corners")
+    loop = loops[outermost([one.vertices for one in loops], in_space(vertex_array(V)))]
+    return loop.vertices[loop.corners(count)[0]]
+
+
+def mean_turns(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> FloatArray:
+    """Angles between the mean directions of the runs before and after each corner of a closed curve.
+
+    Parameters
+    ----------
+    lengths : (l,) float64
+        Of the edges from each vertex to the next; positive.
+    turning : (l,) float64
+        Radians.
+    corners : (k,) int64
+        Ascending.
+
+    Returns
+    -------
+    (k,) float64
+        Radians; their sum is that of ``turning``.
+    """
+    mean, whole = np.empty(len(corners)), np.empty(len(corners))
+    for j, run in enumerate(_runs(corners, len(lengths))):
+        # From the direction in which the run begins.
+        direction = np.cumsum(turning[run]) - turning[run[0]]
+        mean[j], whole[j] = (lengths[run] * direction).sum() / lengths[run].sum(), direction[-1]
+    return np.asarray(np.roll(whole - mean, 1) + turning[corners] + mean)
+
+
+def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
+    """Which of some loops encloses the largest area, given positions (n, 3) of about unit size."""
+    return int(np.argmax([np.linalg.norm(_vector_area(space[loop])) for loop in loops]))
+
+
+def in_space(V: FloatArray) -> FloatArray:
+    """Positions (n, 3) of about unit size around the origin, so that nothing made of them overflows."""
+    V = np.column_stack([V, np.zeros(len(V))]) if V.shape[1] == 2 else V
+    V = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
+    return np.asarray(V - V.mean(axis=0))
+
+
+def _vector_area(points: FloatArray) -> FloatArray:
+    """Area that a closed curve in space encloses, as a vector normal to it; its shadow's area along any direction."""
+    return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0) / 2)
+
+
+def _angle_sums(V: FloatArray, F: IntArray) -> FloatArray:
+    """Sum of the triangles' angles at every vertex, radians; a triangle without area has what its edges say."""
+    z1, z2 = rest_frames(V, F)
+    sides = z1 + 0j, z2 - z1, -z2
+    total = np.zeros(len(V))
+    for k, (ahead, behind) in enumerate(((sides[0], sides[2]), (sides[1], sides[0]), (sides[2], sides[1]))):
+        np.add.at(total, F[:, k], np.abs(np.angle(-ahead * behind.conj())))
+    return total
+
+
+def _runs(corners: IntArray, n: int) -> list[IntArray]:
+    """The edges of a closed curve of ``n`` from each corner to the next, all around a single one."""
+    after = np.roll(corners, -1)
+    return [(c + np.arange((d - c) % n or n)) % n for c, d in zip(corners.tolist(), after.tolist(), strict=True)]
+
+
+def _left_over(lengths: FloatArray, turning: FloatArray, count: int) -> IntArray:
+    """Corners that are left when all others are taken away, each time that one for which the sum grows least."""
+    n = len(lengths)
+    # Of the run that begins at a corner, its length; of each corner, what it turns by, and its neighbours.
+    run, turn = lengths.tolist(), turning.tolist()
+    before, after = [(i - 1) % n for i in range(n)], [(i + 1) % n for i in range(n)]
+
+    def cost(i: int) -> float:
+        a, b = run[before[i]], run[i]
+        return float(a * b / (a + b) * turn[i] ** 2)
+
+    latest = [cost(i) for i in range(n)]
+    queue = [(latest[i], i) for i in range(n)]
+    heapq.heapify(queue)
+    left = set(range(n))
+    while len(left) > count:
+        grown, i = heapq.heappop(queue)
+        if i not in left or grown != latest[i]:
+            continue
+        left.remove(i)
+        p, q = before[i], after[i]
+        share = run[i] / (run[p] + run[i])
+        turn[p] += share * turn[i]
+        turn[q] += (1 - share) * turn[i]
+        run[p] += run[i]
+        after[p], before[q] = q, p
+        for j in (p, q):
+            latest[j] = cost(j)
+            heapq.heappush(queue, (latest[j], j))
+    return np.array(sorted(left), dtype=np.int64)
+
+
+def _settled(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> IntArray:
+    """Move each corner to the best place between its neighbours until all are there."""
+    n, count = len(lengths), len(corners)
+    if count == 1:
+        return corners
+    corners = corners.copy()
+    for _ in range(_MOST_ROUNDS):
+        before = corners.copy()
+        for j in range(count):
+            first = int(corners[j - 1])
+            run = (first + np.arange((corners[(j + 1) % count] - first) % n or n)) % n
+            length, direction = lengths[run], np.cumsum(turning[run]) - turning[first]
+            direction -= (length * direction).sum() / length.sum()
+            # A step at each of these lowers the sum by as much.
+            so_far, along = np.cumsum(length * direction)[:-1], np.cumsum(length)[:-1]
+            lowered = so_far**2 * length.sum() / (along * (length.sum() - along))
+            here, best = (int(corners[j]) - first) % n - 1, int(np.argmax(lowered))
+            if lowered[best] > lowered[here] + _LEAST * (length * direction**2).sum():
+                corners[j] = run[best + 1]
+        if np.array_equal(corners, before):
+            break
+    return np.sort(corners)

@@ -1,0 +1,167 @@
+"""Which contours of an outline are holes, and whether they bound a region at all: decided exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.exact.loops import contacts, winding
+from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
+from quasiharmonic.targets.outlines.contours import checked, distinct, in_unit, signed_area
+from quasiharmonic.util.arrays import FloatArray
+
+# Meeting sides that are looked for; the first of them is told.
+_MOST_MEETINGS = 100
+
+
+class Arranged(NamedTuple):
+    """A contour among others.
+
+    Attributes
+    ----------
+    points : (k, 2) float64
+        As given, but for points that repeat the one before.
+    depth : int
+        How many other contours are around it; a hole has an odd number.
+    clockwise : bool
+        How it runs.
+    """
+
+    points: FloatArray
+    depth: int
+    clockwise: bool
+
+    @property
+    def reversed(self) -> bool:
+        """Whether it runs the other way than its depth asks for: counterclockwise outside, clockwise around holes."""
+        return self.clockwise == (self.depth % 2 == 0)
+
+    @property
+    def wound(self) -> FloatArray:
+        """Its points, running the right way; the first one stays the first."""
+        return np.roll(self.points[::-1], 1, axis=0) if self.reversed else self.points
+
+
+def nested(contours: Sequence[ArrayLike]) -> list[FloatArray]:
+    """Order contours by decreasing area and wind them: counterclockwise outside, clockwise around holes.
+
+    What lies within an odd number of others is a hole (the even-odd rule). The contours may be wound
+    as they like. A point that repeats the one before it is dropped.
+
+    Parameters
+    ----------
+    contours : sequence of (k, 2) float
+
+    Returns
+    -------
+    list of (k, 2) float64
+        Each from its own first point on.
+
+    Raises
+    ------
+    ValueError
+        When a contour is no array of at least three finite points, or encloses no area; when one
+        crosses, touches or goes back along itself or another one.
+    """
+    return [one.wound for one in arranged(contours)]
+
+
+def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
+    """An outline without its holes: the contours that no other one is around, each running as it did.
+
+    Parameters
+    ----------
+    contours : sequence of (k, 2) float
+        As `nested` takes them.
+
+    Returns
+    -------
+    list of (k, 2) float64
+
+    Raises
+    ------
+    ValueError
+        As `nested`.
+    """
+    return [one.points for one in arranged(contours) if one.depth == 0]
+
+
+def arranged(contours: Sequence[ArrayLike]) -> list[Arranged]:
+    """Contours by decreasing area, and how they lie in each other; raises as `nested`."""
+    found = [distinct(checked(c, f"contour {i}"), 0.0) for i, c in enumerate(contours)]
+    if not found:
+        return []
+    for i, contour in enumerate(found):
+        if collinear(contour):
+            raise ValueError(f"contour {i} of the outline encloses no area")
+    _check_simple(found)
+    areas = [abs(signed_area(c)) for c in in_unit(found)[0]]
+    anchors = np.array([c[np.lexsort((c[:, 1], c[:, 0]))[0]] for c in found])
+    around = np.zeros((len(found), len(found)), dtype=bool)
+    for i, contour in enumerate(found):
+        turns, _ = winding(anchors, contour, np.roll(contour, -1, axis=0))
+        around[i] = turns != 0
+    # Its own anchor is on a contour, not within it.
+    np.fill_diagonal(around, val=False)
+    depth = around.sum(axis=0)
+    order = sorted(range(len(found)), key=lambda i: -areas[i])
+    return [Arranged(found[i], int(depth[i]), _clockwise(found[i])) for i in order]
+
+
+def collinear(contour: FloatArray) -> bool:
+    """Whether all points of a contour lie on one line."""
+    one, other = contour[np.lexsort((contour[:, 1], contour[:, 0]))[[0, -1]]]
+    return not orientation(np.tile(one, (len(contour), 1)), np.tile(other, (len(contour), 1)), contour).any()
+
+
+def _clockwise(contour: FloatArray) -> bool:
+    # At its lexicographically first point a simple contour turns, and the way it runs.
+    first = int(np.lexsort((contour[:, 1], contour[:, 0]))[0])
+    before, here, after = contour[first - 1], contour[first], contour[(first + 1) % len(contour)]
+    return bool(orientation(before, here, after) < 0)
+
+
+def _check_simple(contours: list[FloatArray]) -> None:
+    """Raise when sides of contours have more in common than the point that joins them."""
+    length = np.array([len(c) for c in contours])
+    start = np.concatenate([[0], np.cumsum(length)])
+    owner = np.repeat(np.arange(len(contours)), length)
+    following = np.arange(1, start[-1] + 1)
+    following[start[1:] - 1] = start[:-1]
+    points = np.concatenate(contours)
+    met = contacts(points, np.stack([np.arange(start[-1]), following], axis=1), _MOST_MEETINGS)
+    if not len(met.pairs):
+        return
+    # What goes back along itself also touches what is beside it.
+    spike = (following[met.pairs] == met.pairs[:, ::-1]).any(axis=1)
+    first = int(np.lexsort((*met.pairs.T[::-1], ~spike))[0])
+    (i, j), relation = met.pairs[first].tolist(), met.relation[first]
+
+    def side(k: int) -> str:
+        (x0, y0), (x1, y1) = points[k].tolist(), points[following[k]].tolist()
+        a, b = k - start[owner[k]], following[k] - start[owner[k]]
+        return f"side from point {a} ({x0:.6g}, {y0:.6g}) to point {b} ({x1:.6g}, {y1:.6g})"
+
+    how = {SegmentRelation.CROSSING: "crosses", SegmentRelation.TOUCHING: "touches"}.get(relation, "runs along")
+    one, other = int(owner[i]), int(owner[j])
+    count = f"{len(met.pairs)} such pairs" if met.complete else f"more than {_MOST_MEETINGS} such pairs"
+    more = "" if len(met.pairs) == 1 else f" ({count} in all)" if met.complete else f" ({count})"
+    if spike[first]:
+        at = j if following[i] == j else i
+        x, y = points[at].tolist()
+        raise ValueError(
+            f"contour {one} of the outline goes back along itself at point {at - start[one]} ({x:.6g}, {y:.6g}){more}: "
+            "remove the spike"
+        )
+    if one == other:
+        raise ValueError(
+            f"contour {one} of the outline meets itself: its {side(i)} {how} its {side(j)}{more}: an outline must not "
+            "cross or touch itself"
+        )
+    raise ValueError(
+        f"contours {one} and {other} of the outline meet: the first one's {side(i)} {how} the other's "
+        f"{side(j)}{more}: holes must lie apart, within what is around them"
+    )

@@ -1,0 +1,81 @@
+"""Outlines from plain files of points."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.loops import listed
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textual import is_number, number, read_text
+from quasiharmonic.targets.outlines.contours import MOST_POINTS, distinct
+from quasiharmonic.targets.outlines.nesting import arranged, collinear
+from quasiharmonic.util.arrays import FloatArray
+
+
+def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
+    """Read contours from a text file of points.
+
+    Parameters
+    ----------
+    path : str or path-like
+        One point a line: x and y between blanks, tabs, commas or semicolons. A blank line ends a
+        contour, ``#`` begins a comment, and the first line may be a heading, as ``x,y``. Contours are
+        closed by themselves; repeating the first point at the end does no harm.
+
+    Returns
+    -------
+    list of (k, 2) float64
+        The contours by decreasing area, each as it stands in the file, from its first point on, be it
+        counterclockwise or clockwise; `nested` winds them.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for anything but two numbers on it, for a contour of fewer than three points or
+        without area, for an empty file and for one of more than a million points; as `nested` for
+        contours that meet themselves or each other.
+    """
+    loops: list[list[tuple[float, float]]] = [[]]
+    starts, count = [0], 0
+    for line, raw in enumerate(read_text(path).split(b"\n"), 1):
+        text, comment, _ = raw.partition(b"#")
+        words = text.replace(b",", b" ").replace(b";", b" ").split()
+        if not words:
+            # A line that is nothing but a comment stands within a contour.
+            if loops[-1] and not comment:
+                loops.append([])
+                starts.append(line)
+            continue
+        if line == 1 and not any(map(is_number, words)):
+            continue
+        if len(words) != 2:
+            raise MeshFileError(path, f"{len(words)} values in place of two, x and y,", line)
+        try:
+            x, y = map(number, words)
+        except ValueError as error:
+            raise MeshFileError(path, str(error), line) from None
+        if not loops[-1]:
+            starts[-1] = line
+        loops[-1].append((x, y))
+        count += 1
+        if count > MOST_POINTS:
+            raise MeshFileError(path, f"more than {MOST_POINTS:,} points", line, "thin them out")
+    contours, begins = [], []
+    for loop, start in zip(loops, starts, strict=True):
+        if not loop:
+            continue
+        contour = distinct(np.array(loop), 0.0)
+        if len(contour) < 3 or collinear(contour):
+            what = f"a contour of {len(contour)} different points that encloses no area begins"
+            raise MeshFileError(path, what, start, "blank lines separate contours, and nothing else")
+        contours.append(contour)
+        begins.append(start)
+    if not contours:
+        raise MeshFileError(path, "has no points")
+    try:
+        return [one.points for one in arranged(contours)]
+    except ValueError as error:
+        plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
+        raise MeshFileError(path, f"{error} (the {plural} {listed(begins)})") from None

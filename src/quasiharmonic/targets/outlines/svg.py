@@ -1,0 +1,330 @@
+"""Outlines from SVG drawings: the geometry of shapes and paths, with transforms and groups.
+
+Fill, stroke and opacity play no part: every closed shape is a contour, an open one is closed by a
+straight line, and what lies within an odd number of others is a hole. Nothing outside the file is
+ever fetched.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from quasiharmonic.geometry.curves.arcs import Arc
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.textual import read_text
+from quasiharmonic.targets.outlines.contours import MOST_POINTS, Pieces, as_complex, flatten
+from quasiharmonic.targets.outlines.nesting import arranged
+from quasiharmonic.targets.outlines.svgpath import commands, parse_path
+from quasiharmonic.util.arrays import FloatArray
+
+_SVG = "http://www.w3.org/2000/svg"
+MOST_BYTES = 64 << 20
+_DEEPEST = 200
+_MOST_TRANSFORMS = 1000
+_TOO_MANY = f"more than {MOST_POINTS:,} pieces in all"
+# Squares of coordinates, and their sums, must neither overflow nor vanish.
+_LARGEST = 1e150
+_CONTAINERS = "svg", "g", "a", "switch"
+# What shows in a drawing and has no outline of its own here.
+_FOREIGN = {
+    "text": "turn the text into paths (in Inkscape: Path > Object to Path)",
+    "use": "turn the clone into a path (in Inkscape: Edit > Clone > Unlink Clone)",
+}
+_LENGTH = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([a-z%]*)\s*", re.IGNORECASE)
+_UNITS = {"": 1.0, "px": 1.0, "in": 96.0, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 96 / 72, "pc": 16.0}
+_TRANSFORM = re.compile(r"[\s,]*([a-zA-Z]+)\s*\(([^()]*)\)[\s,]*")
+# What a style may say that an attribute of the same name would have to: it is not read there, and not passed over.
+_SHAPING = re.compile(
+    r"(?:^|[;{\s])\s*(transform(?:-origin)?|translate|rotate|scale|offset-path|d|[cr]?[xy]|r)\s*:", re.IGNORECASE
+)
+_HIDDEN = re.compile(r"(?:^|;)\s*display\s*:\s*none\s*(?:;|!|$)")
+
+
+def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[FloatArray]:
+    """Read the outline that an SVG file draws.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file: ``path``, ``rect``, ``circle``, ``ellipse``, ``polygon`` and ``polyline`` elements, in
+        groups and with transforms.
+    tolerance : float
+        How far the contours may stray from the drawing's curves, as a share of its larger side; at
+        least 1e-7.
+
+    Returns
+    -------
+    list of (k, 2) float64
+        The contours by decreasing area, in the units of the file with the y-axis turned upwards, so
+        that the outline looks as the drawing does. Each runs as it is drawn, from its first point on,
+        be it counterclockwise or clockwise; `nested` winds them.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, when the file is no SVG drawing, breaks its rules, declares entities, has text or
+        clones, which are not outlines, or style sheets that move or shape what is drawn, is larger than
+        64 MiB, nested more than 200 deep, or draws nothing that encloses an area; as `nested` for
+        contours that meet themselves or each other.
+    ValueError
+        When the tolerance is out of range.
+    """
+    if not 1e-7 <= tolerance < 1:
+        raise ValueError(f"the tolerance is a share of the drawing's size, from 1e-7 to below 1, not {tolerance}")
+    subpaths = svg_paths(path)
+    controls = [control for pieces in subpaths for control in pieces]
+    if not controls:
+        raise MeshFileError(path, "draws no path or shape")
+    every = np.concatenate(controls)
+    if not np.abs(every).max() < _LARGEST:
+        raise MeshFileError(path, "has coordinates that are too large")
+    size = float(np.ptp(every, axis=0).max())
+    contours = []
+    try:
+        for pieces in subpaths if size > 1 / _LARGEST else []:
+            contour = flatten(pieces, tolerance * size)
+            if len(contour) > 2 and _breadth(contour) > (tolerance * size) ** 2:
+                contours.append(contour)
+    except ValueError as error:
+        raise MeshFileError(path, str(error)) from None
+    if not contours:
+        raise MeshFileError(path, "draws nothing that encloses an area")
+    try:
+        return [one.points for one in arranged(contours)]
+    except ValueError as error:
+        raise MeshFileError(path, f"{error} (in units of the drawing, the y-axis upwards)") from None
+
+
+def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Pieces]:
+    """The paths that an SVG file draws, as `read_svg` reads it; with ``arcs`` as `parse_path` has them."""
+    if os.path.isfile(path) and os.path.getsize(path) > MOST_BYTES:
+        raise MeshFileError(path, f"is larger than {MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _Drawing(path, arcs).read(read_text(path))
+
+
+def _breadth(contour: FloatArray) -> float:
+    """Area of the triangles that a contour's sides span with its first point: 0 only if all lies on one line."""
+    w = as_complex(contour - contour[0])
+    return float(np.abs((w.conj() * np.roll(w, -1)).imag).sum()) / 2
+
+
+class _Drawing:
+    """Walks through the elements of a drawing and collects its paths, transformed."""
+
+    def __init__(self, path: str | os.PathLike[str], arcs: bool) -> None:
+        self.path, self.arcs = path, arcs
+        # Shapes as path data, with their elements, lines and transforms; read when all has been counted.
+        self.shapes: list[tuple[str, int, str, FloatArray]] = []
+        self.elements = self.commands = 0
+        # A transform of homogeneous points for every open container.
+        self.transforms = [np.diag([1.0, -1.0, 1.0])]
+        self.depth = 0
+        # The depth of the element whose contents are passed over.
+        self.skipped = 0
+        self.parser = expat.ParserCreate(namespace_separator=" ")
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.EntityDeclHandler = self._entity
+        self.parser.CharacterDataHandler = self._text
+        # The text of the style sheet that is being read.
+        self.sheet: list[str] | None = None
+
+    def read(self, data: bytes) -> list[Pieces]:
+        try:
+            self.parser.Parse(data, True)
+        except expat.ExpatError as error:
+            what = f"is not well-formed XML: {expat.ErrorString(error.code)}"
+            raise MeshFileError(self.path, what, error.lineno) from None
+        drawn: list[tuple[list[Any], FloatArray]] = []
+        count = 0
+        for tag, line, d, transform in self.shapes:
+            try:
+                for pieces in parse_path(d, arcs=self.arcs):
+                    count += len(pieces)
+                    if count > MOST_POINTS:
+                        raise ValueError(_TOO_MANY)
+                    drawn.append((pieces, transform))
+            except ValueError as error:
+                raise MeshFileError(self.path, f"<{tag}>: {error}", line) from None
+        return [_transformed(pieces, transform) for pieces, transform in drawn]
+
+    def _error(self, what: str, remedy: str = "") -> MeshFileError:
+        return MeshFileError(self.path, what, self.parser.CurrentLineNumber, remedy)
+
+    def _entity(self, name: str, *_: object) -> None:
+        raise self._error(f"declares the entity {name[:40]!a}, and entities are not read", "save it as plain SVG")
+
+    def _text(self, text: str) -> None:
+        if self.sheet is not None:
+            self.sheet.append(text)
+
+    def _check_style(self, tag: str, style: str) -> None:
+        if found := _SHAPING.search(style):
+            remedy = "write it as an attribute, or apply the transform to the paths in a drawing program"
+            raise self._error(f"<{tag}>: {found.group(1)!r} in a style is not read", remedy)
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self.depth += 1
+        self.elements += 1
+        if self.elements > MOST_POINTS:
+            raise self._error(f"more than {MOST_POINTS:,} elements")
+        if self.depth > _DEEPEST:
+            raise self._error(f"elements nested more than {_DEEPEST} deep")
+        namespace, _, tag = name.rpartition(" ")
+        if tag == "style" and namespace in ("", _SVG):
+            # Wherever it stands, be it among definitions that draw nothing.
+            self.sheet = []
+        if self.skipped:
+            return
+        if self.depth == 1 and (tag != "svg" or namespace not in ("", _SVG)):
+            raise self._error(f"is not an SVG drawing: the root element is {tag[:40]!a}")
+        hidden = attributes.get("display") == "none" or _HIDDEN.search(attributes.get("style", ""))
+        if namespace not in ("", _SVG) or hidden or not (tag in _CONTAINERS or tag in _SHAPES or tag in _FOREIGN):
+            self.skipped = self.depth
+            return
+        if tag in _FOREIGN:
+            raise self._error(f"a <{tag}> has no outline that could be read", _FOREIGN[tag])
+        self._check_style(tag, attributes.get("style", ""))
+        if "transform" in attributes and "transform-origin" in attributes:
+            raise self._error(f"<{tag}>: transform-origin is not read", "apply the transform in a drawing program")
+        try:
+            transform = self.transforms[-1]
+            if "transform" in attributes:
+                transform = transform @ _transform(attributes["transform"])
+            if tag == "svg" and self.depth > 1:
+                if "viewBox" in attributes:
+                    raise ValueError("an inner <svg> with a viewBox")
+                transform = transform @ _affine(1, 0, 0, 1, _length(attributes, "x"), _length(attributes, "y"))
+            if tag in _SHAPES:
+                self._note(tag, _SHAPES[tag](attributes), transform)
+                # Titles and animations within a shape draw nothing.
+                self.skipped = self.depth
+            else:
+                self.transforms.append(transform)
+        except ValueError as error:
+            raise self._error(f"<{tag}>: {error}") from None
+
+    def _end(self, name: str) -> None:
+        if self.sheet is not None:
+            sheet, self.sheet = "".join(self.sheet), None
+            self._check_style("style", sheet)
+        if self.skipped == self.depth:
+            self.skipped = 0
+        elif not self.skipped:
+            self.transforms.pop()
+        self.depth -= 1
+
+    def _note(self, tag: str, d: str, transform: FloatArray) -> None:
+        self.commands += commands(d, MOST_POINTS - self.commands)
+        if self.commands > MOST_POINTS:
+            raise ValueError(_TOO_MANY)
+        self.shapes.append((tag, self.parser.CurrentLineNumber, d, transform))
+
+
+def _transformed(pieces: list[Any], transform: FloatArray) -> list[Any]:
+    matrix, shift = transform[:2, :2], transform[:2, 2]
+    return [p.transformed(matrix, shift) if isinstance(p, Arc) else p @ matrix.T + shift for p in pieces]
+
+
+def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> FloatArray:
+    """The matrix that SVG writes matrix(a, b, c, d, e, f)."""
+    return np.array([(a, c, e), (b, d, f), (0, 0, 1)], dtype=np.float64)
+
+
+def _transform(text: str) -> FloatArray:
+    """Read the attribute ``transform``: a product of matrix, translate, scale, rotate, skewX and skewY."""
+    text = text.rstrip()
+    product, at, count = np.eye(3), 0, 0
+    while at < len(text):
+        found = _TRANSFORM.match(text, at)
+        count += 1
+        if count > _MOST_TRANSFORMS:
+            raise ValueError(f"more than {_MOST_TRANSFORMS:,} transforms of one element")
+        if found is None:
+            raise ValueError(f"the transform {text[at : at + 40]!a} is not understood")
+        name, at = found.group(1), found.end()
+        try:
+            values = [float(word) for word in found.group(2).replace(",", " ").split()]
+        except ValueError:
+            values = []
+        if name not in _TRANSFORMS or len(values) not in _TRANSFORMS[name][0] or not all(map(math.isfinite, values)):
+            raise ValueError(f"the transform {found.group().strip()[:40]!a} is not understood")
+        product = product @ _TRANSFORMS[name][1](*values)
+    return np.asarray(product)
+
+
+def _rotation(degrees: float, x: float = 0.0, y: float = 0.0) -> FloatArray:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return _affine(1, 0, 0, 1, x, y) @ _affine(c, s, -s, c, 0, 0) @ _affine(1, 0, 0, 1, -x, -y)
+
+
+# How many numbers each transform takes, and its matrix.
+_TRANSFORMS: dict[str, tuple[tuple[int, ...], Callable[..., FloatArray]]] = {
+    "matrix": ((6,), _affine),
+    "translate": ((1, 2), lambda x, y=0.0: _affine(1, 0, 0, 1, x, y)),
+    "scale": ((1, 2), lambda x, y=None: _affine(x, 0, 0, x if y is None else y, 0, 0)),
+    "rotate": ((1, 3), _rotation),
+    "skewX": ((1,), lambda degrees: _affine(1, 0, math.tan(math.radians(degrees)), 1, 0, 0)),
+    "skewY": ((1,), lambda degrees: _affine(1, math.tan(math.radians(degrees)), 0, 1, 0, 0)),
+}
+
+
+def _length(attributes: dict[str, str], name: str, default: float = 0.0) -> float:
+    """A length in user units; `ValueError` for a negative radius or side, and for units without a fixed size."""
+    if name not in attributes:
+        return default
+    found = _LENGTH.fullmatch(attributes[name])
+    if found is None or found.group(2).lower() not in _UNITS:
+        raise ValueError(f"{name}={attributes[name][:40]!a} is not a length in px or another fixed unit")
+    value = float(found.group(1)) * _UNITS[found.group(2).lower()]
+    if not math.isfinite(value) or (value < 0 and name not in ("x", "y", "cx", "cy")):
+        raise ValueError(f"{name}={attributes[name][:40]!a} is out of range")
+    return value
+
+
+def _rect(attributes: dict[str, str]) -> str:
+    x, y, w, h = (_length(attributes, name) for name in ("x", "y", "width", "height"))
+    if w == 0 or h == 0:
+        return ""
+    rx = _length(attributes, "rx", _length(attributes, "ry"))
+    ry = _length(attributes, "ry", rx)
+    rx, ry = min(rx, w / 2), min(ry, h / 2)
+    if rx == 0 or ry == 0:
+        return f"M{x!r},{y!r}h{w!r}v{h!r}h{-w!r}z"
+    corner = f"a{rx!r},{ry!r} 0 0 1 "
+    return (
+        f"M{x + rx!r},{y!r}H{x + w - rx!r}{corner}{rx!r},{ry!r}V{y + h - ry!r}{corner}{-rx!r},{ry!r}"
+        f"H{x + rx!r}{corner}{-rx!r},{-ry!r}V{y + ry!r}{corner}{rx!r},{-ry!r}z"
+    )
+
+
+def _ellipse(attributes: dict[str, str], *radii: str) -> str:
+    x, y = _length(attributes, "cx"), _length(attributes, "cy")
+    rx, ry = (_length(attributes, name) for name in radii)
+    if rx == 0 or ry == 0:
+        return ""
+    half = f"a{rx!r},{ry!r} 0 0 1 "
+    return f"M{x + rx!r},{y!r}{half}{-2 * rx!r},0{half}{2 * rx!r},0z"
+
+
+def _polygon(attributes: dict[str, str]) -> str:
+    return f"M{points}z" if (points := attributes.get("points", "").strip()) else ""
+
+
+# Every shape as path data.
+_SHAPES: dict[str, Callable[[dict[str, str]], str]] = {
+    "path": lambda attributes: attributes.get("d", ""),
+    "rect": _rect,
+    "circle": lambda attributes: _ellipse(attributes, "r", "r"),
+    "ellipse": lambda attributes: _ellipse(attributes, "rx", "ry"),
+    "polygon": _polygon,
+    "polyline": _polygon,
+}

@@ -1,0 +1,234 @@
+"""The path language of SVG (the attribute ``d``) as Bézier curves.
+
+W3C, Scalable Vector Graphics (SVG) 2, chapter 9 and appendix B.2, https://www.w3.org/TR/SVG2/paths.html.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+import re
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.geometry.curves.arcs import Arc
+from quasiharmonic.targets.outlines.contours import MOST_POINTS, Pieces
+
+_BLANKS = re.compile(r"[ \t\r\n\f]*")
+_COMMA = re.compile(r"[ \t\r\n\f]*,?[ \t\r\n\f]*")
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+# Numbers that each command takes at a time; F is a flag, a single 0 or 1.
+_ARGUMENTS = {"M": "xx", "L": "xx", "H": "x", "V": "x", "C": "x" * 6, "S": "x" * 4, "Q": "x" * 4, "T": "xx"}
+_ARGUMENTS |= {"A": "xxxFFxx", "Z": ""}
+# Cubic curves in half a turn of an arc: each strays from a circle by 6.6e-8 of the radius.
+_HALF_TURN = 8
+# A letter, other than that of an exponent, and what follows up to the next one.
+_COMMAND = re.compile(r"([A-DF-Za-df-z])([^A-DF-Za-df-z]*)")
+
+
+def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
+    """Read path data.
+
+    Parameters
+    ----------
+    d : str
+        Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as [1]_ has them.
+    arcs : bool
+        Leave arcs what they are, as `quasiharmonic.geometry.curves.Arc`.
+
+    Returns
+    -------
+    list of list of (degree + 1, 2) float64
+        For every subpath its pieces, each a Bézier curve by its control points. Arcs are cubic curves
+        within 1e-7 of their larger radius. Subpaths that draw nothing are left out.
+
+    Raises
+    ------
+    ValueError
+        With the place, where the data break the rules.
+    """
+    pen = _Pen(arcs)
+    scan = _Scanner(d)
+    command = ""
+    while (token := scan.command(command)) is not None:
+        if not command and token not in "Mm":
+            raise scan.error("path data begin with M")
+        command = token
+        values = [scan.number() if kind == "x" else scan.flag() for kind in _ARGUMENTS[command.upper()]]
+        if not all(map(math.isfinite, values)):
+            raise scan.error("a number is too large")
+        pen.draw(command, values)
+        if pen.count > MOST_POINTS:
+            raise scan.error(f"more than {MOST_POINTS:,} pieces")
+    return [subpath for subpath in pen.subpaths if subpath]
+
+
+def commands(d: str, most: int) -> int:
+    """How many commands there are in path data, counted in a small part of the time that reading them takes.
+
+    An arc counts for as many as half a turn is curves.
+
+    Parameters
+    ----------
+    d : str
+    most : int
+        More of them are not counted.
+
+    Returns
+    -------
+    int
+        Too few only where the flags of arcs are written together with what follows them.
+    """
+    total = 0
+    for letter, numbers in map(re.Match.groups, _COMMAND.finditer(d)):
+        width = len(_ARGUMENTS.get(letter.upper(), "")) or 1
+        count = sum(1 for _ in islice(_NUMBER.finditer(numbers), width * (most + 1 - total)))
+        total += max(1, count // width) * (_HALF_TURN if letter in "Aa" else 1)
+        if total > most:
+            break
+    return total
+
+
+class _Scanner:
+    """Takes numbers and commands off path data."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.at = 0
+        self._skip()
+
+    def command(self, previous: str) -> str | None:
+        """The next command; what follows its arguments without a letter repeats it."""
+        if self.at == len(self.text):
+            return None
+        character = self.text[self.at]
+        if character.isascii() and character.upper() in _ARGUMENTS:
+            self.at += 1
+            self._skip()
+            return character
+        if previous in ("", "z", "Z") or not _NUMBER.match(self.text, self.at):
+            raise self.error("a command is needed")
+        # Further pairs after a move are lines.
+        return {"M": "L", "m": "l"}.get(previous, previous)
+
+    def number(self) -> float:
+        found = _NUMBER.match(self.text, self.at)
+        if found is None:
+            raise self.error("a number is needed")
+        self.at = found.end()
+        self._skip(comma=True)
+        return float(found.group())
+
+    def flag(self) -> float:
+        if self.text[self.at : self.at + 1] not in ("0", "1"):
+            raise self.error("a flag, 0 or 1, is needed")
+        self.at += 1
+        value = float(self.text[self.at - 1])
+        self._skip(comma=True)
+        return value
+
+    def _skip(self, comma: bool = False) -> None:
+        found = (_COMMA if comma else _BLANKS).match(self.text, self.at)
+        self.at = self.at if found is None else found.end()
+
+    def error(self, what: str) -> ValueError:
+        near = self.text[max(0, self.at - 10) : self.at + 10]
+        return ValueError(f"path data: {what} at character {self.at + 1} (near {near!a})")
+
+
+class _Pen:
+    """Follows the commands of a path; points are complex numbers x + iy."""
+
+    def __init__(self, arcs: bool) -> None:
+        # Control points, and arcs if they are left what they are.
+        self.subpaths: list[list[Any]] = []
+        self.count = 0
+        self.arcs = arcs
+        self.here = self.start = 0j
+        # The last control point of the curve before, and of which kind it was.
+        self.control = 0j
+        self.before = ""
+
+    def draw(self, command: str, values: list[float]) -> None:
+        kind = command.upper()
+        origin = self.here if command.islower() else 0j
+        if kind == "Z":
+            self._line(self.start)
+            self.subpaths.append([])
+        elif kind == "M":
+            self.here = self.start = origin + complex(*values)
+            self.subpaths.append([])
+        elif kind == "H":
+            self._line(complex(origin.real + values[0], self.here.imag))
+        elif kind == "V":
+            self._line(complex(self.here.real, origin.imag + values[0]))
+        elif kind == "A":
+            radii, turn, large, sweep = values[:2], math.radians(values[2]), values[3] > 0, values[4] > 0
+            self._arc(radii[0], radii[1], turn, large, sweep, origin + complex(*values[5:]))
+        else:
+            points = [origin + complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
+            if kind in "ST":
+                points.insert(0, self._reflected("CS" if kind == "S" else "QT"))
+            if kind != "L":
+                self.control = points[-2]
+            self._piece(points)
+        self.before = kind
+
+    def _reflected(self, alike: str) -> complex:
+        """The control point that continues the curve before smoothly, if that was of the same degree."""
+        return 2 * self.here - self.control if self.before and self.before in alike else self.here
+
+    def _line(self, end: complex) -> None:
+        if end != self.here:
+            self._piece([end])
+
+    def _piece(self, points: list[complex]) -> None:
+        every = np.array([self.here, *points])
+        self.subpaths[-1].append(every.view(np.float64).reshape(-1, 2))
+        self.here = points[-1]
+        self.count += 1
+
+    def _arc(self, rx: float, ry: float, turn: float, large: bool, sweep: bool, end: complex) -> None:
+        """An elliptical arc, by its centre (appendix B.2.4 of [1]_)."""
+        rx, ry = abs(rx), abs(ry)
+        if end == self.here:
+            return
+        if rx == 0 or ry == 0:
+            self._line(end)
+            return
+        # In coordinates that make the ellipse the unit circle.
+        axis = cmath.exp(1j * turn)
+
+        def inward(z: complex) -> complex:
+            z /= axis
+            return complex(z.real / rx, z.imag / ry)
+
+        half = inward((self.here - end) / 2)
+        size = abs(half)
+        if size > 1:  # too small to reach: the radii grow until it does
+            rx, ry, half, size = rx * size, ry * size, half / size, 1.0
+        middle = half * 1j * math.sqrt(max(0.0, 1 - size**2)) / size
+        if large != sweep:
+            middle = -middle
+        first, last = cmath.phase(half - middle), cmath.phase(-half - middle)
+        angle = (last - first) % (2 * math.pi) if sweep else -((first - last) % (2 * math.pi))
+        # Unit circle to ellipse, moved so that the arc's ends are where they are to be.
+        centre = (self.here + end) / 2 + axis * complex(middle.real * rx, middle.imag * ry)
+
+        if self.arcs:
+            rows = np.array([centre, axis * rx, 1j * axis * ry]).view(np.float64).reshape(-1, 2)
+            self.subpaths[-1].append(Arc(rows[0], rows[1], rows[2], first, first + angle))
+            self.here = end
+            self.count += 1
+            return
+        steps = max(1, math.ceil(abs(angle) / (math.pi / _HALF_TURN)))
+        lever = 1j * 4 / 3 * math.tan(angle / steps / 4)
+        at = np.exp(1j * (first + angle * np.arange(steps + 1) / steps))
+        circle = np.stack([at[:-1], at[:-1] * (1 + lever), at[1:] * (1 - lever), at[1:]], axis=1)
+        pieces = centre + axis * (circle.real * rx + 1j * (circle.imag * ry))
+        pieces[0, 0], pieces[-1, -1] = self.here, end
+        self.subpaths[-1].extend(pieces.view(np.float64).reshape(steps, 4, 2))
+        self.here = end
+        self.count += steps

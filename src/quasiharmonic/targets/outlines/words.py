@@ -1,0 +1,201 @@
+"""Outlines of words: letters pushed into each other, as contours and as the curves that these are chords of."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from quasiharmonic.geometry.curves.curve import Curve
+from quasiharmonic.targets.outlines.contours import distinct, signed_area
+from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
+from quasiharmonic.targets.outlines.nesting import filled, nested
+from quasiharmonic.util.arrays import FloatArray
+
+# Points of a united outline nearer to each other than this, in units of the font size, are one.
+_ONE = 1e-12
+# Steps to where two curves meet; they have met when they are nearer than this share of their size.
+_STEPS, _MEET = 30, 1e-14
+# Curves are as long as their chords but for this share. Chords that cross at a small angle do so far from where their
+# curves do: so many tolerances at most.
+_ALIKE, _STRAYS = 0.01, 100.0
+_FLATLY = (
+    "letters of the word touch so flatly that their curves cannot be joined: choose others, or have the boundary slide "
+    "along the polygon that it is"
+)
+
+
+def word(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[FloatArray]:
+    """Outline of several letters, set so tightly that they make one piece.
+
+    A connected surface can fill no outline of several pieces, so the letters of a word have to overlap.
+
+    Parameters
+    ----------
+    text : str
+        Characters with something to see.
+    font : str or path, optional
+        As for `letter`.
+    overlap : float
+        How far each letter is pushed into the one before, in units of the font size.
+    tolerance : float
+        As for `letter`.
+
+    Returns
+    -------
+    list of (k, 2) float64
+        One outer contour, counterclockwise, and holes, clockwise. The first letter stands as `letter`
+        has it.
+
+    Raises
+    ------
+    ValueError
+        As for `letter`; when the overlap is not positive; when a part of a letter touches no other, as
+        the dot of an i.
+    FileNotFoundError
+        When there is no such font file.
+    ModuleNotFoundError
+        When Shapely, which unites the letters, is not installed.
+    """
+    contours = [distinct(contour, tolerance) for contour in _united(_set(text, font, overlap, tolerance)[0])]
+    loose = len(filled(contours)) - 1
+    if loose:
+        raise ValueError(
+            f"{loose} {'part' if loose == 1 else 'parts'} of {text!r} (a dot, an accent) "
+            f"{'touches' if loose == 1 else 'touch'} no other; choose other letters, capitals for instance"
+        )
+    return contours
+
+
+def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[Curve]:
+    """The curves that the contours of `word` are chords of: pieces of the letters' own, which meet where letters do.
+
+    Parameters
+    ----------
+    text, font, overlap, tolerance
+        As for `word`; letters stand where it puts them.
+
+    Returns
+    -------
+    list of Curve
+        Closed, one for each contour.
+
+    Raises
+    ------
+    ValueError
+        As for `word`; when letters touch so flatly that it is not to be told where one goes over into the other.
+    FileNotFoundError, ModuleNotFoundError
+        As for `word`.
+    """
+    letters, shifts = _set(text, font, overlap, tolerance)
+    drawn = [
+        Curve.contour([piece - (shift, 0.0) for piece in path])
+        for character, shift in zip(text, shifts, strict=True)
+        for path in glyph_paths(character, font)
+        if any(np.ptp(piece, axis=0).any() for piece in path)
+    ]
+    return [_traced(distinct(contour, _ONE), drawn, tolerance) for contour in _united(letters)]
+
+
+def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tuple[list[list[FloatArray]], list[float]]:
+    """The letters of a word in their places, and how far to the left each has been moved."""
+    if not 0 < overlap < np.inf:
+        raise ValueError(f"overlap must be positive and finite, not {overlap}")
+    if not text:
+        raise ValueError("a word needs a letter")
+    letters = [letter(character, font, tolerance=tolerance) for character in text]
+    shifts = [0.0]
+    for before, after in itertools.pairwise(letters):
+        shifts.append(_gap(before, after) + overlap)
+        for contour in after:
+            contour[:, 0] -= shifts[-1]
+    return letters, shifts
+
+
+def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
+    """The curve that a united contour is made of chords of, from those of the letters."""
+    middles = (contour + np.roll(contour, -1, axis=0)) / 2
+    by_point, by_middle = (np.stack([one.nearest(points)[1] for one in drawn]) for points in (contour, middles))
+    # A chord is on the curve to which its middle and both of its ends are near, and be it that others cross it there.
+    own = np.argmin(by_point + by_middle + np.roll(by_point, -1, axis=1), axis=0)
+    begins = np.flatnonzero(own != np.roll(own, 1))
+    if not begins.size:
+        return drawn[own[0]]
+    contour, own = np.roll(contour, -begins[0], axis=0), np.roll(own, -begins[0])
+    runs = np.split(np.arange(len(contour)), begins[1:] - begins[0])
+    curves = [drawn[own[run[0]]] for run in runs]
+    # Where each run begins, on the curve before and on its own.
+    meetings = [_meeting(curves[k - 1], curves[k], contour[run[0]]) for k, run in enumerate(runs)]
+    pieces = []
+    for k, (one, run) in enumerate(zip(curves, runs, strict=True)):
+        points = contour[np.append(run, run[-1] + 1) % len(contour)]
+        start, end = meetings[k][1], meetings[(k + 1) % len(runs)][0]
+        steps = np.diff(one.nearest(points)[0])
+        if float(np.sum(steps - one.length * np.round(steps / one.length))) > 0:
+            pieces += one.section(start, end)
+        else:
+            pieces += [np.asarray(piece)[::-1] for piece in reversed(one.section(end, start))]
+    found = Curve(pieces)
+    around = float(np.hypot(*(np.roll(contour, -1, axis=0) - contour).T).sum())
+    away = float(found.nearest(contour)[1].max())
+    if not found.closed or abs(found.length - around) > _ALIKE * around or away > _STRAYS * tolerance:
+        raise ValueError(_FLATLY)
+    return found
+
+
+def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
+    """Where two curves meet near a point, as lengths along each: Newton's method, from its nearest points."""
+    s, t = (curve.nearest(near[None])[0] for curve in (one, other))
+    ahead = np.ones(1, dtype=bool)
+    for _ in range(_STEPS):
+        apart = ((other.position(t) - one.position(s)) @ (1, 1j))[0]
+        if abs(apart) <= _MEET * one.size:
+            return float(s[0]), float(t[0])
+        along, across = one.frame(s, ahead)[0][0], other.frame(t, ahead)[0][0]
+        sine = (along.conjugate() * across).imag
+        if abs(sine) < 1e-6:
+            break
+        s = one.moved(s, np.array([(apart * across.conjugate()).imag / -sine]))
+        t = other.moved(t, np.array([(apart * along.conjugate()).imag / -sine]))
+    raise ValueError(_FLATLY)
+
+
+def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
+    """How far one letter can move to the left until it touches another, on some level of both."""
+    low, high = (
+        [extreme([extreme(c[:, 1]) for c in shape]) for shape in (before, after)] for extreme in (np.min, np.max)
+    )
+    levels = np.linspace(max(low), min(high), 513)[1:-1:2]
+    room = -_leftmost([c * (-1, 1) for c in before], levels)
+    return float((_leftmost(after, levels) - room).min())
+
+
+def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
+    """Where a shape begins on horizontal lines, infinite where it does not meet them."""
+    a = np.concatenate(shape)
+    b = np.concatenate([np.roll(contour, -1, axis=0) for contour in shape])
+    y = levels[:, None]
+    meets = (a[:, 1] > y) != (b[:, 1] > y)
+    rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])
+    return np.asarray(np.where(meets, a[:, 0] + (y - a[:, 1]) / rise * (b[:, 0] - a[:, 0]), np.inf).min(axis=1))
+
+
+def _united(shapes: list[list[FloatArray]]) -> list[FloatArray]:
+    """The outline of all that some shapes cover; each is an outline of its own, wound as `nested` does."""
+    try:
+        import shapely
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "joining the letters of a word needs Shapely: pip install 'quasiharmonic[shapes]'"
+        ) from error
+
+    covered = [
+        shapely.difference(
+            shapely.union_all([shapely.Polygon(c) for c in contours if signed_area(c) > 0]),
+            shapely.union_all([shapely.Polygon(c) for c in contours if signed_area(c) < 0]),
+        )
+        for contours in shapes
+    ]
+    rings = shapely.get_rings(shapely.get_parts(shapely.union_all(covered)))
+    # The last point of a ring is its first again.
+    return nested([shapely.get_coordinates(ring)[:-1] for ring in rings])

@@ -1,0 +1,23 @@
+"""Data sets: thousands of problems on one machine or on a cluster, with a record for each.
+
+The package builds on `solver` and `apps`. Start reading in `driver`, then `worker` for what one process does.
+"""
+
+from quasiharmonic.ui.batch.driver import Progress, run
+from quasiharmonic.ui.batch.problems import ProblemFiles, find_problems
+from quasiharmonic.ui.batch.records import COLUMNS, OUTCOMES, read_table, write_table
+from quasiharmonic.ui.batch.settings import Settings
+from quasiharmonic.ui.batch.supervisor import WorkerError
+
+__all__ = [
+    "COLUMNS",
+    "OUTCOMES",
+    "ProblemFiles",
+    "Progress",
+    "Settings",
+    "WorkerError",
+    "find_problems",
+    "read_table",
+    "run",
+    "write_table",
+]

@@ -1,0 +1,209 @@
+"""Small problems of a data set solved side by side, in a process that solves problems.
+
+A call of NumPy takes longer than what it does to some hundred triangles, so several problems are read, the first stage
+of their searches is run as one (`quasiharmonic.solver.search.batched`), and their maps are judged as one. What that
+solves gets its map and its record as it would alone. Everything else is left as if it had never been here, to be solved
+by itself: what cannot be read, what has several islands, what is not small, and what takes more than the first stage.
+So whatever goes wrong here costs time and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quasiharmonic import io
+from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.linsolve import available
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.batched import Given, posed_each
+from quasiharmonic.problem.result import MapResult
+from quasiharmonic.solver.search.batched import SMALL, Patterns, beginning_alike, first_stage
+from quasiharmonic.ui.batch import metadata as account
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch import setup as posing
+from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+Job = dict[str, Any]
+
+
+class Ready(NamedTuple):
+    """A problem that has been read.
+
+    Attributes
+    ----------
+    mesh : MeshData
+    fixed : (k,) int64 or None
+        The vertices to hold, if the files say which.
+    record : dict
+        What is known of it.
+    """
+
+    mesh: io.MeshData
+    fixed: IntArray | None
+    record: Record
+
+
+class _Posed(NamedTuple):
+    """The one problem that a mesh is, and the mesh once it has a map."""
+
+    problem: Problem
+    mapped: Callable[[FloatArray], io.MeshData]
+
+
+class _Read(NamedTuple):
+    """A map that has been written, as a reader gets it."""
+
+    V: FloatArray
+    F: IntArray
+    uv: FloatArray
+
+
+def solver_for(problem: Problem, asked: str) -> str:
+    """The linear solver for a problem: QDLDL for a small one, where the choice is free.
+
+    Alone and with others a problem has the same map by it, but for rounding where its order of elimination depends on
+    what lies beside; and no other is quicker there.
+    """
+    return "qdldl" if asked == "auto" and len(problem.F) <= SMALL and "qdldl" in available() else asked
+
+
+def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> None:
+    """Solve what can be solved of some problems together, and write maps and records of that.
+
+    Parameters
+    ----------
+    jobs : sequence of dict
+        As `quasiharmonic.ui.batch.worker.solve_files` takes them, of the same settings, which `Settings.together`
+        allows.
+    tell : callable
+        Called with ``{"done": k, "outcome": …, "seconds": …}`` whenever the k-th has its record.
+
+    Raises
+    ------
+    OutputError
+        When a map or a record cannot be written, which is no fault of the problems.
+    """
+    account.forget_peak()
+    settings, folders = jobs[0]["settings"], [Path(job["folder"]) for job in jobs]
+    read: dict[int, Ready] = {}
+    for k, job in enumerate(jobs):
+        # What is the matter with it is found again when it is given by itself.
+        with suppress(Exception):
+            one = ready(job)
+            if len(one.mesh.F) <= SMALL:
+                read[k] = one
+    posed = _posed(read, settings)
+    written: dict[int, _Read] = {}
+    for k, result in _solved({k: one.problem for k, one in posed.items()}, settings):
+        record = read[k].record
+        record |= account.sizes([posed[k].problem]) | account.told([result], result.status)
+        record |= {"flips_before": result.history[0].flipped, "seconds_map": result.seconds}
+        records.clear(folders[k])
+        with account.timed(record, "write"):
+            path = records.map_path(folders[k])
+            io.write_obj(path, posed[k].mapped(result.uv), durable=False)
+            found = _mapped(io.read_mesh(path))
+        if np.array_equal(found.F, posed[k].problem.F) and len(found.V) == posed[k].problem.n:
+            written[k] = found
+    with _shared([read[k].record for k in written], "write"):
+        loops = [posed[k].problem.domain.loops for k in written]
+        judged = certify_each([one.F for one in written.values()], [one.uv for one in written.values()], loops)
+    for (k, found), certificate in zip(written.items(), judged, strict=True):
+        if not certificate.injective:
+            continue
+        record = read[k].record
+        record |= {
+            "outcome": "injective",
+            "certified": True,
+            "bijective": bool(certificate.bijective),
+            "flips_after": 0,
+        }
+        record["map_bytes"] = records.map_path(folders[k]).stat().st_size
+        with account.timed(record, "measure"):
+            record |= account.measured(*found)
+        record["peak_memory"] = account.peak()
+        record["seconds"] = sum(value for name, value in record.items() if name.startswith("seconds_"))
+        records.write_record(folders[k], record)
+        tell({"done": k, "outcome": "injective", "seconds": record["seconds"]})
+
+
+def ready(job: Job) -> Ready:
+    """Read a problem; raises as what reads it does."""
+    record: Record = {**job["record"], "versions": account.versions()}
+    with account.timed(record, "read"):
+        mesh = io.read_mesh(job["mesh"])
+        fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
+    return Ready(mesh, fixed, record)
+
+
+def _posed(read: dict[int, Ready], settings: dict[str, Any]) -> dict[int, _Posed]:
+    """Those that are one problem on all vertices of their mesh."""
+    plain = [k for k, one in read.items() if settings["to"] is None and _plain(one, settings)]
+    with _shared([read[k].record for k in plain], "setup"):
+        problems = posed_each([_arrays(read[k]) for k in plain]) if plain else None
+    posed = {k: _Posed(one, read[k].mesh.with_map) for k, one in zip(plain, problems or [], strict=False)}
+    for k, one in read.items():
+        if k not in posed and (settings["to"] is not None or one.mesh.FT is not None):
+            with suppress(Exception), account.timed(one.record, "setup"):
+                surface = posing.surface_of(one.mesh, settings)
+                islands = surface.islands
+                if len(islands) == 1 and np.array_equal(islands[0].vertices, np.arange(len(one.mesh.V))):
+                    problem = posing.posed(surface, one.fixed, settings)[0].fitted.problem
+                    posed[k] = _Posed(problem, partial(_with_map, one.mesh, surface))
+    return posed
+
+
+def _plain(one: Ready, settings: dict[str, Any]) -> bool:
+    """Whether vertices have their places by their own numbers, and files say which are held."""
+    mesh = one.mesh
+    if settings["reference"] is not None or one.fixed is None or mesh.FT is None or mesh.vt is None:
+        return False
+    return len(mesh.vt) == len(mesh.V) and np.array_equal(mesh.FT, mesh.F)
+
+
+def _arrays(one: Ready) -> Given:
+    """What `Problem` is made of."""
+    assert one.fixed is not None
+    assert one.mesh.vt is not None
+    held = np.unique(one.fixed)
+    return one.mesh.V, one.mesh.F, held, one.mesh.vt[held]
+
+
+def _with_map(mesh: io.MeshData, surface: SeamedMesh, uv: FloatArray) -> io.MeshData:
+    return mesh.with_places(surface.with_places([uv]))
+
+
+def _solved(problems: dict[int, Problem], settings: dict[str, Any]) -> Iterator[tuple[int, MapResult]]:
+    """Those that the first stage of their search solves."""
+    for descent, some in beginning_alike(problems, settings["strategy"]).items():
+        patterns = Patterns(solver_for(problems[some[0]], settings["linear_solver"]))
+        found = first_stage([problems[k] for k in some], descent, patterns, settings["max_iterations"], lambda: None)
+        for k, result in zip(some, found, strict=True):
+            if isinstance(result, MapResult) and result.injective:
+                yield k, result
+
+
+def _mapped(mesh: io.MeshData) -> _Read:
+    """The mesh and the map of a file."""
+    if mesh.vt is not None and len(mesh.vt) == len(mesh.V) and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
+        return _Read(mesh.V, mesh.F, mesh.vt)
+    return _Read(*io.cut_at_seams(mesh))
+
+
+@contextmanager
+def _shared(some: Sequence[Record], phase: str) -> Iterator[None]:
+    """Add an equal share of the time that something takes to that of a phase of each."""
+    whole: Record = {}
+    with account.timed(whole, phase):
+        yield
+    for record in some:
+        name, seconds = f"seconds_{phase}", whole[f"seconds_{phase}"]
+        record[name] = record.get(name, 0.0) + seconds / len(some)

@@ -1,0 +1,342 @@
+"""Run all problems of a data set: on this machine's cores, or through a Dask cluster."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, get_args
+
+from quasiharmonic import __version__
+from quasiharmonic.io.atomic import new_folder, write_whole
+from quasiharmonic.io.errors import OutputError
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.lock import FILE as LOCK
+from quasiharmonic.ui.batch.lock import alone
+from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, find_problems, small_together
+from quasiharmonic.ui.batch.settings import Orders, Settings
+from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor, resident
+from quasiharmonic.util.arrays import check_callback
+
+# Seconds between two calls of a callback while nothing is finished.
+_TICK = 0.2
+
+
+@dataclass
+class Progress:
+    """How far a run is.
+
+    Attributes
+    ----------
+    total : int
+        Problems of the data set.
+    outcomes : dict of str to int
+        How many of those done ended how; see `quasiharmonic.ui.batch.records.OUTCOMES`.
+    resumed : int
+        Of those, how many an earlier run had done.
+    seconds : float
+        Since the start of the run.
+    """
+
+    total: int
+    outcomes: dict[str, int] = field(default_factory=dict)
+    resumed: int = 0
+    seconds: float = 0.0
+
+    @property
+    def done(self) -> int:
+        """Problems with a record."""
+        return sum(self.outcomes.values())
+
+    @property
+    def solved(self) -> int:
+        """Problems with a map certified to be what was asked for."""
+        return sum(self.outcomes.get(outcome, 0) for outcome in records.SOLVED)
+
+    @property
+    def failed(self) -> int:
+        """Problems done without one."""
+        return self.done - self.solved
+
+    @property
+    def rate(self) -> float:
+        """Problems a second, those that an earlier run had done excepted."""
+        return (self.done - self.resumed) / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Time until the end at the present rate; None while nobody can tell."""
+        return (self.total - self.done) / self.rate if self.rate > 0 else None
+
+
+def run(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    settings: Settings | None = None,
+    *,
+    jobs: int | None = None,
+    threads: int = 1,
+    time_limit: float | None = 600.0,
+    memory_limit: int | None = None,
+    retry: bool = False,
+    table: str = "csv",
+    scheduler: Any = None,
+    callback: Callable[[Progress], object] | None = None,
+) -> Progress:
+    """Solve every problem of a data set, each in a process that may fail without harm to the others.
+
+    Every problem gets a folder of its own in ``output/results`` with its map, ``map.obj``, and its record,
+    ``record.json``, both written whole as soon as it is finished. The same call again goes on where the last one
+    ended, however it ended: a problem whose record is of the same input and settings is not solved anew. In the
+    end all records are put together in ``output/records.csv`` or ``.parquet``.
+
+    Parameters
+    ----------
+    source : path
+        What `quasiharmonic.batch.find_problems` takes: a folder with problems at any depth, or a list.
+    output : path
+        The run's folder; made if need be.
+    settings : Settings, optional
+        How problems are solved.
+    jobs : int, optional
+        Problems solved at a time, each in a process of its own; one a core by default. Not with a scheduler.
+    threads : int
+        Threads of the linear solver in each.
+    time_limit : float or None
+        Seconds for one problem, all included. Whoever takes longer is ended and recorded.
+    memory_limit : int or None
+        Bytes of resident memory that a process that solves a problem may have. Whichever has more is ended and
+        recorded.
+    retry : bool
+        Try again what an earlier run has recorded as an error, a crash, or beyond a limit. (Beyond a limit lower than
+        the present one it is tried again anyway.)
+    table : {"csv", "parquet"}
+        Form of the table of records.
+    scheduler : str, distributed.Client or cluster, optional
+        Address of a Dask scheduler, or what stands for one: its workers solve the problems, as many at a time as they
+        have threads. They must see ``source`` and ``output`` under the same paths.
+    callback : callable, optional
+        Called with the `Progress` whenever a problem is done, and a few times a second besides.
+
+    Returns
+    -------
+    Progress
+        How the problems ended.
+
+    Raises
+    ------
+    ValueError
+        When there are no problems, some lie in ``output``, or an argument makes no sense.
+    OutputError
+        When results cannot be written, as on a full disk, or while another run is writing to ``output``. What is
+        finished stays.
+    ImportError
+        When a package that was asked for is not installed.
+    WorkerError
+        When processes cannot be started.
+    """
+    check_callback(callback)
+    settings = _checked(settings or Settings())
+    _check(jobs, threads, time_limit, memory_limit, scheduler)
+    folder = Path(os.path.abspath(output))
+    table_path = folder / f"records.{table}"
+    records.check_table(table_path)
+    began = time.perf_counter()
+    # Counted first and found once more while they are solved, so that no list of them is kept.
+    progress = Progress(_count(source, settings, folder))
+    _check_folder(folder)
+    with new_folder(folder, leftovers=frozenset({LOCK})), alone(folder):
+        _prepare(folder, source, settings)
+        orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
+        todo = find_problems(source, plain=settings.plain)
+        if scheduler is None:
+            finished = _local(todo, orders, min(jobs or _cores(), progress.total))
+        else:
+            from quasiharmonic.ui.batch.cluster import on_cluster
+
+            finished = on_cluster(todo, orders, scheduler)
+        with closing(finished):
+            for item in finished:
+                progress.seconds = time.perf_counter() - began
+                if item is not None:
+                    progress.outcomes[item.outcome] = progress.outcomes.get(item.outcome, 0) + 1
+                    progress.resumed += item.resumed
+                if callback is not None:
+                    callback(progress)
+        records.write_table(table_path, _records(source, orders))
+    return progress
+
+
+def _checked(settings: Settings) -> Settings:
+    """Settings that no problem will stumble over, with files named such that they are found from anywhere."""
+    from quasiharmonic.energies.polishing import ENERGIES
+    from quasiharmonic.geometry.mesh.reference import Reference
+    from quasiharmonic.linsolve import available
+    from quasiharmonic.solver.search.strategy import STRATEGIES
+
+    for name, words in (
+        ("strategy", list(STRATEGIES)),
+        ("energy", [None, *ENERGIES, "distances"]),
+        ("polish", [None, *ENERGIES]),
+        ("reference", [None, *get_args(Reference)]),
+        ("linear_solver", ["auto", *available()]),
+    ):
+        given = getattr(settings, name)
+        if given not in words:
+            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
+    _check_flatten(settings)
+    if settings.slide and settings.polish is None:
+        raise ValueError("the boundary slides while distortion is lowered: name an energy for that too, by polish")
+    if settings.max_iterations < 1:
+        raise ValueError(f"max_iterations must be at least 1, not {settings.max_iterations}")
+    if settings.to is None:
+        for name in ("cut", "corners"):
+            if getattr(settings, name) and not (name == "cut" and settings.flatten):
+                raise ValueError(f"{name} is of plain meshes and the outline that they go to: name one by to")
+        return settings
+    from quasiharmonic.targets import outline
+    from quasiharmonic.targets.boundary.corner_spec import read_corners
+
+    outline(settings.to)
+    if settings.corners is not None:
+        read_corners(settings.corners)
+    return replace(settings, to=_anywhere(settings.to), corners=_anywhere(settings.corners))
+
+
+def _anywhere(name: str | None) -> str | None:
+    """What names a file from anywhere, if it names one."""
+    return os.path.abspath(name) if name is not None and os.path.isfile(name) else name
+
+
+def _check_flatten(settings: Settings) -> None:
+    """Refuse settings of maps onto given boundaries where boundaries are free, and the other way round."""
+    if not settings.flatten:
+        if settings.energy is not None:
+            raise ValueError(
+                "energy is for flatten, and flatten was not asked for: ask for it, or give polish its own energy"
+            )
+        return
+    plain = Settings()
+    for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
+        if getattr(settings, name) != getattr(plain, name):
+            raise ValueError(
+                f"{name} is of maps onto a given boundary, and flatten sets it free: leave one of them out"
+            )
+
+
+def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limit: int | None, scheduler: Any) -> None:
+    if scheduler is not None and jobs is not None:
+        raise ValueError("jobs is for this machine's processes; a Dask cluster has the workers that it has")
+    for name, value in (("jobs", jobs), ("threads", threads)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, not {value}")
+    for name, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
+        if limit is not None and not limit > 0:
+            raise ValueError(f"{name} must be positive, not {limit}")
+    if memory_limit is not None and scheduler is None and resident(os.getpid()) is None:
+        raise ValueError("a limit of memory needs psutil on this system: pip install 'quasiharmonic[batch]'")
+
+
+def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> int:
+    """How many problems there are, none of which would be passed over as the output of a run."""
+    count, inside = 0, folder.is_relative_to(os.path.abspath(source))
+    for files in find_problems(source, plain=settings.plain):
+        if inside and files.mesh.is_relative_to(folder):
+            raise ValueError(f"{folder} holds a problem, {files.mesh}: name another folder for the results")
+        count += 1
+    if not count:
+        raise ValueError(
+            f"there are no problems in {source}: a problem is a folder with input.obj and handles.txt"
+            + ("" if settings.plain else "; to take plain meshes, say what to map them to, or to flatten them")
+        )
+    return count
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse what stands where the run's folder is to be, if it is no such folder."""
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise OutputError(f"cannot write to {folder}: it is no folder")
+    try:
+        tables = [name for name in records.TABLES if (folder / name).exists()]
+    except OSError as error:
+        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+    if tables and not (folder / MARKER).exists():
+        raise OutputError(f"{folder} has a {tables[0]} that is of no run: name another folder for the results")
+
+
+def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -> None:
+    """Say in the run's folder what it is."""
+    try:
+        for name in records.TABLES:
+            # Not that of the last run until there is that of this one.
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+    about = {"source": os.path.abspath(source), "settings": settings.to_dict(), "version": __version__}
+    write_whole(folder / MARKER, json.dumps(about, indent=2).encode() + b"\n")
+
+
+def _records(source: str | os.PathLike[str], orders: Orders) -> Iterator[records.Record]:
+    for files in find_problems(source, plain=orders.settings.plain):
+        record = records.read_record(orders.folder(files.name))
+        if record is not None:
+            yield record
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator[Finished | None]:
+    """Solve problems in processes of this machine; yields None now and then while nothing is finished."""
+    supervisors = [Supervisor(orders) for _ in range(jobs)]
+    groups = small_together(todo) if orders.settings.together else ([files] for files in todo)
+    lock, finished = threading.Lock(), SimpleQueue[Finished | BaseException | None]()
+
+    def attend(supervisor: Supervisor) -> None:
+        try:
+            while True:
+                with lock:
+                    group = next(groups, None)
+                if group is None:
+                    break
+                for item in supervisor.attend_all(group):
+                    finished.put(item)
+        except ClosedError:
+            pass
+        except BaseException as error:
+            finished.put(error)
+        finished.put(None)
+
+    threads = [threading.Thread(target=attend, args=(supervisor,), daemon=True) for supervisor in supervisors]
+    for thread in threads:
+        thread.start()
+    working = jobs
+    try:
+        while working:
+            try:
+                item = finished.get(timeout=_TICK)
+            except Empty:
+                yield None
+                continue
+            if isinstance(item, BaseException):
+                raise item
+            if item is None:
+                working -= 1
+            else:
+                yield item
+    finally:
+        for supervisor in supervisors:
+            supervisor.close()
+        for thread in threads:
+            thread.join()

@@ -1,0 +1,89 @@
+"""What a record says of a problem, beside what became of it: how it was found, how long that took, what with."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import version
+from math import isfinite
+from pathlib import Path
+
+from quasiharmonic import __version__
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+
+def sizes(problems: list[Problem]) -> Record:
+    """How large the problems of a mesh's islands are, together."""
+    return {
+        "vertices": sum(problem.n for problem in problems),
+        "triangles": sum(len(problem.F) for problem in problems),
+        "fixed": sum(len(problem.fixed) for problem in problems),
+        "pins": sum(len(problem.domain.pins) for problem in problems),
+        "loops": sum(len(problem.domain.loops) for problem in problems),
+        "islands": len(problems),
+    }
+
+
+def told(results: Sequence[MapResult], status: Status) -> Record:
+    """How the maps of a mesh's islands were found, and how that ended."""
+    stages = [stage for result in results for stage in result.stages]
+    return {
+        "status": status.name.lower(),
+        "iterations": sum(stage.iterations for stage in stages),
+        "stages": json.dumps([stage.to_dict() for stage in stages]),
+        "linear_solver": results[0].linear_solver,
+    }
+
+
+def measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
+    """How a map distorts a surface; nothing where no triangle has an area at rest."""
+    found = distortion(V, F, uv)
+    if len(found.flat) == len(F):
+        return {}
+    values = {"mips": found.summary("mips").mean, "isometric": found.summary("isometric").maximum}
+    return {name: value if isfinite(value) else None for name, value in values.items()}
+
+
+@contextmanager
+def timed(record: Record, phase: str) -> Iterator[None]:
+    """Add the time that something takes to that of a phase."""
+    began = time.perf_counter()
+    try:
+        yield
+    finally:
+        name = f"seconds_{phase}"
+        record[name] = record.get(name, 0.0) + time.perf_counter() - began
+
+
+@cache
+def versions() -> str:
+    """Of Python and packages, as JSON."""
+    packages = {name: version(name) for name in ("numpy", "scipy")}
+    return json.dumps({"quasiharmonic": __version__, "python": platform.python_version(), **packages})
+
+
+def forget_peak() -> None:
+    """Let the highest memory use be counted anew, where the system can do that (Linux)."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
+
+
+def peak() -> int | None:
+    """Highest resident memory, bytes: since `forget_peak` on Linux, of the process elsewhere; None if nobody knows."""
+    with suppress(OSError, IndexError):
+        return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
+    try:
+        import resource
+    except ImportError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most

@@ -1,0 +1,116 @@
+"""What is asked of a problem's files: a surface with its seams, and where the boundary of each island goes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic import io
+from quasiharmonic.apps.atlas.mapped import faced, naming
+from quasiharmonic.apps.atlas.seaming import cut_apart
+from quasiharmonic.apps.repair.fitting import Fitted, held_in_place, laid_along
+from quasiharmonic.energies.newton.sliding import moved_onto
+from quasiharmonic.geometry.curves import Curve, Rails
+from quasiharmonic.geometry.mesh.seams import Island, SeamedMesh
+from quasiharmonic.targets.boundary.corner_spec import AskedCorners, read_corners
+
+
+class Posed(NamedTuple):
+    """The problem of one island.
+
+    Attributes
+    ----------
+    fitted : Fitted
+    slide : bool or Rails
+        Whether its boundary slides, and along what.
+    """
+
+    fitted: Fitted
+    slide: bool | Rails
+
+
+def surface_of(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
+    """The surface of a file with the seams that its map has, and with those that are cut if that is asked for.
+
+    Parameters
+    ----------
+    mesh : MeshData
+    settings : dict
+        As `Settings.to_dict` has them.
+
+    Raises
+    ------
+    ValueError, ModuleNotFoundError
+        As `quasiharmonic.io.seams` and `cut_apart`.
+    """
+    surface = io.seamed(mesh)
+    if settings["cut"]:
+        flat = settings["flatten"]
+        return cut_apart(surface, polygons=mesh.polygons, disks_too=flat, reach=flat or settings["refine"])
+    return surface
+
+
+def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings: dict[str, Any]) -> list[Posed]:
+    """The problem of every island, in order.
+
+    Parameters
+    ----------
+    surface : SeamedMesh
+    fixed : (k,) int or None
+        The mesh's vertices that are held where the file's map has them; boundaries, if None.
+    settings : dict
+        As `Settings.to_dict` has them.
+
+    Raises
+    ------
+    ValueError
+        When something about the input makes a problem impossible to pose; it says what.
+    """
+    to, reference = settings["to"], settings["reference"]
+    islands = faced(surface, reflect=to is None)
+    if to is not None and settings["slide"] and len(islands) > 1:
+        raise ValueError(f"boundaries slide along the outline of one island, and there are {len(islands)}")
+    asked = None if settings["corners"] is None else read_corners(settings["corners"])
+    found = []
+    for k, (island, _) in enumerate(islands):
+        with naming(island, len(islands)):
+            fitted = (
+                held_in_place(island, fixed, reference=reference) if to is None else _onto(island, k, asked, settings)
+            )
+            slide: bool | Rails = settings["slide"]
+            if slide:
+                slide = slide if to is None else Rails(_curves(to, _changed(to)), held=fitted.held)
+                fitted = replace(fitted, problem=moved_onto(slide, fitted.problem))
+        found.append(Posed(fitted, slide))
+    return found
+
+
+def _onto(island: Island, k: int, asked: AskedCorners | None, settings: dict[str, Any]) -> Fitted:
+    """An island laid along the outline; the ``k``-th one has it further to the right, for itself."""
+    contours = _outline(settings["to"], _changed(settings["to"]))
+    corners = None if asked is None else asked.within(island.vertices)
+    return laid_along(island.V, island.F, contours, corners=corners, reference=settings["reference"], beside=k)
+
+
+def _changed(to: str) -> int:
+    """When an outline was changed; files are read anew when they have."""
+    return os.stat(to).st_mtime_ns if os.path.isfile(to) else 0
+
+
+@cache
+def _outline(to: str, _changed: int) -> list[NDArray[np.float64]]:
+    from quasiharmonic.targets import outline
+
+    return outline(to)
+
+
+@cache
+def _curves(to: str, _changed: int) -> list[Curve]:
+    from quasiharmonic.targets import outline_curves
+
+    return outline_curves(to)

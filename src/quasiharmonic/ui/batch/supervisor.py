@@ -1,0 +1,385 @@
+"""A process that solves problems, kept alive and within its limits, and replaced when it dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, BinaryIO, NamedTuple
+
+from quasiharmonic.io.errors import OutputError
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.problems import ProblemFiles
+from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.batch.settings import Orders
+
+# What runs in the process; -P keeps modules that happen to lie in the working directory out of it.
+COMMAND = [sys.executable, "-P", "-c", "from quasiharmonic.ui.batch.worker import serve; serve()"]
+# Of OpenMP, MKL, OpenBLAS, BLIS and Apple's Accelerate.
+_THREADS = "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"
+# Seconds between two looks at time and memory, and those that a process may take to import its libraries.
+_LOOK = 0.05
+_START = 120.0
+#: Seconds that several small problems may take together; some hundredths each are usual.
+TOGETHER = 5.0
+
+
+class Finished(NamedTuple):
+    """What a run is told of a problem that is done.
+
+    Attributes
+    ----------
+    name : str
+    outcome : str
+        As in the record.
+    seconds : float
+        As in the record.
+    resumed : bool
+        Whether an earlier run had done it.
+    """
+
+    name: str
+    outcome: str
+    seconds: float
+    resumed: bool = False
+
+
+class ClosedError(Exception):
+    """The supervisor was closed while a problem was being solved."""
+
+
+class WorkerError(OSError):
+    """A process that solves problems could not be started."""
+
+
+class Supervisor:
+    """Solves one problem at a time in a process of its own.
+
+    Parameters
+    ----------
+    orders : Orders
+        The run's limits, threads, settings and folder.
+    """
+
+    def __init__(self, orders: Orders) -> None:
+        self.orders = orders
+        self._process: _Process | None = None
+        self._closed = False
+        self._lock = threading.Lock()
+
+    def attend(self, files: ProblemFiles) -> Finished:
+        """See to it that a problem has a record of this input and these settings.
+
+        Raises
+        ------
+        OutputError
+            When results cannot be written, for instance on a full disk.
+        WorkerError
+            When no process can be started.
+        ClosedError
+            When `close` was called meanwhile.
+        """
+        job = self._job(files)
+        return job if isinstance(job, Finished) else self._solved(job)
+
+    def attend_all(self, some: Sequence[ProblemFiles]) -> Iterator[Finished]:
+        """As `attend`, of problems that are small: solved together as far as they can be, and the others one by one.
+
+        Whatever happens to a process that solves several, and however long it takes, is recorded of none of them: those
+        that have no record yet are solved one by one.
+
+        Yields
+        ------
+        Finished
+            In no particular order.
+        """
+        jobs: list[dict[str, Any]] = []
+        for files in some:
+            job = self._job(files)
+            if isinstance(job, Finished):
+                yield job
+            else:
+                jobs.append(job)
+        if len(jobs) > 1:
+            left = dict(enumerate(jobs))
+            for k, finished in self._solved_together(jobs):
+                del left[k]
+                yield finished
+            jobs = list(left.values())
+        for job in jobs:
+            yield self._solved(job)
+
+    def _job(self, files: ProblemFiles) -> dict[str, Any] | Finished:
+        """What the process is told of a problem; or how it ended, if nothing has to be done."""
+        folder, orders = self.orders.folder(files.name), self.orders
+        known = _known(files, orders)
+        try:
+            known["key"] = orders.settings.key(files)
+        except OSError as error:
+            return _conclude(folder, known | {"outcome": "invalid", "error": str(error)}, 0.0)
+        before = records.read_record(folder)
+        if before is not None and before.get("key") == known["key"] and _settled(folder, before, orders):
+            return Finished(files.name, before["outcome"], before.get("seconds") or 0.0, resumed=True)
+        return {
+            "mesh": str(files.mesh),
+            "fixed": None if files.fixed is None else str(files.fixed),
+            "folder": str(folder),
+            "time_limit": orders.time_limit,
+            "settings": orders.settings.to_dict(),
+            "record": known,
+        }
+
+    def close(self) -> None:
+        """End the process, whatever it is doing; may be called from another thread."""
+        with self._lock:
+            self._closed = True
+            if self._process is not None:
+                self._process.end()
+
+    def _begun(self, job: dict[str, Any]) -> _Process:
+        """Give a job to the process, which is started if need be."""
+        with self._lock:
+            if self._closed:
+                raise ClosedError
+            if self._process is not None and not self._process.lives():
+                self._process.end()
+                self._process = None
+            self._process = process = self._process or _Process(self.orders.threads)
+        try:
+            process.await_ready()
+        except WorkerError:
+            if self._closed:
+                raise ClosedError from None
+            raise
+        process.send(job)
+        return process
+
+    def _solved_together(self, jobs: list[dict[str, Any]]) -> Iterator[tuple[int, Finished]]:
+        """Solve some small problems at once, and tell of those that have been by their number."""
+        limit = min(self.orders.time_limit or TOGETHER, TOGETHER)
+        orders = replace(self.orders, time_limit=limit)
+        process = self._begun({"together": jobs, "time_limit": limit})
+        while True:
+            answer, _ = process.answer(orders)
+            if answer is None:
+                self._replace()
+                if self._closed:
+                    raise ClosedError
+                return
+            if "stop" in answer:
+                raise OutputError(answer["stop"])
+            if "over" in answer:
+                return
+            k = answer["done"]
+            yield k, Finished(jobs[k]["record"]["problem"], answer["outcome"], answer["seconds"])
+
+    def _solved(self, job: dict[str, Any]) -> Finished:
+        process = self._begun(job)
+        began = time.perf_counter()
+        record: Record = job["record"]
+        while True:
+            answer, why = process.answer(self.orders)
+            if answer is None:
+                break
+            if "stop" in answer:
+                raise OutputError(answer["stop"])
+            if "outcome" in answer:
+                if answer["outcome"] == "memory":
+                    # What could not be allocated may have left the process crippled.
+                    self._replace()
+                return Finished(record["problem"], answer["outcome"], answer["seconds"])
+            record = answer["facts"]
+        self._replace()
+        if self._closed:
+            raise ClosedError
+        return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)
+
+    def _replace(self) -> None:
+        """Make room for another process, which is started when there is something to do."""
+        with self._lock:
+            if self._process is not None:
+                self._process.end()
+            self._process = None
+
+
+def lost(files: ProblemFiles, orders: Orders, why: str) -> Finished:
+    """Record a problem as a crash that has taken its supervisor along.
+
+    Raises
+    ------
+    OutputError
+        When the record cannot be written.
+    """
+    record = _known(files, orders) | {"outcome": "crash", "error": why}
+    with suppress(OSError):
+        record["key"] = orders.settings.key(files)
+    return _conclude(orders.folder(files.name), record, 0.0)
+
+
+def _known(files: ProblemFiles, orders: Orders) -> Record:
+    """What can be said of a problem before it is looked at."""
+    return {
+        "problem": files.name,
+        "source": str(files.mesh),
+        "threads": orders.threads,
+        "time_limit": orders.time_limit,
+        "memory_limit": orders.memory_limit,
+        "certified": False,
+    }
+
+
+def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
+    """Write the record of a problem that could not do so itself."""
+    records.clear(folder)
+    records.write_record(folder, record | {"seconds": seconds})
+    return Finished(record["problem"], record["outcome"], seconds)
+
+
+def _settled(folder: Path, record: Record, orders: Orders) -> bool:
+    """Whether a record of the same input and settings stands under these orders."""
+    outcome = record["outcome"]
+    if outcome in records.JUDGED:
+        return records.is_complete(folder, record)
+    if outcome == "invalid":
+        return True
+    if orders.retry:
+        return False
+    if outcome == "timeout":
+        return orders.time_limit is not None and orders.time_limit <= record["time_limit"]
+    if outcome == "memory" and record["memory_limit"] is not None:
+        return orders.memory_limit is not None and orders.memory_limit <= record["memory_limit"]
+    return True
+
+
+class _Process:
+    """A process with a line of jobs to it and a line of answers from it."""
+
+    def __init__(self, threads: int) -> None:
+        # Its position is shared with the process, which writes where `send` has put it.
+        self._errors = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
+        environment = {**os.environ, **dict.fromkeys(_THREADS, str(threads))}
+        try:
+            self._process = subprocess.Popen(
+                COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, env=environment
+            )
+        except OSError as error:
+            self._errors.close()
+            raise WorkerError(f"cannot start {COMMAND[0]}: {error}") from error
+        self._answers: SimpleQueue[bytes | None] = SimpleQueue()
+        self._ready = False
+        assert self._process.stdout is not None
+        threading.Thread(target=_pump, args=(self._process.stdout, self._answers), daemon=True).start()
+
+    def await_ready(self) -> None:
+        """Wait until the process has imported its libraries."""
+        if self._ready:
+            return
+        with suppress(Empty):
+            line = self._answers.get(timeout=_START)
+            self._ready = line is not None
+        if not self._ready:
+            words = self._last_words()
+            self.end()
+            raise WorkerError(f"the process that solves problems did not start: {words}")
+
+    def lives(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    def send(self, job: dict[str, Any]) -> None:
+        """Give a job."""
+        self._began, self._peak = time.monotonic(), 0
+        assert self._process.stdin is not None
+        # If it has died meanwhile, the end of its answers tells.
+        with suppress(OSError):
+            self._errors.truncate(0)
+            self._errors.seek(0)
+            self._process.stdin.write(json.dumps(job).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def answer(self, orders: Orders) -> tuple[dict[str, Any] | None, Record]:
+        """Wait for the next answer; without one, what ended the process."""
+        while True:
+            try:
+                line = self._answers.get(timeout=_LOOK)
+            except Empty:
+                why = self._exceeded(orders)
+                if why is None:
+                    continue
+                self.end()
+                return None, why | self._seen()
+            if line is not None:
+                return json.loads(line), {}
+            self._process.wait()
+            return None, {"outcome": "crash", "error": self._cause()} | self._seen()
+
+    def end(self) -> None:
+        """Kill it; nothing is lost by that but the problem at hand."""
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        self._errors.close()
+
+    def _exceeded(self, orders: Orders) -> Record | None:
+        if orders.time_limit is not None and time.monotonic() - self._began > orders.time_limit:
+            return {"outcome": "timeout", "error": f"not done within {orders.time_limit:g} s"}
+        self._peak = max(self._peak, resident(self._process.pid) or 0)
+        if orders.memory_limit is not None and self._peak > orders.memory_limit:
+            return {"outcome": "memory", "error": f"took more than {orders.memory_limit / 2**20:.0f} MiB of memory"}
+        return None
+
+    def _seen(self) -> Record:
+        return {"peak_memory": self._peak or None}
+
+    def _cause(self) -> str:
+        code = self._process.returncode
+        text = f"the process ended with exit code {code}"
+        if code < 0:
+            with suppress(ValueError):
+                text = f"the process was ended by {signal.Signals(-code).name}"
+            if -code == signal.SIGKILL:
+                text += ", as the system does when memory runs out"
+        words = self._last_words()
+        return f"{text}: {words}" if words else text
+
+    def _last_words(self) -> str:
+        """What the process has written to standard error that may tell why it ended, in one line."""
+        if self._errors.closed:
+            return ""
+        self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(self._errors.tell() - 10_000, 0))
+        words = " ".join(self._errors.read().decode("utf-8", "replace").split())
+        _, fatal, tail = words.rpartition("Fatal Python error")
+        return (fatal + tail)[:300] if fatal else tail[-300:]
+
+
+def _pump(source: BinaryIO, answers: SimpleQueue[bytes | None]) -> None:
+    with source, suppress(OSError, ValueError):
+        for line in source:
+            answers.put(line)
+    answers.put(None)
+
+
+def resident(pid: int) -> int | None:
+    """Resident memory of a process in bytes; None where it cannot be told."""
+    with suppress(OSError, IndexError, ValueError, AttributeError):
+        return int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    try:
+        import psutil
+    except ImportError:
+        return None
+    with suppress(psutil.Error):
+        return int(psutil.Process(pid).memory_info().rss)
+    return None

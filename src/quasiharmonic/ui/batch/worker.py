@@ -1,0 +1,266 @@
+"""One process that solves problems one after another: jobs come on standard input, answers go to standard output.
+
+Both are lines of JSON. Nothing a problem does is let out: it ends in a record, which is written next to the
+map before the answer is given, or in the death of this process, which `quasiharmonic.ui.batch.supervisor` records.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from math import isfinite
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic import io
+from quasiharmonic.apps import atlas
+from quasiharmonic.apps.atlas.mapped import MappedAtlas, each_island, faced
+from quasiharmonic.apps.atlas.refined import written_over
+from quasiharmonic.apps.flattening.flattened import flattenable
+from quasiharmonic.apps.repair.fitting import Fitted
+from quasiharmonic.energies.polishing import polished
+from quasiharmonic.geometry.curves import Rails
+from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.solver.refine.solve_refining import climb, on_refinement
+from quasiharmonic.solver.search.solving import solve
+from quasiharmonic.ui.batch import batched as together
+from quasiharmonic.ui.batch import metadata as account
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch import setup as posing
+from quasiharmonic.ui.batch.records import Record
+
+#: What a process says when it has imported what it needs.
+READY = "ready"
+# Seconds beyond the time limit after which the system ends this process, should nobody be left to do so.
+GRACE = 10.0
+
+
+def serve() -> None:
+    """Solve what comes on standard input until that ends, whatever is going on then."""
+    # Ctrl-C reaches the whole group; the parent decides what becomes of this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    faulthandler.enable(all_threads=False)
+    # What libraries print must not come between the answers.
+    answers = os.fdopen(os.dup(1), "w", encoding="ascii")
+    os.dup2(2, 1)
+
+    def tell(message: dict[str, Any]) -> None:
+        try:
+            answers.write(json.dumps(message, allow_nan=False) + "\n")
+            answers.flush()
+        except OSError:
+            # Whoever listened has gone, which is no fault of the problem and must not get into its record.
+            os._exit(0)
+
+    jobs: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_listen, args=(jobs,), daemon=True).start()
+    tell({READY: True})
+    while True:
+        job = json.loads(jobs.get())
+        _alarm(job["time_limit"])
+        try:
+            if "together" in job:
+                together.solve_some(job["together"], tell)
+                answer: dict[str, Any] = {"over": True}
+            else:
+                record = solve_files(job, tell)
+                answer = {"outcome": record["outcome"], "seconds": record["seconds"]}
+        except io.OutputError as error:
+            answer = {"stop": str(error)}
+        tell(answer)
+        _alarm(None)
+
+
+def _listen(jobs: SimpleQueue[bytes]) -> None:
+    # Not sys.stdin, which the interpreter cannot close at its end while it is being waited at.
+    with os.fdopen(os.dup(0), "rb") as source:
+        for line in source:
+            jobs.put(line)
+    # Whoever gave the jobs has gone, and nobody waits for the one at hand.
+    os._exit(0)
+
+
+def _alarm(limit: float | None) -> None:
+    """Have the system end this process some time after the limit: also if it hangs where no thread can see its end."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0.0 if limit is None else limit + GRACE)
+
+
+def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Record:
+    """Solve one problem and write its map and its record.
+
+    Parameters
+    ----------
+    job : dict
+        ``mesh`` and ``fixed``, paths; ``folder``, where results go; ``settings``, as `Settings.to_dict` has them;
+        ``record``, what is known of the record beforehand.
+    tell : callable
+        Called with ``{"facts": …}`` once it is known how large the problem is.
+
+    Returns
+    -------
+    dict
+        The record as written.
+
+    Raises
+    ------
+    OutputError
+        When map or record cannot be written, which is no fault of the problem.
+    """
+    folder = Path(job["folder"])
+    records.clear(folder)
+    account.forget_peak()
+    began = time.perf_counter()
+    record: Record = {**job["record"], "versions": account.versions()}
+    try:
+        fill_record(job, folder, record, tell)
+    except io.OutputError:
+        raise
+    except MemoryError as error:
+        record |= {"outcome": "memory", "certified": False, "error": str(error) or "out of memory"}
+    except Exception as error:
+        # What is wrong with the input shows before its sizes are known.
+        wrong_input = isinstance(error, ValueError) and "vertices" not in record
+        record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _unexpected(error)
+    record["peak_memory"] = account.peak()
+    record["seconds"] = time.perf_counter() - began
+    records.write_record(folder, record)
+    return record
+
+
+def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
+    """Read, solve, write, judge, measure; what is found goes into the record as soon as it is known."""
+    settings = job["settings"]
+    with account.timed(record, "read"):
+        mesh = io.read_mesh(job["mesh"])
+        fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
+    with account.timed(record, "setup"):
+        if not settings["flatten"] and settings["to"] is None and mesh.FT is None:
+            # It says what is missing.
+            io.problem_arrays(mesh, fixed)
+        surface = posing.surface_of(mesh, settings)
+    if settings["cut"]:
+        record["cut_edges"] = len(surface.seams) - len(io.seamed(mesh).seams)
+    if settings["flatten"]:
+        found = _flattened(surface, settings, record, tell)
+        mapped = mesh.with_places(found.mesh)
+    else:
+        found, refined = _mapped(surface, fixed, settings, record, tell)
+        mapped = mesh.with_places(found.mesh)
+        if any(refined):
+            mapped = written_over(mesh, surface.islands, refined, found.places())
+    with account.timed(record, "write"):
+        record |= _written(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
+    with account.timed(record, "measure"):
+        record |= account.measured(*io.without_idle(*io.cut_at_seams(mapped)))
+
+
+def _mapped(
+    surface: SeamedMesh,
+    fixed: NDArray[np.signedinteger] | None,
+    settings: dict[str, Any],
+    record: Record,
+    tell: Callable[[dict[str, Any]], None],
+) -> tuple[MappedAtlas, list[Refined | None]]:
+    """Map a surface onto a given boundary, island by island; and what became of the meshes of these."""
+    with account.timed(record, "setup"):
+        posed = posing.posed(surface, fixed, settings)
+    problems = [one.fitted.problem for one in posed]
+    record |= account.sizes(problems)
+    tell({"facts": record})
+    todo = iter(posed)
+    # Each is posed as it is to be solved.
+    found = each_island(surface, lambda island: _solved(*next(todo), settings, record), reflect=settings["to"] is None)
+    results = [island.result for island in found.islands]
+    record |= account.told(results, found.status)
+    if settings["refine"]:
+        record["added_vertices"] = added = sum(result.added for result in results)
+        record["vertices"] += added
+        record["triangles"] += sum(2 * result.added for result in results)
+        record["rung"] = results[-1].rungs[-1].name if len(results) == 1 else None
+    if all(result.history for result in results):
+        record["flips_before"] = sum(result.history[0].flipped for result in results)
+    why = [result.diagnosis for result in results if not result.injective]
+    if why:
+        reasons = [reason.summary() for reason in why if reason is not None and reason.obstructions]
+        record["error"] = "; ".join(reasons) or found.status.value
+    return found, [result.refined for result in results]
+
+
+def _solved(fitted: Fitted, slide: bool | Rails, settings: dict[str, Any], record: Record) -> MapResult:
+    """Map one island, and lower its distortion if that is asked for."""
+    with account.timed(record, "map"):
+        way = climb if settings["refine"] else solve
+        result = way(
+            fitted.problem,
+            strategy=settings["strategy"],
+            max_iterations=settings["max_iterations"],
+            linear_solver=together.solver_for(fitted.problem, settings["linear_solver"]),
+        )
+    if settings["polish"] is None or result.status is not Status.INJECTIVE:
+        return result
+    with account.timed(record, "polish"):
+        fine = on_refinement(fitted.problem, result.refined)
+        return polished(fine, result, energy=settings["polish"], slide=slide)
+
+
+def _flattened(
+    surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
+) -> MappedAtlas:
+    """Lay a surface flat, its boundary free, island by island."""
+    with account.timed(record, "setup"):
+        pieces = [piece for island, _ in faced(surface, reflect=False) for piece in flattenable(island.V, island.F)]
+    record |= {"vertices": len(surface.V), "triangles": len(surface.F), "fixed": 0, "pins": 0}
+    record |= {"loops": sum(len(piece.loops) for piece in pieces), "islands": len(surface.islands)}
+    tell({"facts": record})
+    with account.timed(record, "map"):
+        found = atlas.flatten(
+            surface,
+            energy=settings["energy"] or "symmetric-dirichlet",
+            max_iterations=settings["max_iterations"],
+            linear_solver=settings["linear_solver"],
+        )
+    record |= account.told([island.result for island in found.islands], found.status)
+    energy = found.islands[0].result.history[-1].energy
+    if len(pieces) == 1 and isfinite(energy):
+        record["energy"] = energy
+    bad = [result.certificate for result in (island.result for island in found.islands) if not result.injective]
+    if bad:
+        record["error"] = bad[0].summary()
+    return found
+
+
+def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
+    """Write a map, and judge the file as a reader gets it: whether it is what is wanted, injective or bijective."""
+    # Waiting for the disk would take longer than most problems. What a power failure takes is found by its length.
+    io.write_obj(path, mesh, durable=False)
+    V, F, uv = io.cut_at_seams(io.read_mesh(path))
+    verdict = atlas.certify(SeamedMesh(V, F, F, uv))
+    bijective = verdict.bijective and not len(verdict.overlapping)
+    certified = bijective if wanted == "bijective" else verdict.injective
+    return {
+        "outcome": wanted if certified else f"not {wanted}",
+        "certified": certified,
+        "bijective": bijective,
+        "flips_after": len(verdict.flipped),
+        "map_bytes": path.stat().st_size,
+    }
+
+
+def _unexpected(error: Exception) -> Record:
+    """An exception that no input should raise, with its place."""
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{Path(at.filename).name}, line {at.lineno}, in {at.name}"
+    return {"outcome": "error", "certified": False, "error": f"{type(error).__name__}: {error} ({place})"}

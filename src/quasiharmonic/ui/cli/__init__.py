@@ -1,0 +1,109 @@
+"""The command ``qhm``.
+
+Exit status 0: what was asked for holds, and a written file is certified injective. 1: a map was written
+or judged that is not injective. 2: the input or the call is wrong, and nothing was written. 3: a map was
+written, but what should be told about it could not be, the verdict perhaps included. 141: nothing was to be written,
+and nobody reads standard output any more.
+
+The subcommands are in `commands`. The package builds on everything below it. Start reading here, then `commands.check`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
+from io import TextIOWrapper
+
+from quasiharmonic.ui.cli.interrupts import Interrupts
+from quasiharmonic.ui.cli.report import ReportError, in_words
+from quasiharmonic.ui.cli.streams import NO_READER, tell
+from quasiharmonic.ui.cli.version import Version
+
+# The subcommands in the order of the help; each is a module of `commands`.
+COMMANDS = (
+    "map",
+    "flatten",
+    "morph",
+    "animate",
+    "repair",
+    "field",
+    "polish",
+    "harmonise",
+    "check",
+    "measure",
+    "plot",
+    "view",
+    "studio",
+    "diagnose",
+    "refine",
+    "batch",
+    "report",
+    "demo",
+)
+
+
+_INTERRUPTED = "interrupted, nothing was written"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``qhm`` and return its exit status.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments after the command's name; those of the process by default.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that cannot show a sign gets another; a report must not fail for that.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    with Interrupts() as interrupts:
+        words = sys.argv[1:] if argv is None else list(argv)
+        # Those of other commands would have to be imported and declared for nothing.
+        parser = parser_of([words[0]] if words and words[0] in COMMANDS else COMMANDS)
+        try:
+            options = parser.parse_args(words)
+        except OSError as error:
+            # Of the version, which is printed meanwhile.
+            return _fail("--version", error, 2)
+        run: Callable[[argparse.Namespace], int] = options.run
+        try:
+            return run(options)
+        except ReportError as error:
+            return _fail(options.command, error, 3)
+        except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+            # Wrong input of any kind: the library's messages name the elements and what to do.
+            return _fail(options.command, error, 2)
+        except KeyboardInterrupt:
+            return _fail(options.command, _INTERRUPTED, 2)
+        except Exception as error:
+            if interrupts.happened:
+                return _fail(options.command, _INTERRUPTED, 2)
+            if isinstance(error, ImportError):
+                return _fail(options.command, error, 2)
+            raise
+
+
+def _fail(command: str, why: str | Exception, status: int) -> int:
+    """Say why a command fails, unless it is that nobody listens; the exit status."""
+    if isinstance(why, BrokenPipeError):
+        return NO_READER
+    tell(f"qhm {command}: {why if isinstance(why, str) else in_words(why)}")
+    return status
+
+
+def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
+    """The command's parser, with some of its subcommands."""
+    parser = argparse.ArgumentParser(
+        prog="qhm",
+        description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
+        epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written), 3 "
+        "written, but not what should be told about it.",
+    )
+    parser.add_argument("--version", action=Version)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name in names:
+        import_module(f"{__name__}.commands.{name}").add_parser(commands)
+    return parser

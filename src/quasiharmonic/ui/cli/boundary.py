@@ -1,0 +1,95 @@
+"""``qhm check --boundary``: the boundary of a surface in numbers and as a picture."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.targets import BoundaryLoop
+
+# Corners that are looked for on each loop, and degrees by which it turns at one, as at those of outlines.
+_MOST, _LEAST = 12, 20.0
+# Vertices of a loop that the sentences list.
+_LISTED = 100
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read the surface, number its boundary, draw it, report."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.targets import boundary_turning
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.ui.plot import save_boundary_figure
+    from quasiharmonic.util.arrays import counted
+
+    if options.plot is not None:
+        report.check_picture("--plot", options.plot, (options.input,))
+    mesh = io.read_mesh(options.input)
+    with report.about(options.input):
+        opened = io.seamed(mesh).opened()
+        # Of a vertex that has several places, each is on the boundary by itself and by the vertex's number.
+        origin = np.arange(len(opened.V))
+        origin[opened.F] = mesh.F
+        turning = boundary_turning(opened.V, opened.F)
+        loops = [replace(loop, vertices=origin[loop.vertices]) for loop in turning]
+    told = [_told(loop, mesh.V) for loop in loops]
+    facts: dict[str, Any] = {
+        "input": str(options.input),
+        "vertices": len(mesh.V),
+        "triangles": len(mesh.F),
+        "loops": told,
+    }
+    count = counted("boundary loop", "boundary loops", len(loops)) if loops else "the surface is closed"
+    text = [f"{options.input}: {count}; vertices are counted from 0"]
+    text += [line for i, one in enumerate(told) for line in _sentences(i, one)]
+    if options.plot is not None:
+        marked = [corner["vertex"] for loop in told for corner in loop["corners"]]
+        save_boundary_figure(options.plot, mesh.V, mesh.F, [loop.vertices for loop in loops], np.array(marked))
+        text.append(f"wrote {options.plot}")
+    report.emit(facts, options.json, "\n".join(text))
+    return 0
+
+
+def _told(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]:
+    """A loop in plain Python types; its corners by how far it turns there."""
+    import numpy as np
+
+    positions, turning = loop.corners(min(_MOST, len(loop.vertices)))
+    vertices, own = loop.vertices[positions], loop.turning[positions]
+    corners = [
+        {"vertex": vertex, "place": V[vertex].tolist(), "turning": angle, "turning_at_vertex": alone}
+        for vertex, angle, alone in zip(
+            vertices.tolist(), np.degrees(turning).tolist(), np.degrees(own).tolist(), strict=True
+        )
+        if abs(angle) >= _LEAST
+    ]
+    return {
+        "vertices": loop.vertices.tolist(),
+        "length": float(loop.lengths.sum()),
+        "corners": sorted(corners, key=lambda corner: -abs(float(corner["turning"]))),
+    }
+
+
+def _sentences(i: int, loop: dict[str, Any]) -> list[str]:
+    vertices = loop["vertices"]
+    more = f", … ({len(vertices)} in all; --json lists them)" if len(vertices) > _LISTED else ""
+    lines = [
+        f"loop {i}: {len(vertices)} vertices, length {loop['length']:.6g}, the surface to the left",
+        "  in order: " + ", ".join(map(str, vertices[:_LISTED])) + more,
+    ]
+    for corner in loop["corners"]:
+        x, y, z = corner["place"]
+        lines.append(
+            f"  corner: vertex {corner['vertex']} at ({x:.6g}, {y:.6g}, {z:.6g}), where it turns by "
+            f"{corner['turning_at_vertex']:.0f}°, and by {corner['turning']:.0f}° from the run before to that after"
+        )
+    if not loop["corners"]:
+        lines.append(f"  no corner of {_LEAST:g}° or more")
+    return lines

@@ -1,0 +1,253 @@
+"""``qhm animate``: a mesh and where its boundary goes, frame by frame → a sequence of maps, a moving picture."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.apps.animation.frames import Animation, FrameStep
+    from quasiharmonic.io import MeshData
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.ui.cli.arguments import Commands
+
+PICTURES = ".gif", ".mp4"
+_MESHES = ".obj", ".ply", ".off", ".glb", ".gltf"
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments
+
+    parser = commands.add_parser(
+        "animate",
+        help="map a surface to a sequence of targets, each frame certified, none leaping",
+        description="Map a surface to a sequence of targets, each frame from the one before it. With --polish every "
+        "frame has little distortion, and vertices do not leap from one to the next.",
+        epilog="Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input "
+        "or call, nothing written; 3 written, but not what should be told about it. Ctrl-C writes the frames so far.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file: the surface")
+    parser.add_argument(
+        "targets",
+        type=Path,
+        nargs="+",
+        metavar="FRAMES",
+        help="where fixed vertices go: meshes with the same vertices and a map (vt), in their order; or a folder of "
+        "them, by name; or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed lists",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        action="append",
+        help="folder to write the frames to as 0000.obj, 0001.obj, …, or a moving picture, .gif or .mp4; repeatable",
+    )
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+    )
+    parser.add_argument("--polish", choices=arguments.ENERGIES, help="lower this distortion energy in every frame")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        metavar="TIMES",
+        help="for --polish: no vertex moves more than so many times as far as the boundary does (default: 3)",
+    )
+    parser.add_argument(
+        "--bridge", action="store_true", help="go past frames that allow no map halfway between those around them"
+    )
+    parser.add_argument(
+        "--frames-per-second", type=arguments.count, metavar="N", help="of a moving picture (default: 24)"
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, animate, write, read back, judge, report."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.apps.animation.animated import animate
+    from quasiharmonic.geometry.mesh.topology import boundary_edges
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.ui.cli import arguments, progress, report
+    from quasiharmonic.ui.plot.animation import check_animation
+
+    arguments.settle(options, "limit", None, asked=options.polish is not None, belongs="--polish")
+    drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
+    arguments.settle(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
+    targets = _files(options.targets)
+    inputs = (options.input, options.fixed, *targets)
+    for path in drawn:
+        check_animation(path, options.frames_per_second)
+    report.check_new({f"-o {path}": path for path in drawn}, options.json, inputs=inputs)
+    folders = [_checked_folder(path, inputs) for path in options.output if path not in drawn]
+    if len(set(options.output)) < len(options.output):
+        raise ValueError("-o: the same output is named twice")
+    mesh = io.read_mesh(options.input)
+    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
+    with report.about(options.input):
+        held = np.unique(boundary_edges(mesh.F, len(mesh.V))) if fixed is None else fixed
+    places = _targets(targets, mesh, held)
+    with report.about(options.input):
+        problem = Problem(mesh.V, mesh.F, held, places[0])
+    with report.about(options.input), progress.line(_words) as show:
+        animation = animate(
+            problem,
+            places,
+            polish=options.polish,
+            limit=options.limit,
+            bridge=options.bridge,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+    if not animation.frames:
+        raise KeyboardInterrupt
+    written: dict[Path, tuple[bool, list[str]]] = {}
+    for folder in folders:
+        with report.after_writing(folders[0]) if written else nullcontext():
+            written[folder] = _write_frames(folder, mesh, animation)
+    for t, path in enumerate(drawn):
+        # What could not be drawn is wrong output, unless something is written already.
+        before = [*folders, *drawn[:t]]
+        with report.after_writing(before[0]) if before else nullcontext():
+            _draw(path, problem, animation, options.frames_per_second)
+    with report.after_writing(options.output[0]):
+        missing = len(places) - len(animation.frames)
+        facts: dict[str, Any] = {
+            **animation.to_dict(),
+            "asked": len(places),
+            "input": str(options.input),
+            "outputs": [str(path) for path in options.output],
+        }
+        lines = [f"wrote {', '.join(map(str, options.output))}", animation.summary()]
+        if missing:
+            lines.append(f"{missing} further frames were asked for")
+        for folder, (_, others) in written.items():
+            if others:
+                names = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
+                lines.append(f"not of this run, but in {folder}: {names}")
+        report.emit(facts, options.json, "\n".join(lines))
+    certified = all(every for every, _ in written.values())
+    return 0 if not missing and certified and animation.found.all() else 1
+
+
+def _files(given: list[Path]) -> list[Path]:
+    """The files that are named, or are in the folder that is."""
+    if len(given) == 1 and given[0].is_dir():
+        found = sorted(path for path in given[0].iterdir() if path.suffix.lower() in _MESHES)
+        if not found:
+            raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(_MESHES)})")
+        return found
+    if len(given) > 1 and any(path.suffix.lower() == ".npy" for path in given):
+        raise ValueError("an array .npy has all frames: name no other file beside it")
+    return given
+
+
+def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
+    """A folder that can be written to, or made, with none of the inputs in it."""
+    if path.suffix and not path.is_dir():
+        raise ValueError(f"-o {path}: neither a moving picture ({', '.join(PICTURES)}) nor the name of a folder")
+    if any(source is not None and source.resolve().parent == path.resolve() for source in inputs):
+        raise ValueError(f"-o {path}: frames are not written where the input is")
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"-o {path}: it is no folder")
+    return path
+
+
+def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Where the held vertices go in every frame; (t, k, 2)."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.ui.cli import report
+
+    if files[0].suffix.lower() == ".npy":
+        return _array(files[0], len(mesh.V), held)
+    places = []
+    for path in files:
+        frame = io.read_mesh(path)
+        if len(frame.V) != len(mesh.V):
+            raise ValueError(f"{path}: {len(frame.V)} vertices, where the surface has {len(mesh.V)}")
+        with report.about(path):
+            mapped = io.mapped(frame)
+        opened = mapped.opened()
+        if opened.uv is None or not mapped.seamless:
+            raise ValueError(f"{path}: its map has seams, and frames are of a surface without")
+        places.append(opened.uv[held])
+    return np.stack(places)
+
+
+def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.util.arrays import real_array
+
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise io.MeshFileError(path, "there is no such file") from error
+    except (ValueError, EOFError, MemoryError) as error:
+        # The first sentence says what is wrong, further ones what a programmer might do about it.
+        said = str(error).partition("\n")[0]
+        raise ValueError(f"{path}: no array of numbers in NumPy's format: {said}") from error
+    shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, held.size) and array.shape[2] == 2
+    if not shaped or array.dtype.kind not in "iuf":
+        raise ValueError(
+            f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {held.size}, 2) for fixed vertices "
+            f"only, not {array.dtype} {array.shape}"
+        )
+    return real_array(f"{path}: its array", array if array.shape[1] == held.size else array[:, held])
+
+
+def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[bool, list[str]]:
+    """Write every frame that has a map.
+
+    Returns
+    -------
+    certified : bool
+        Whether all are as a reader gets them.
+    others : list of str
+        Frames in the folder that are of another run.
+    """
+    from quasiharmonic import io
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.ui.cli import verdict as judging
+
+    certified = True
+    digits = max(4, len(str(len(animation.frames) - 1)))
+    written: set[str] = set()
+    with io.new_folder(folder):
+        for t, frame in enumerate(animation.frames):
+            if not frame.injective:
+                continue
+            path = folder / f"{t:0{digits}}.obj"
+            with report.after_writing(folder / min(written)) if written else nullcontext():
+                io.write_mapped(path, mesh.with_map(frame.uv))
+                written.add(path.name)
+                certified &= judging.judge(io.read_mesh(path)).injective
+    others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
+    return certified, sorted(others)
+
+
+def _draw(path: Path, problem: Problem, animation: Animation, rate: int) -> None:
+    from quasiharmonic.ui.plot.animation import save_animation
+
+    named = ((f"frame {t}", frame.uv) for t, frame in enumerate(animation.frames))
+    save_animation(path, problem.V, problem.F, named, fixed=problem.fixed, frames_per_second=rate)
+
+
+def _words(step: FrameStep) -> str:
+    sweep = f", sweep {step.sweep}" if step.sweep else ""
+    return f"frame {step.frame + 1} of {step.frames}{sweep}   largest move {step.move:.3g}"

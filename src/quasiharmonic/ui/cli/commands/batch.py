@@ -1,0 +1,235 @@
+"""``qhm batch``: every problem of a data set → maps, and a record of each."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli.streams import tell
+
+if TYPE_CHECKING:
+    from quasiharmonic.ui.batch import Progress
+    from quasiharmonic.ui.cli.arguments import Commands
+
+# Seconds between two updates of the line on a terminal, and between two lines elsewhere.
+LIVE, LOG = 0.1, 30.0
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments, targets
+
+    parser = commands.add_parser(
+        "batch",
+        help="map all problems of a data set, on all cores or a cluster",
+        description="Map every problem of a data set, each in a process that may fail without harm to the others. "
+        "Maps and records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has "
+        "all records. The same command again goes on where the last one ended, however it ended. `qhm report OUT` "
+        "makes a page of it.",
+        epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
+        "(the records say why); 2 wrong call, or stopped: what was finished is kept; 3 "
+        "finished, but that could not be told.",
+    )
+    parser.add_argument(
+        "source",
+        metavar="DIR_OR_LIST",
+        type=Path,
+        help="folder with problems (input.obj and handles.txt) at any depth, or a text file that lists folders and "
+        "meshes, one a line",
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument(
+        "--table", choices=("csv", "parquet"), default="csv", help="form of the table of records (default: csv)"
+    )
+    parser.add_argument("--retry", action="store_true", help="try again what failed by an error, a crash or a limit")
+
+    work = parser.add_argument_group("who works, and how long")
+    work.add_argument(
+        "-j", "--jobs", type=arguments.count, metavar="N", help="problems at a time (default: a core each)"
+    )
+    work.add_argument(
+        "--threads", type=arguments.count, default=1, metavar="N", help="solver threads for each (default: 1)"
+    )
+    work.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="have the workers of a Dask cluster do it, whose scheduler is at tcp://HOST:PORT",
+    )
+    work.add_argument(
+        "--time-limit",
+        type=_seconds,
+        default=600.0,
+        metavar="SECONDS",
+        help="for one problem; 0 for none (default: 600)",
+    )
+    work.add_argument(
+        "--memory-limit", type=_bytes, metavar="SIZE", help="resident memory for one problem, such as 800M or 4G"
+    )
+
+    solver = parser.add_argument_group("how each is solved")
+    solver.add_argument(
+        "--to",
+        metavar="OUTLINE",
+        help=f"take every mesh file, its boundary to go to {targets.FORMS}",
+    )
+    solver.add_argument(
+        "--flatten",
+        action="store_true",
+        help="take every mesh file and lay it flat, its boundary free, without overlap",
+    )
+    solver.add_argument(
+        "--cut", action="store_true", help="with --to and --flatten: cut what does not lie flat, along seams"
+    )
+    solver.add_argument(
+        "--corners",
+        metavar="auto",
+        help="with --to: corners of the boundary by angle (auto), near:x,y,z,…, or as qhm map takes them",
+    )
+    solver.add_argument(
+        "--refine",
+        action="store_true",
+        help="split inner edges where there is no map without, as few as need be (adds vertices)",
+    )
+    solver.add_argument(
+        "--energy",
+        choices=arguments.FLATTENED,
+        help="what --flatten lowers (default: symmetric-dirichlet)",
+    )
+    arguments.add_strategy(solver)
+    solver.add_argument(
+        "--polish", choices=arguments.ENERGIES, metavar="ENERGY", help="then lower distortion: %(choices)s"
+    )
+    solver.add_argument(
+        "--slide",
+        action="store_true",
+        help="let boundary vertices glide along the outline while --polish lowers distortion, its corners held",
+    )
+    solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
+    solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    arguments.add_linear_solver(solver)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run, showing how far it is; say how it ended."""
+    from quasiharmonic.ui import batch
+    from quasiharmonic.ui.cli import report
+
+    if options.flatten and options.strategy is not None:
+        raise ValueError(
+            "--strategy is of maps onto a given boundary, and --flatten sets it free: leave one of them out"
+        )
+    settings = batch.Settings(
+        to=options.to,
+        flatten=options.flatten,
+        energy=options.energy,
+        cut=options.cut,
+        corners=options.corners,
+        refine=options.refine,
+        strategy=options.strategy or "speed",
+        polish=options.polish,
+        slide=options.slide,
+        reference=options.reference,
+        max_iterations=options.max_iterations,
+        linear_solver=options.linear_solver,
+    )
+    show = _Display()
+    try:
+        progress = batch.run(
+            options.source,
+            options.output,
+            settings,
+            jobs=options.jobs,
+            threads=options.threads,
+            time_limit=options.time_limit or None,
+            memory_limit=options.memory_limit,
+            retry=options.retry,
+            table=options.table,
+            scheduler=options.scheduler,
+            callback=show,
+        )
+    except KeyboardInterrupt:
+        show.clear()
+        tell(f"qhm batch: interrupted; what was finished is kept in {options.output}, and the same command goes on")
+        return 2
+    finally:
+        show.clear()
+    wanted = "bijective" if options.flatten else "injective"
+    records = options.output / f"records.{options.table}"
+    with report.after_writing(records):
+        print(_account(progress, wanted, records), flush=True)
+    return 0 if progress.solved == progress.total else 1
+
+
+def _account(progress: Progress, wanted: str, table: Path) -> str:
+    from quasiharmonic.ui.batch import OUTCOMES
+
+    failures = [
+        f"{progress.outcomes[outcome]} {words}"
+        for outcome, words in OUTCOMES.items()
+        if outcome != wanted and progress.outcomes.get(outcome)
+    ]
+    lines = [f"{progress.solved} of {progress.total} problems have a certified {wanted} map"]
+    lines += ["the others: " + ", ".join(failures)] if failures else []
+    resumed = f", {progress.resumed} of them done before" if progress.resumed else ""
+    lines.append(f"wrote {table} in {_duration(progress.seconds)}{resumed}")
+    return "\n".join(lines)
+
+
+class _Display:
+    """How far a run is: a line that is written over on a terminal, elsewhere a line now and then."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._shown = time.monotonic() - LIVE if self._terminal else time.monotonic()
+
+    def __call__(self, progress: Progress) -> None:
+        now = time.monotonic()
+        if sys.stderr is None or now - self._shown < (LIVE if self._terminal else LOG):
+            return
+        self._shown = now
+        text = f"{progress.done}/{progress.total} done   {progress.failed} failed   {progress.rate:.3g}/s"
+        if progress.seconds_left is not None:
+            text += f"   {_duration(progress.seconds_left)} left"
+        if self._terminal:
+            sys.stderr.write("\r\x1b[K" + text[: shutil.get_terminal_size().columns - 1])
+            sys.stderr.flush()
+        else:
+            tell(text)
+
+    def clear(self) -> None:
+        """Take the line away."""
+        if self._terminal:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.2g} s" if seconds < 9.5 else f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a time in seconds")
+    return value
+
+
+def _bytes(text: str) -> int:
+    found = re.fullmatch(r"([0-9.]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    value = 0.0
+    if found is not None and found[1].count(".") < 2 and found[1] != ".":
+        value = float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
+    return int(value)

@@ -1,0 +1,54 @@
+"""``qhm demo``: a curved surface of the package's own onto a letter."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.ui.cli.arguments import Commands
+
+LETTER = "R"
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "demo",
+        help="make a surface and a letter, map the one onto the other, draw it",
+        description="Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.",
+        epilog="Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map "
+        "was written, but not what should be told about it.",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Make, map, write, judge, draw, report."""
+    from quasiharmonic import io, targets
+    from quasiharmonic.apps.atlas.mapped import each_island
+    from quasiharmonic.geometry import surfaces
+    from quasiharmonic.geometry.mesh.seams import SeamedMesh
+    from quasiharmonic.geometry.mesh.topology import boundary_loops
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.ui.cli import verdict as judging
+    from quasiharmonic.ui.cli.commands import map
+
+    folder: Path = options.output
+    with io.new_folder(folder):
+        V, F = surfaces.cat()
+        (loop,) = boundary_loops(F, len(V))
+        problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
+        mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
+        judged = judging.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
+    with report.after_writing(folder / "demo.obj"):
+        map.draw(folder / "demo.png", judged, [problem], mapped)
+        facts = {**mapped.to_dict(), **judged.to_dict(), **report.sizes(problem.domain)}
+        report.emit(facts, str(folder / "demo.json"), report.of_maps(mapped, judged, folder / "demo.obj"))
+        print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
+    return 0 if judged.injective else 1

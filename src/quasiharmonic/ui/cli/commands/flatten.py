@@ -1,0 +1,189 @@
+"""``qhm flatten``: a mesh file → a bijective map of it, its boundary where distortion is least."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from quasiharmonic.apps.atlas import MappedAtlas
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+# Pieces are so many allowances apart: more than two, or these would touch.
+_ROOM = 2.1
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments, material, seams
+
+    parser = commands.add_parser(
+        "flatten",
+        help="lay a surface flat, its boundary free, without overlap",
+        description="Map a surface with a boundary into the plane, its boundary going where distortion is least. No "
+        "triangle is inverted, and nothing overlaps.",
+        epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
+        "written; 3 written, but not what should be told about it. Ctrl-C writes the best map so far.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
+    parser.add_argument(
+        "--energy",
+        choices=arguments.FLATTENED,
+        default="symmetric-dirichlet",
+        help="what is lowered; mips is for angles alone, distances for those between vertices some edges apart "
+        "(default: symmetric-dirichlet)",
+    )
+    arguments.add_rings(parser)
+    parser.add_argument(
+        "--weights", type=Path, metavar="FILE", help="how much each triangle counts, a positive number on each line"
+    )
+    parser.add_argument(
+        "--start", action="store_true", help="begin with the map in the input's texture coordinates (vt)"
+    )
+    parser.add_argument(
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="vertices, 0-based, one a line, that are held where the input's vt have them",
+    )
+    parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
+    seams.add_options(parser)
+    seams.add_packing(parser)
+    parser.add_argument(
+        "--pattern", type=Path, metavar="FILE", help="draw the outline true to scale too, as .svg or .dxf"
+    )
+    parser.add_argument("--unit", choices=("mm", "cm", "m", "in"), help="of the surface, for --pattern (default: mm)")
+    parser.add_argument(
+        "--allowance", type=float, default=0.0, metavar="WIDTH", help="cut so far outside of the outline, in that unit"
+    )
+    parser.add_argument(
+        "--max-iterations",
+        type=arguments.steps,
+        default=500,
+        metavar="N",
+        help="steps on each connected surface; 0 leaves the start as it is (default: 500)",
+    )
+    arguments.add_linear_solver(parser)
+    material.add_options(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, flatten, write, read back, judge, report."""
+    from quasiharmonic import io
+    from quasiharmonic.apps import atlas
+    from quasiharmonic.apps.flattening.patterns import write_pattern
+    from quasiharmonic.energies.measures import distortion
+    from quasiharmonic.ui.cli import arguments, material, progress, report, seams
+    from quasiharmonic.ui.cli import verdict as judging
+
+    began = time.perf_counter()
+    seams.check_options(options)
+    seams.check_packing(options)
+    arguments.settle(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
+    arguments.settle(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
+    inputs = (
+        options.input,
+        options.weights,
+        options.fixed,
+        None if options.seams in ("file", "none") else Path(options.seams),
+    )
+    report.check_outputs(options.output, None, options.json, inputs, pattern=options.pattern)
+    _check_pattern(options)
+    if options.pack and (options.unit_square or options.fixed is not None or options.pattern is not None):
+        raise ValueError("--pack decides size and place: leave --unit-square, --fixed and --pattern out")
+    mesh = material.read_mesh(options, options.input)
+    given: dict[str, Any] = {}
+    if options.start or options.fixed is not None:
+        if options.cut or options.seams != "file":
+            raise ValueError("--start and --fixed are of the input's own map, and new seams leave nothing of it")
+        # Says what is missing of that map.
+        io.mapped(mesh)
+    if options.fixed is not None:
+        given["fixed"] = io.read_handles(options.fixed, len(mesh.V))
+    if options.weights is not None:
+        given["weights"] = _weights(options.weights)
+    found = seams.surface(options, mesh, disks_too=True)
+    with report.about(options.input), progress.line() as show:
+        mapped = atlas.flatten(
+            found.mesh,
+            start=options.start,
+            energy=options.energy,
+            unit_square=options.unit_square,
+            rings=options.rings,
+            gap=_ROOM * options.allowance,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+            **given,
+        )
+    judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, mapped.mesh)))
+    with report.after_writing(options.output):
+        flat = io.without_idle(judged.V, judged.F, judged.uv)
+        measured = distortion(*flat, rings=options.rings if options.energy == "distances" else None)
+        facts = {
+            **mapped.to_dict(),
+            **judged.to_dict(),
+            "vertices": len(mesh.V),
+            "triangles": len(mesh.F),
+            **found.facts,
+            "energy": options.energy,
+            # Each island begins anew; of several, none is the energy of all.
+            "mean_energy": _mean_energy(mapped),
+            "distortion": measured.to_dict(),
+            "input": str(options.input),
+            "output": str(options.output),
+            "seconds_in_all": time.perf_counter() - began,
+        }
+        worst = measured.summary("isometric").maximum
+        lines = [report.of_maps(mapped, judged, options.output), *found.notes, f"stretched {worst:.3g} times at worst"]
+        if measured.distances is not None:
+            lines.append(measured.distances.summary())
+        if options.pattern is not None:
+            facts["pattern"] = str(options.pattern)
+            write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)
+            lines.append(f"wrote {options.pattern}, true to scale")
+        lines.append(mapped.status.value)
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0 if judged.apart else 1
+
+
+def _check_pattern(options: argparse.Namespace) -> None:
+    """Refuse before any work what would make no pattern."""
+    from quasiharmonic.apps.flattening.patterns import check_pattern
+
+    if options.pattern is None:
+        if options.allowance:
+            raise ValueError("--allowance is of a pattern: name its file by --pattern")
+        return
+    if options.unit_square:
+        raise ValueError("a pattern is true to scale, and --unit-square is not: leave one of them out")
+    check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
+
+
+def _mean_energy(mapped: MappedAtlas) -> float | None:
+    """Of one island, if there is a map whose energy was lowered; JSON has neither infinity nor NaN."""
+    first = mapped.islands[0].result
+    if len(mapped.islands) > 1 or not (first.certificate.bijective and first.history):
+        return None
+    energy = first.history[-1].energy
+    return energy if isfinite(energy) else None
+
+
+def _weights(path: Path) -> list[float]:
+    """One positive number on each line."""
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.numbers import read_rows
+
+    values = []
+    for line, (value,) in read_rows(path, 1):
+        if not value > 0:
+            raise MeshFileError(path, f"a weight must be positive, not {value:g}", line)
+        values.append(value)
+    return values

@@ -1,0 +1,79 @@
+"""``qhm harmonise``: a map in a file → an injective one of less distortion, by any energy."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.apps.atlas import MappedAtlas, SeamedMesh
+    from quasiharmonic.problem.result import Step
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments, material, seams
+
+    parser = commands.add_parser(
+        "harmonise",
+        help="lower an energy that does not mind inversions, within the injective maps",
+        description="Lower the distortion of the map that the input's texture coordinates (vt) give, by an energy that "
+        "need not mind inversions, and keep it injective or make it so. Where polish has the energy it is faster.",
+        epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips "
+        "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but not what "
+        "should be told about it.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with a map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
+    )
+    parser.add_argument("--energy", choices=arguments.HARMONISED, default="arap", help="(default: arap)")
+    parser.add_argument(
+        "--eta",
+        type=float,
+        nargs="+",
+        metavar="ETA",
+        help="weight of the energy against injectivity, one for each round (default: four rounds, as suits the energy)",
+    )
+    parser.add_argument(
+        "--unscaled",
+        action="store_true",
+        help="compare lengths and areas as they are, not after scaling the map to the surface's area",
+    )
+    parser.add_argument(
+        "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
+    )
+    seams.add_packing(parser)
+    arguments.add_linear_solver(parser)
+    material.add_options(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, harmonise, write, judge, report."""
+    from quasiharmonic.ui.cli.commands import polish
+
+    def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
+        from quasiharmonic.apps import atlas
+
+        return atlas.harmonise(
+            mesh,
+            fixed=fixed,
+            energy=options.energy,
+            eta=options.eta,
+            scaled=not options.unscaled,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+
+    return polish.improve(options, lower)

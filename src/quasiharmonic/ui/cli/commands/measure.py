@@ -1,0 +1,94 @@
+"""``qhm measure``: how much a map distorts, in all and triangle by triangle."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.energies.measures import Distortion
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments
+
+    parser = commands.add_parser(
+        "measure",
+        help="measure a map's distortion, and export it triangle by triangle",
+        description="Measure what the map that the input's texture coordinates (vt) give does to every triangle. "
+        "Means and quantiles are weighted by the surface's area; measures of size are taken after the map has been "
+        "scaled to it.",
+        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but not told.",
+    )
+    parser.add_argument(
+        "input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file with a map, injective or not"
+    )
+    parser.add_argument(
+        "--export", type=Path, metavar="FILE", help="write every measure of every triangle as .csv, .npz or .ply"
+    )
+    parser.add_argument(
+        "--distances",
+        action="store_true",
+        help="measure too how far distances between vertices some edges apart are off, along the surface against in "
+        "the plane",
+    )
+    arguments.add_rings(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, measure, export, report."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.apps.atlas.verdict import mirrored_islands, unmirrored
+    from quasiharmonic.energies.measures import distortion
+    from quasiharmonic.geometry.mesh.seams import SeamedMesh
+    from quasiharmonic.ui.cli import arguments, report
+    from quasiharmonic.util.arrays import named
+
+    arguments.settle(options, "rings", 20, asked=options.distances, belongs="--distances")
+    report.check_json(options.json, inputs=(options.input, options.export))
+    if options.export is not None:
+        report.check_export(options.export, inputs=(options.input,))
+    mesh = io.read_mesh(options.input)
+    V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
+    opened = SeamedMesh(V, F, F, uv)
+    mirrored = np.flatnonzero(mirrored_islands(opened))
+    if mirrored.size:
+        reflected = unmirrored(opened).uv
+        uv = uv if reflected is None else reflected
+    with report.about(options.input):
+        found = distortion(V, F, uv, rings=options.rings if options.distances else None)
+    if options.export is not None:
+        # What is coloured by first is what bounds the error of a texture.
+        values = {"isometric": found.isometric, **found.per_triangle()}
+        io.write_per_triangle(options.export, V, F, uv, values)
+    facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
+    lines = [_table(found, len(mesh.F))]
+    if mirrored.size:
+        lines.append(f"mirrored {named('island', 'islands', mirrored)} measured as the other side shows them")
+    if found.distances is not None:
+        lines.append(found.distances.summary())
+    with nullcontext() if options.export is None else report.after_writing(options.export):
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0
+
+
+def _table(found: Distortion, count: int) -> str:
+    """A line for each measure."""
+    lines = [f"{'':20}{'mean':>12}{'median':>12}{'95 %':>12}{'min':>12}{'max':>12}  at"]
+    for name, values in found.per_triangle().items():
+        if (values != values).all():
+            lines.append(f"{name:20}  undefined: no triangle has area")
+            continue
+        s = found.summary(name)
+        numbers = "".join(f"{value:12.4g}" for value in (s.mean, s.median, s.p95, s.minimum, s.maximum))
+        lines.append(f"{name:20}{numbers}  {s.highest}")
+    lines.append(f"{len(found.flipped)} of {count} triangles inverted, {len(found.flat)} without area in the rest mesh")
+    return "\n".join(lines)

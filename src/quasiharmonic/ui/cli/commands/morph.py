@@ -1,0 +1,182 @@
+"""``qhm morph``: a planar mesh whose boundary has moved → a mesh with a valid interior."""
+
+from __future__ import annotations
+
+import argparse
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.apps.mesh_motion.morphed import Morphed
+    from quasiharmonic.io.fem.files import FemMesh
+    from quasiharmonic.ui.cli.arguments import Commands
+    from quasiharmonic.util.arrays import FloatArray
+
+# What quality is of elements with so many nodes.
+_QUALITY = {
+    3: "mean-ratio quality",
+    4: "quality at the worst corner",
+    6: "mean-ratio quality times evenness of the Jacobian",
+}
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments
+
+    parser = commands.add_parser(
+        "morph",
+        help="move the boundary of a planar mesh (Gmsh, VTK) and keep its interior valid",
+        description="Move some nodes of a planar mesh and place the others such that no element is inverted: triangles "
+        "of three or six nodes, quadrilaterals of four. Boundary nodes that are not moved stay; mid-side nodes go "
+        "along with their sides. Positions are changed within the file; every other byte of it stays, data, times and "
+        "physical groups included.",
+        epilog="Exit status: 0 no element of the written mesh is inverted, decided exactly; 1 not so; 2 wrong "
+        "input or call, nothing written; 3 written, but not what should be told about it.",
+    )
+    parser.add_argument(
+        "input", type=Path, metavar="MESH", help="Gmsh .msh (2 or 4), legacy .vtk or .vtu; text or binary"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="MESH", help="mesh to write, in the same format"
+    )
+    given = parser.add_mutually_exclusive_group(required=True)
+    given.add_argument(
+        "--positions", type=Path, metavar="CSV", help="where vertices go: lines 'vertex,x,y', counting from 0"
+    )
+    given.add_argument(
+        "--field",
+        metavar="NAME",
+        help="point data of the mesh that say how far the boundary's vertices go; of several times, the last",
+    )
+    parser.add_argument(
+        "--energy",
+        choices=(*arguments.ENERGIES, "none"),
+        default="symmetric-dirichlet",
+        help="what the placement minimises; none: the first valid mesh (default: symmetric-dirichlet)",
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
+    parser.add_argument(
+        "--slide",
+        action="store_true",
+        help="let boundary vertices that are not moved, or by nothing, glide along the boundary as it is, its corners "
+        "held",
+    )
+    parser.add_argument(
+        "--rest",
+        type=Path,
+        metavar="MESH",
+        help="the mesh against which distortion is measured: of a chain of steps the first one. How far the written "
+        "mesh is from where one step from there would end is told (default: the input)",
+    )
+    arguments.add_linear_solver(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, morph, write, read again, judge, report."""
+    from quasiharmonic.apps.mesh_motion.morphing import morph
+    from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+    from quasiharmonic.geometry.mesh.elements import rim
+    from quasiharmonic.io.fem.files import check_fem_output, read_fem, write_fem
+    from quasiharmonic.ui.cli import progress, report
+
+    report.check_moved(options.output, options.json, inputs=(options.input, options.positions, options.rest))
+    check_fem_output(options.output, options.input)
+    mesh = read_fem(options.input)
+    rest = None if options.rest is None else _rest(options.rest, mesh)
+    if options.field is not None:
+        moved = rim(mesh.F)
+        positions = mesh.points[moved] + mesh.point_field(options.field, moved)
+        if options.slide:
+            goes = (positions != mesh.points[moved]).any(axis=1)
+            moved, positions = moved[goes], positions[goes]
+    else:
+        moved, positions = _positions(options.positions, len(mesh.points))
+    with report.about(options.input), progress.line() as show:
+        morphed = morph(
+            mesh.points,
+            mesh.F,
+            moved,
+            positions,
+            energy=None if options.energy == "none" else options.energy,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+            slide=options.slide,
+            rest=rest,
+        )
+    write_fem(options.output, mesh, morphed.points)
+    with report.after_writing(options.output):
+        # What a reader gets is judged: a format may hold fewer digits.
+        inverted = inverted_elements(morphed.F, read_fem(options.output).points)
+        drift = None if rest is None else morphed.drift()
+        facts = {
+            **morphed.to_dict(),
+            "injective": not inverted.size,
+            "flipped": inverted.tolist(),
+            "drift": drift if drift is None or isfinite(drift) else None,
+            "input": str(options.input),
+            "output": str(options.output),
+            "moved": len(moved),
+        }
+        report.emit(facts, options.json, _sentences(morphed, len(inverted), drift, options.output))
+    return 0 if not inverted.size else 1
+
+
+def _rest(path: Path, mesh: FemMesh) -> FloatArray:
+    """Places of the same nodes in another file."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.fem.files import read_fem
+
+    first = read_fem(path)
+    if first.points.shape != mesh.points.shape or not np.array_equal(first.F, mesh.F):
+        raise MeshFileError(path, f"is not the mesh of {mesh.source}: the same nodes and elements in order are needed")
+    return first.points
+
+
+def _sentences(morphed: Morphed, inverted: int, drift: float | None, output: Path) -> str:
+    before, after = morphed.quality_before, morphed.quality_after
+    what = "triangle" if morphed.F.shape[1] != 4 else "quadrilateral"
+    verdict = f"{inverted} of {len(after)} {what}s are not positive" if inverted else f"every {what} is positive"
+    lines = [f"wrote {output}: {verdict}"]
+    if inverted:
+        lines.append(morphed.result.status.value if morphed.valid else morphed.summary())
+    elif not morphed.result.certificate.bijective:
+        lines.append(f"but the mesh overlaps itself. {morphed.result.certificate.summary()}")
+    for name, quality in (("before", before), ("after", after)):
+        worst = f"worst {quality.min():.3g} ({what} {int(quality.argmin())})"
+        lines.append(f"{_QUALITY[morphed.F.shape[1]]} {name}: {worst}, mean {quality.mean():.3g}")
+    if drift is not None:
+        lines.append(
+            f"no node is further than {drift:.3g} from where one step from the mesh at rest puts it"
+            if isfinite(drift)
+            else "one step from the mesh at rest finds no valid mesh: how far this one has drifted is not known"
+        )
+    return "\n".join(lines)
+
+
+def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Read lines of a vertex and its place."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.numbers import read_rows
+
+    places: dict[int, list[float]] = {}
+    for line, (vertex, *place) in read_rows(path, 3):
+        if not (0 <= vertex < n and vertex.is_integer()):
+            raise MeshFileError(path, f"{vertex:g} is not a vertex from 0 to {n - 1}", line, "lines are 'vertex,x,y'")
+        if int(vertex) in places:
+            raise MeshFileError(path, f"names vertex {int(vertex)} a second time", line)
+        places[int(vertex)] = place
+    if not places:
+        raise MeshFileError(path, "moves no vertex")
+    return np.array(list(places), dtype=np.int64), np.array(list(places.values()))

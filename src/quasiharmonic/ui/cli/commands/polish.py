@@ -1,0 +1,146 @@
+"""``qhm polish``: an injective map in a file → one of less distortion."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from typing import Any, TypeAlias
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.apps.atlas import MappedAtlas, SeamedMesh
+    from quasiharmonic.energies.measures import Distortion
+    from quasiharmonic.problem.result import Step
+    from quasiharmonic.ui.cli.arguments import Commands
+
+    Lower: TypeAlias = Callable[[SeamedMesh, NDArray[np.int64] | None, Callable[[Step], None] | None], MappedAtlas]
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments, material, seams, sliding
+
+    parser = commands.add_parser(
+        "polish",
+        help="lower the distortion of an injective map, which stays injective",
+        description="Lower the distortion of the injective map that the input's texture coordinates (vt) give.",
+        epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
+        "that is not injective included), nothing written; 3 written, but not what should be told about it.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with an injective map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
+    )
+    parser.add_argument(
+        "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"
+    )
+    parser.add_argument("--max-iterations", type=arguments.count, default=200, metavar="N", help="(default: 200)")
+    parser.add_argument(
+        "--free",
+        action="store_true",
+        help="let the boundary go where distortion is least, each island staying about where it is",
+    )
+    sliding.add_options(parser)
+    parser.add_argument(
+        "--to",
+        metavar="OUTLINE",
+        help="the outline that the boundary is on, as qhm map names it (default: the polygon that the boundary is)",
+    )
+    seams.add_packing(parser)
+    arguments.add_linear_solver(parser)
+    material.add_options(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, polish, write, judge, report."""
+    from quasiharmonic.ui.cli import sliding
+
+    if options.to is not None and not options.slide:
+        raise ValueError("--to names the outline to slide along: add --slide")
+    if options.free and (options.slide or options.fixed is not None):
+        raise ValueError("with --free nothing holds the boundary: leave --slide and --fixed out")
+    sliding.check_options(options)
+
+    notes: list[str] = []
+
+    def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
+        from quasiharmonic.apps import atlas
+
+        given: dict[str, Any] = {
+            "energy": options.energy,
+            "max_iterations": options.max_iterations,
+            "linear_solver": options.linear_solver,
+            "callback": show,
+        }
+        if options.free:
+            return atlas.polish(mesh, free=True, **given)
+        if options.to is not None and len(mesh.islands) > 1:
+            raise ValueError(f"--slide --to is for one island on the outline, and there are {len(mesh.islands)}")
+        if options.to is None:
+            return atlas.polish(mesh, fixed=fixed, slide=options.slide, **given)
+        rails = sliding.along(options.to, pieces=options.pieces)
+        notes.extend(sliding.told_off(rails, mesh.islands[0]))
+        return atlas.polish(mesh, fixed=fixed, slide=rails, **given)
+
+    return improve(options, lower, inputs=(options.pieces,), notes=notes)
+
+
+def improve(
+    options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = (), notes: Sequence[str] = ()
+) -> int:
+    """Read a map, lower its distortion, write, judge, report; for every command that does so.
+
+    What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``. What
+    ``notes`` say by the time the map is there is told with it.
+    """
+    from quasiharmonic import io
+    from quasiharmonic.apps.atlas.verdict import unmirrored
+    from quasiharmonic.energies.measures import distortion
+    from quasiharmonic.ui.cli import material, progress, report, seams
+    from quasiharmonic.ui.cli import verdict as judging
+
+    seams.check_packing(options)
+    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
+    mesh = material.read_mesh(options, options.input)
+    before = io.mapped(mesh)
+    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
+    with report.about(options.input), progress.line() as show:
+        after = lower(before, fixed, show)
+    judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, after.mesh)))
+    with report.after_writing(options.output):
+        # Each with the vertices that its own seams give it, which may lie in different places.
+        opened = unmirrored(before).opened(), unmirrored(after.mesh).opened()
+        measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
+        facts = {
+            **after.to_dict(),
+            **judged.to_dict(),
+            "vertices": len(mesh.V),
+            "triangles": len(mesh.F),
+            "input": str(options.input),
+            "output": str(options.output),
+            "distortion_before": measured[0].to_dict(),
+            "distortion": measured[1].to_dict(),
+        }
+        lines = [report.of_maps(after, judged, options.output)]
+        if judged.injective:
+            lines += [*notes, _change(*measured), *([] if judged.mirrored else [after.status.value])]
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0 if judged.injective else 1
+
+
+def _change(before: Distortion, after: Distortion) -> str:
+    """What was won, or paid, in angles and in lengths."""
+    angles = [found.summary("mips").mean for found in (before, after)]
+    lengths = [found.summary("isometric").maximum for found in (before, after)]
+    return (
+        f"MIPS from {angles[0]:.3g} to {angles[1]:.3g} on average, "
+        f"isometric distortion from {lengths[0]:.3g} to {lengths[1]:.3g} at worst"
+    )

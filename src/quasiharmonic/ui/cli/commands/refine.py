@@ -1,0 +1,117 @@
+"""``qhm refine``: a problem without a map → one that leaves room for it, on a mesh with a few edges split."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.io import MeshData
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.solver.refine.refining import RefinedProblem
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments
+
+    parser = commands.add_parser(
+        "refine",
+        help="split the edges that stand in the way of a map",
+        description="Split the edges that qhm diagnose names, and no others, until it names none. Beside the mesh "
+        "with its first guess (vt), which qhm map then takes, the fixed vertices are written to OUTPUT.handles, and "
+        "how the new mesh came from the old one to OUTPUT.origin.json (OUTPUT without its suffix).",
+        epilog="Exit status: 0 written, and nothing known forbids an injective map any more; 1 written, but something "
+        "does that no refinement cures; 2 wrong input or call, nothing written; 3 written, but not what should be told "
+        "about it.",
+    )
+    parser.add_argument(
+        "input", type=Path, metavar="INPUT", help="OBJ file, or a folder with input.obj and handles.txt"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")
+    parser.add_argument(
+        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+    )
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, split, write, report."""
+    from quasiharmonic import io
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.solver.refine.refining import refine_problem
+    from quasiharmonic.ui.cli import report
+
+    output: Path = options.output
+    if output.suffix.lower() != ".obj":
+        raise ValueError(f"{output}: a mesh with a first guess of its map is written as .obj")
+    handles, origin = output.with_suffix(".handles"), output.with_suffix(".origin.json")
+    mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
+    outputs = {"-o": output, "the list of handles": handles, "the origin": origin}
+    report.check_new(outputs, options.json, inputs=(mesh_path, fixed_path))
+    mesh = io.read_mesh(mesh_path)
+    fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
+    with report.about(mesh_path):
+        problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
+        result = refine_problem(problem)
+    with io.no_remains(output, handles, origin):
+        write(output, handles, origin, mesh, problem, result)
+    with report.after_writing(output):
+        split = len(result.refined.parents)
+        facts = {
+            "split": split,
+            "rounds": result.rounds,
+            "diagnosis": result.diagnosis.to_dict(),
+            **report.sizes(result.problem.domain),
+            "input": str(options.input),
+            "output": str(output),
+            "handles": str(handles),
+            "origin": str(origin),
+        }
+        lines = [f"wrote {output}, {handles.name} and {origin.name}: {split} edge{'' if split == 1 else 's'} split"]
+        lines.append(result.diagnosis.summary())
+        if not result.diagnosis.forbids_injective:
+            lines.append(f"Next: qhm map {output} --fixed {handles} -o …")
+        report.emit(facts, options.json, "\n".join(lines))
+    return 1 if result.diagnosis.forbids_injective else 0
+
+
+def write(output: Path, handles: Path, origin: Path, mesh: MeshData, problem: Problem, result: RefinedProblem) -> None:
+    """Write the three files, the mesh last: when it is there, all are."""
+    import json
+
+    from quasiharmonic import io
+
+    refined = result.refined
+    new, parent = io.refined_mesh(mesh, refined, first_guess(mesh, problem))
+    shares = [[share for share in row if share] for row in refined.weights.tolist()]
+    made = zip(refined.parents.tolist(), shares, strict=True)
+    facts = {
+        "old_vertices": problem.n,
+        "old_triangles": len(problem.F),
+        "new_vertices": [
+            {"vertex": problem.n + k, "between": between[: len(weights)], "weights": weights}
+            for k, (between, weights) in enumerate(made)
+        ],
+        "parent_of_triangle": parent.tolist(),
+    }
+    io.write_whole(origin, json.dumps(facts).encode() + b"\n")
+    io.write_whole(handles, "".join(f"{vertex}\n" for vertex in problem.fixed.tolist()).encode())
+    io.write_obj(output, new)
+
+
+def first_guess(mesh: MeshData, problem: Problem) -> NDArray[np.float64]:
+    """The places of all vertices in the file; where there are none, the middle of the target."""
+    import numpy as np
+
+    from quasiharmonic import io
+
+    uv, _ = io.vertex_places(mesh)
+    middle = problem.target.min(axis=0) / 2 + problem.target.max(axis=0) / 2
+    return np.where(np.isnan(uv), middle, uv)

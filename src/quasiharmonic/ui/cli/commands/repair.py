@@ -1,0 +1,98 @@
+"""``qhm repair``: a UV file with inverted triangles → the same file without, its boundary kept."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.ui.cli import arguments, material
+
+    parser = commands.add_parser(
+        "repair",
+        help="right the inverted triangles of a UV map, its boundary kept",
+        description="Right the inverted triangles of the map that the input's texture coordinates (vt) give. The map "
+        "may have seams; each of its islands is repaired on its own. Boundaries stay, and so does every vertex that "
+        "need not move.",
+        epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
+        "or call, nothing written; 3 written, but not what should be told about it.",
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with texture coordinates")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB or glTF file to write")
+    parser.add_argument(
+        "--all",
+        dest="whole",
+        action="store_true",
+        help="map islands that have inverted triangles anew as a whole (default: only patches around them)",
+    )
+    parser.add_argument(
+        "--unmirror",
+        action="store_true",
+        help="turn over islands that are mirrored, each in its place (default: left, as some are on purpose)",
+    )
+    parser.add_argument(
+        "--max-iterations",
+        type=arguments.count,
+        default=2000,
+        metavar="N",
+        help="on an island as a whole (default: 2000)",
+    )
+    arguments.add_linear_solver(parser)
+    material.add_options(parser)
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, repair, write, judge, report."""
+    from dataclasses import replace
+
+    from quasiharmonic import io
+    from quasiharmonic.apps.atlas.verdict import certify
+    from quasiharmonic.apps.repair.repairing import repair
+    from quasiharmonic.geometry.mesh.seams import SeamedMesh
+    from quasiharmonic.ui.cli import material, progress, report
+    from quasiharmonic.ui.cli import verdict as judging
+
+    if options.output.suffix.lower() == ".off":
+        raise ValueError(f"{options.output}: OFF has no room for seams: write .obj, .ply or .glb")
+    report.check_outputs(options.output, None, options.json, inputs=(options.input,))
+    mesh = material.read_mesh(options, options.input)
+    if mesh.vt is None or mesh.FT is None or (mesh.FT < 0).any(axis=1).all():
+        raise ValueError(
+            f"{options.input}: there is no map to repair: no face has texture coordinates (vt) at all three corners"
+        )
+    with report.about(options.input), progress.line() as show:
+        result = repair(
+            mesh.V,
+            mesh.F,
+            mesh.vt,
+            FT=mesh.FT,
+            whole=options.whole,
+            unmirror=options.unmirror,
+            max_iterations=options.max_iterations,
+            linear_solver=options.linear_solver,
+            callback=show,
+        )
+    repaired = replace(mesh, vt=result.uv, FT=result.FT)
+    judging.tell_losses(options.output, repaired)
+    io.write_mapped(options.output, repaired)
+    written = io.read_mesh(options.output)
+    with report.after_writing(options.output):
+        verdict = certify(SeamedMesh(written.V, written.F, written.FT, written.vt))
+        facts = {
+            **result.to_dict(),
+            "injective": verdict.injective,
+            "input": str(options.input),
+            "output": str(options.output),
+            "vertices": len(mesh.V),
+            "triangles": len(mesh.F),
+        }
+        report.emit(facts, options.json, f"wrote {options.output}: {result.summary()}")
+    return 0 if verdict.injective else 1

@@ -1,0 +1,67 @@
+"""``qhm studio``: a page with a surface and its map, to be taken hold of."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "studio",
+        help="take hold of a map in the browser",
+        description="Open a page with a surface beside its map: drag corners, pins and the boundary, and the map "
+        "follows, each picture of it certified. Needs the extra 'studio'. Only this machine can open the page, by the "
+        "address that is printed. Ctrl-C ends it.",
+        epilog="Exit status: 0 ended by Ctrl-C; 2 wrong input or call.",
+    )
+    parser.add_argument(
+        "input",
+        type=Path,
+        nargs="?",
+        metavar="INPUT",
+        help="OBJ, OFF, PLY, GLB, glTF or STL file, or a folder with input.obj and handles.txt (default: a surface of "
+        "ours)",
+    )
+    parser.add_argument("--port", type=int, default=0, metavar="N", help="listen there (default: any that is free)")
+    parser.add_argument("--no-browser", action="store_true", help="print the address and leave the browser alone")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    import asyncio
+    import signal
+    import webbrowser
+    from contextlib import suppress
+
+    try:
+        from quasiharmonic.ui.studio.server import Studio
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] != "websockets":
+            raise
+        raise ImportError("the page needs the package websockets: pip install 'quasiharmonic[studio]'") from error
+
+    source = ""
+    if options.input is not None:
+        from quasiharmonic.ui.studio.surface import read_sheet
+
+        # What is wrong with it is said here rather than on the page.
+        read_sheet(options.input)
+        source = str(options.input.resolve())
+
+    def ready(address: str) -> None:
+        print(address, flush=True)
+        if not options.no_browser:
+            webbrowser.open(address)
+
+    # With Python's own handler asyncio takes Ctrl-C as a wish to end, and not as an error wherever it happens to be.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with suppress(KeyboardInterrupt):
+        asyncio.run(Studio(source).run(options.port, ready))
+    return 0

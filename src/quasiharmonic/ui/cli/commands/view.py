@@ -1,0 +1,40 @@
+"""``qhm view``: a window on a surface and its map."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from quasiharmonic.ui.cli.arguments import Commands
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "view",
+        help="look at a surface and its map in a window",
+        description="Open a window on a surface and the map that its texture coordinates (vt) give, with a "
+        "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
+        epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
+    )
+    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB or glTF file with a map")
+    parser.add_argument(
+        "--screenshot", type=Path, metavar="PNG", help="write what the window would show instead; needs no display"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, show."""
+    from quasiharmonic import io
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.ui.plot.interactive import show
+
+    if options.screenshot is not None:
+        report.check_picture("--screenshot", options.screenshot, inputs=(options.input,), endings=(".png",))
+    V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
+    with report.about(options.input):
+        show(V, F, uv, screenshot=options.screenshot)
+    return 0

@@ -1,0 +1,193 @@
+"""What a command says at its end: a few sentences, or JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quasiharmonic.ui.cli.streams import tell
+
+if TYPE_CHECKING:
+    from quasiharmonic.apps.atlas.mapped import MappedAtlas
+    from quasiharmonic.problem import Domain
+    from quasiharmonic.ui.cli.verdict import Judged
+
+
+def sizes(domain: Domain) -> dict[str, Any]:
+    """How large a mesh is, and how much of it is held."""
+    return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
+
+
+def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
+    """Sentences about a map that was searched for and written, island by island."""
+    from quasiharmonic.problem.result import Status
+    from quasiharmonic.util.arrays import counted
+
+    lines = [f"wrote {output}: {judged.summary()}"]
+    results = [island.result for island in mapped.islands]
+    if not judged.injective:
+        lines.append(mapped.status.value)
+    # Surfaces may each be injective where pins forbid that they keep apart.
+    if not judged.injective or mapped.status is Status.IMPOSSIBLE:
+        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
+    iterations = sum(result.iterations for result in results)
+    seconds = sum(result.seconds for result in results)
+    lines.append(f"{counted('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
+    return "\n".join(lines)
+
+
+def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
+    """Print the sentences, write the JSON; with ``--json -`` standard output holds the JSON alone."""
+    if destination == "-":
+        if sys.stdout is None:
+            raise OSError("standard output is closed")
+        print(json.dumps(facts, allow_nan=False), flush=True)
+        tell(text)
+        return
+    if destination is not None:
+        from quasiharmonic.io import write_whole
+
+        write_whole(destination, json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
+    print(text, flush=True)
+
+
+def check_outputs(
+    map_path: Path,
+    plot: Path | None,
+    json_path: str | None,
+    inputs: Sequence[Path | None],
+    *,
+    pattern: Path | None = None,
+) -> None:
+    """Say before any work that something could not be written, or would be written over something else.
+
+    Raises
+    ------
+    ValueError, OSError
+        When a path cannot be written, two outputs are the same file, or a picture or a report would replace
+        an input. (The map may: reading is done by then.)
+    """
+    from quasiharmonic import io
+
+    io.check_output(map_path)
+    if plot is not None:
+        check_picture("--plot", plot, inputs)
+    taken = {map_path.resolve(): "the map (-o)"}
+    told = None if json_path in (None, "-") else Path(str(json_path))
+    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", told)):
+        if path is None:
+            continue
+        _check_replaces_nothing(option, path, inputs)
+        if path.resolve() in taken:
+            raise ValueError(f"{option} {path} is also the file of {taken[path.resolve()]}")
+        taken[path.resolve()] = option
+
+
+def check_json(json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for a command that writes a report alone."""
+    if json_path not in (None, "-"):
+        _check_replaces_nothing("--json", Path(str(json_path)), inputs)
+
+
+def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for a mesh in a format whose suffix its own library judges."""
+    _check_replaces_nothing("-o", output, inputs)
+    check_json(json_path, (*inputs, output))
+
+
+def check_new(outputs: Mapping[str, Path], json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for files none of which may replace an input; what each is, and where."""
+    taken: list[Path] = []
+    for what, path in {**outputs, **({} if json_path in (None, "-") else {"--json": Path(str(json_path))})}.items():
+        _check_replaces_nothing(what, path, inputs)
+        if any(_same(path, other) for other in taken):
+            raise ValueError(f"{what} {path} is also another output")
+        taken.append(path)
+
+
+def check_picture(
+    option: str, path: Path, inputs: Sequence[Path | None], endings: Sequence[str] = (".png", ".svg", ".pdf")
+) -> None:
+    """`check_outputs` for a picture."""
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{option} {path}: pictures are written as {', '.join(endings)}")
+    _check_replaces_nothing(option, path, inputs)
+
+
+def check_export(path: Path, inputs: Sequence[Path | None]) -> None:
+    """`check_outputs` for values per triangle."""
+    from quasiharmonic import io
+
+    if path.suffix.lower() not in io.PER_TRIANGLE_FORMATS:
+        raise ValueError(f"--export {path}: values per triangle are written as {', '.join(io.PER_TRIANGLE_FORMATS)}")
+    _check_replaces_nothing("--export", path, inputs)
+
+
+def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
+    from quasiharmonic import io
+
+    io.check_writable(path)
+    if any(_same(path, source) for source in inputs if source is not None):
+        raise ValueError(f"{option} {path} would replace an input file")
+
+
+def _same(path: Path, other: Path) -> bool:
+    """Whether two paths lead to one file, be it by links, symbolic or hard."""
+    return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
+
+
+_COUNTING = "(counting from 0)"
+# What a message that names elements by their numbers has in it.
+_NUMBERED = re.compile(
+    r"\b(vertex|vertices|nodes?|triangles?|quadrilaterals?|edges?|corners?|loops?|islands?|rows?|between) [-(]?\d"
+)
+
+
+@contextmanager
+def about(source: Path | str) -> Iterator[None]:
+    """Tell of which file a message about a mesh speaks, and how it counts where it names elements by numbers.
+
+    Messages about files say themselves of which they speak.
+    """
+    from quasiharmonic.io.errors import MeshFileError
+
+    try:
+        yield
+    except MeshFileError:
+        raise
+    except ValueError as error:
+        if str(error).endswith(_COUNTING):
+            # Said already, of something more particular.
+            raise
+        counting = f" {_COUNTING}" if _NUMBERED.search(str(error)) else ""
+        raise ValueError(f"{source}: {error}{counting}") from error
+
+
+def in_words(error: Exception) -> str:
+    """The message of an error, an error of the system without its number."""
+    from quasiharmonic.io.errors import printable
+
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    named = isinstance(error.filename, str | bytes)
+    return f"{printable(error.filename)}: {error.strerror}" if named else error.strerror
+
+
+class ReportError(Exception):
+    """The map is written, but what should be told about it could not be."""
+
+
+@contextmanager
+def after_writing(output: Path) -> Iterator[None]:
+    """Keep what goes wrong from here on from claiming that nothing was written."""
+    try:
+        yield
+    except (ValueError, OSError, ArithmeticError, ImportError) as error:
+        raise ReportError(f"{output} is written, but the report failed: {in_words(error)}") from error
+    except KeyboardInterrupt:
+        raise ReportError(f"{output} is written; interrupted before the report") from None

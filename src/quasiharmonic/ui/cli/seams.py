@@ -1,0 +1,154 @@
+"""Options that say where the seams of a surface are, and the surface with them."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.geometry.mesh.seams import SeamedMesh
+    from quasiharmonic.io import MeshData
+
+
+@dataclass
+class Seamed:
+    """The surface of a file with its seams.
+
+    Attributes
+    ----------
+    mesh : SeamedMesh
+    facts : dict
+        What was done, for the report.
+    notes : list of str
+        The same in sentences.
+    """
+
+    mesh: SeamedMesh
+    facts: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def add_options(parser: argparse._ActionsContainer) -> None:
+    """``--cut`` and ``--seams``."""
+    parser.add_argument(
+        "--cut",
+        action="store_true",
+        help="cut what does not lie flat, along seams: vertices and faces stay as they are",
+    )
+    parser.add_argument(
+        "--seams",
+        metavar="WHICH",
+        default="file",
+        help="where seams are: file, where the input's vt have them (default); none; or a file of edges, two vertices, "
+        "0-based, on each line",
+    )
+
+
+def add_packing(parser: argparse._ActionsContainer) -> None:
+    """``--pack`` and ``--margin``."""
+    parser.add_argument(
+        "--pack", action="store_true", help="lay the islands into the unit square, all at one texel density"
+    )
+    parser.add_argument(
+        "--margin",
+        type=float,
+        metavar="SHARE",
+        help="for --pack: least room between islands, as a share of the square's side (default: 1/256)",
+    )
+
+
+def laid_out(options: argparse.Namespace, mesh: SeamedMesh) -> SeamedMesh:
+    """The map packed, if that is asked for."""
+    from quasiharmonic.apps import atlas
+
+    return atlas.pack(mesh, margin=options.margin) if options.pack else mesh
+
+
+def check_packing(options: argparse.Namespace) -> None:
+    """Raise a ValueError for a margin of what is not packed."""
+    from quasiharmonic.ui.cli import arguments
+
+    arguments.settle(options, "margin", 1 / 256, asked=options.pack, belongs="--pack")
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Raise a ValueError for a file of edges that is not there."""
+    if options.seams not in ("file", "none") and not Path(options.seams).is_file():
+        raise ValueError(f"--seams {options.seams}: neither 'file' nor 'none', and no file of that name")
+
+
+def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> Seamed:
+    """The surface of a file with the seams that the options ask for.
+
+    Raises
+    ------
+    ValueError, OSError
+        When some faces have places and others none, although there are seams; when a line of the list of edges is
+        wrong; as `find_cuts`.
+    """
+    from quasiharmonic import io
+    from quasiharmonic.geometry.mesh.seams import SeamedMesh
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.util.arrays import counted
+
+    with report.about(mesh.source):
+        if options.seams == "file":
+            if mesh.FT is not None and getattr(options, "to", "") is not None:
+                # Only where the map says where boundaries go, part of it may do.
+                io.check_mapped(mesh)
+            found = Seamed(io.seamed(mesh))
+        elif options.seams == "none":
+            found = Seamed(SeamedMesh(mesh.V, mesh.F))
+        else:
+            from quasiharmonic.apps.atlas.seaming import cut_along
+
+            edges = read_edges(Path(options.seams), len(mesh.V))
+            found = Seamed(cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
+        if options.cut:
+            # What finds cuts takes longer to import than all that a small mesh needs.
+            from quasiharmonic.apps.atlas.seaming import cut_apart
+
+            before = found.mesh
+            found.mesh = cut_apart(
+                before, polygons=mesh.polygons, disks_too=disks_too, reach=disks_too or options.refine
+            )
+            found.facts["cut_edges"] = cut = len(found.mesh.seams) - len(before.seams)
+            found.notes.append(
+                f"cut along {counted('edge', 'edges', cut)}: seams of the map, the model's vertices and faces stay"
+                if cut
+                else "nothing to cut: it lies flat as it is"
+            )
+    islands = len(found.mesh.islands)
+    if islands > 1:
+        found.facts["island_count"] = islands
+        found.notes.append(f"{islands} islands, each mapped on its own (--seams none takes the surface whole)")
+    return found
+
+
+def read_edges(path: Path, n: int) -> NDArray[np.int64]:
+    """Read edges, two vertices of ``n`` on each line; blanks, commas or colons between, ``#`` before comments."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.textual import integer
+
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+        words = line.partition("#")[0].replace(",", " ").replace(":", " ").split()
+        if not words:
+            continue
+        if len(words) != 2 or not all(word.isascii() and word.isdigit() for word in words):
+            raise MeshFileError(path, f"is not an edge, two whole numbers from 0 on: {line[:60]!r}", number)
+        try:
+            ends = [integer(word.encode()) for word in words]
+        except ValueError as error:
+            raise MeshFileError(path, str(error), number, "indices count from 0") from None
+        if max(ends) >= n:
+            raise MeshFileError(path, f"vertex {max(ends)} of a mesh with {n}", number, "indices count from 0")
+        rows.append(ends)
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)

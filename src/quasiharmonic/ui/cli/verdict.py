@@ -1,0 +1,131 @@
+"""A file as a reader gets it: written, read back, judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.apps.atlas.verdict import AtlasVerdict
+    from quasiharmonic.geometry.exact.certificate import Certificate
+    from quasiharmonic.io import MeshData
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What a file's map is, exactly.
+
+    Attributes
+    ----------
+    V : (m, 3) float64
+    F : (f, 3) int64
+    uv : (m, 2) float64
+        The mesh and its map, with a vertex for each of a vertex's places.
+    certificate : Certificate
+        Of all of it as it lies in the plane.
+    verdict : AtlasVerdict or None
+        Island by island; None of a single one, of which the certificate says it all.
+    faces : int
+        How many faces the file has.
+    """
+
+    V: NDArray[np.float64]
+    F: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    certificate: Certificate
+    verdict: AtlasVerdict | None
+    faces: int
+
+    @property
+    def injective(self) -> bool:
+        """Whether every island is injective, or mirrored and injective."""
+        return self.certificate.injective if self.verdict is None else self.verdict.injective
+
+    @property
+    def bijective(self) -> bool:
+        """Whether every island is bijective."""
+        return bool(self.certificate.bijective) if self.verdict is None else self.verdict.bijective
+
+    @property
+    def apart(self) -> bool:
+        """Whether every island is bijective, and none lies on another."""
+        return self.bijective and (self.verdict is None or not len(self.verdict.overlapping))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether an island is mirrored."""
+        return self.verdict is not None and bool(self.verdict.mirrored.size)
+
+    @property
+    def inverted(self) -> NDArray[np.int64]:
+        """Triangles that are not as their island is wound."""
+        import numpy as np
+
+        if self.verdict is not None:
+            return self.verdict.flipped
+        return np.concatenate([self.certificate.flipped, self.certificate.degenerate])
+
+    def summary(self) -> str:
+        """Say what is certified, and of what."""
+        said = self.certificate.summary() if self.verdict is None else self.verdict.summary()
+        if self.faces < len(self.F):
+            said += f"\nThe verdict is on the {len(self.F)} triangles that stand for its {self.faces} faces."
+        return said
+
+    def to_dict(self) -> dict[str, Any]:
+        """The verdict in the report's first keys."""
+        apart = {} if self.verdict is None else {k: self.verdict.to_dict()[k] for k in ("islands", "overlapping")}
+        return {
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "flipped": self.certificate.flipped.tolist(),
+            "degenerate": self.certificate.degenerate.tolist(),
+            "faces": self.faces,
+            "certificate": self.certificate.to_dict(),
+            **({"verdict": apart} if apart else {}),
+        }
+
+
+def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
+    """Judge the map that a file holds, as a reader in some precision sees it."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.apps.atlas.verdict import certify as certify_islands
+    from quasiharmonic.geometry.exact.certificate import certify
+    from quasiharmonic.geometry.mesh.seams import SeamedMesh
+    from quasiharmonic.geometry.mesh.topology import components
+
+    V, F, uv = io.cut_at_seams(mesh)
+    if precision == "float32":
+        with np.errstate(over="ignore"):
+            uv = uv.astype(np.float32).astype(np.float64)
+    # The parts of what has been opened at its seams are its islands.
+    part = components(F, len(V))[F[:, 0]]
+    alone = bool((part == part[:1]).all())
+    verdict = None if alone else certify_islands(SeamedMesh(V, F, F, uv))
+    return Judged(V, F, uv, certify(F, uv), verdict, mesh.faces)
+
+
+def tell_losses(output: Path, mesh: MeshData) -> None:
+    """Say, before it is written, what a file will not have of a mesh."""
+    from quasiharmonic import io
+    from quasiharmonic.ui.cli.streams import tell
+
+    if lost := io.not_held(output, mesh):
+        tell(f"{output} will not have: {'; '.join(lost)}")
+
+
+def write(output: Path, mesh: MeshData) -> Judged:
+    """Write a mesh with its map, and judge the file as a reader gets it."""
+    from quasiharmonic import io
+    from quasiharmonic.ui.cli import report
+
+    tell_losses(output, mesh)
+    io.write_mapped(output, mesh)
+    with report.after_writing(output):
+        return judge(io.read_mesh(output))

@@ -1,0 +1,45 @@
+"""``qhm --version``: the version, and what a report of an error should say of what it runs on."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+
+class Version(argparse.Action):
+    """Print what `told` says, and end."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help="show version and surroundings, and exit")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(told())
+        parser.exit()
+
+
+def told() -> str:
+    """Version, Python, system, packages, whether loops are compiled, and linear solvers, a line each."""
+    import os
+    import platform
+    from importlib.metadata import version
+
+    from quasiharmonic import __version__
+    from quasiharmonic.linsolve import available
+    from quasiharmonic.util import kernels
+
+    if kernels.extension is not None:
+        loops = "compiled"
+    elif os.environ.get("QUASIHARMONIC_PURE"):
+        loops = "in NumPy, as QUASIHARMONIC_PURE has it"
+    else:
+        loops = "in NumPy: the extension is not built, or does not load"
+    return "\n".join(
+        [
+            f"qhm {__version__}",
+            f"Python {platform.python_version()}, {platform.system()} {platform.machine()}",
+            ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "matplotlib")),
+            f"loops: {loops}",
+            f"linear solvers: {', '.join(available())}",
+        ]
+    )

@@ -1,0 +1,156 @@
+"""A surface beside its map in a notebook's cell, to be taken hold of; what the hand does, the kernel computes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io import MeshData
+from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import MapResult
+from quasiharmonic.ui.studio.assets import bundle
+from quasiharmonic.ui.studio.protocol import Array, Frame, ProtocolError, decode, encode
+from quasiharmonic.ui.studio.session import Session
+from quasiharmonic.ui.studio.surface import Sheet, read_sheet, sheet_of
+from quasiharmonic.util.arrays import IntArray, kind_of
+
+try:
+    import anywidget
+    import traitlets
+except ImportError as error:
+    raise ImportError(f"the widget needs anywidget ({error}): pip install 'quasiharmonic[notebook]'") from error
+
+# What a view that comes later, or again, has to be told, in this order.
+_KEPT = "surface", "map", "obstructions"
+
+
+class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
+    """A surface beside its map, as ``qhm studio`` shows them: drag the outline, corners and pins, and the map follows.
+
+    Parameters
+    ----------
+    surface : Problem, MapResult, (n, 2) or (n, 3) array, mesh or path
+        What is mapped: a problem; a result, whose boundary stays where its map has it; or a surface, whose boundary
+        goes to a square until something else is asked for, or where a file's own map has it.
+    F : (f, 3) array of int, optional
+        Triangles, where ``surface`` is an array of positions.
+    height : int
+        Of the view, in pixels.
+
+    Attributes
+    ----------
+    result : MapResult
+        The map at rest that is shown, certified; while a hand moves, the last one.
+    problem : Problem
+        What it is the map of.
+    vertices : (n,) int64
+        For each of their vertices, which of the surface's it is. A closed surface is cut open, and has further copies.
+
+    Raises
+    ------
+    ValueError
+        When the surface is none that can be mapped.
+    ImportError
+        When anywidget is not installed.
+    """
+
+    _esm = f"{bundle('widget')}\nexport default {{ render }};\n"
+    height = traitlets.Int(480).tag(sync=True)
+
+    def __init__(
+        self, surface: Problem | MapResult | ArrayLike | MeshLike, F: ArrayLike | None = None, *, height: int = 480
+    ) -> None:
+        super().__init__(height=height)
+        self._told: dict[str, bytes] = {}
+        self._note = ""
+        sheet = _sheet(surface, F)
+        self.vertices: IntArray = sheet.island.vertices
+        self._session = Session(self._tell)
+        self._session.open(sheet)
+        self.on_msg(self._heard)
+
+    @property
+    def result(self) -> MapResult:
+        moment = self._session.moment
+        return replace(moment.result, V=moment.problem.V)
+
+    @property
+    def problem(self) -> Problem:
+        return self._session.moment.problem
+
+    def outline(self, to: str) -> None:
+        """Lay the boundary along an outline named in words, as ``"letter:R"``; ValueError where that cannot be."""
+        self._ask({"do": "outline", "to": to})
+
+    def polish(self, energy: str = "symmetric-dirichlet", *, slide: bool = False) -> None:
+        """Lower the distortion, as `quasiharmonic.polish` does; ValueError where that cannot be."""
+        self._ask({"do": "polish", "energy": energy, "slide": slide})
+
+    def undo(self) -> None:
+        """Go back to the map before."""
+        self._ask({"do": "undo"})
+
+    def redo(self) -> None:
+        """Go forward again."""
+        self._ask({"do": "redo"})
+
+    def _ask(self, header: dict[str, Any]) -> None:
+        """Do what a message of the view would ask for; raise what it would be told."""
+        self._note = ""
+        self._session.handle(Frame(header, {}))
+        if self._note:
+            raise ValueError(self._note)
+
+    def _heard(self, _: object, content: object, buffers: list[Any]) -> None:
+        """A message from a view in the notebook."""
+        try:
+            frame = decode(bytes(buffers[0]) if buffers else b"")
+        except ProtocolError as error:
+            self._tell({"kind": "note", "level": "error", "text": str(error)}, {})
+            return
+        if frame.header.get("do") != "show":
+            self._session.handle(frame)
+            return
+        for kind in _KEPT:
+            if kind in self._told:
+                self.send({"kind": kind, "first": True}, [self._told[kind]])
+
+    def _tell(self, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+        """Tell all views, and keep what one that comes later has to know."""
+        kind = header["kind"]
+        if kind == "progress":  # which no cell shows
+            return
+        data = encode(header, arrays)
+        if kind == "note":
+            self._note = header["text"]
+        # A map without places says where the boundary is wanted only, and stands for no other.
+        if kind in _KEPT and (kind != "map" or "places" in arrays):
+            self._told[kind] = data
+        self.send({"kind": kind}, [data])
+
+
+def _sheet(surface: Any, F: ArrayLike | None) -> Sheet:
+    """The surface that a session opens."""
+    if F is not None:
+        return sheet_of(MeshData(np.asarray(surface), np.asarray(F)), "mesh")
+    if isinstance(surface, Problem):
+        # Of its map only the places of fixed vertices are looked at.
+        uv = np.zeros((surface.n, 2))
+        uv[surface.fixed] = surface.target
+        return sheet_of(MeshData(surface.V, surface.F).with_map(uv), "problem", surface.fixed)
+    if isinstance(surface, MapResult):
+        if surface.V is None:
+            raise ValueError("the result does not know its surface: hand over its Problem, or V and F")
+        return sheet_of(MeshData(surface.V, surface.F).with_map(surface.uv), "result")
+    if isinstance(surface, str | PathLike):
+        return read_sheet(Path(fspath(surface)))
+    if stands_for_mesh(surface):
+        return sheet_of(MeshData(*mesh_arrays(surface)), "mesh")
+    raise ValueError(f"{kind_of(surface)} is no surface: hand over V and F, a mesh, a path, a Problem or a MapResult")

@@ -1,0 +1,28 @@
+"""Figures of surfaces and maps, drawn with matplotlib, without its global state and without a display.
+
+The package builds on `geometry` and `problem`. Start reading in `canvas`, then `maps`.
+"""
+
+from quasiharmonic.ui.plot.animation import save_animation, save_figures
+from quasiharmonic.ui.plot.boundary import save_boundary_figure
+from quasiharmonic.ui.plot.convergence import plot_convergence
+from quasiharmonic.ui.plot.distortion import plot_distortion, save_distortion_figure
+from quasiharmonic.ui.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
+from quasiharmonic.ui.plot.problems import plot_problem
+from quasiharmonic.ui.plot.texture import plot_texture, save_texture_figure
+
+__all__ = [
+    "plot_before_after",
+    "plot_convergence",
+    "plot_distortion",
+    "plot_map",
+    "plot_problem",
+    "plot_surface",
+    "plot_texture",
+    "save_animation",
+    "save_boundary_figure",
+    "save_distortion_figure",
+    "save_figures",
+    "save_map_figure",
+    "save_texture_figure",
+]

@@ -1,0 +1,242 @@
+"""Moving pictures of maps: how a search comes by one, or how a map follows its boundary."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import zlib
+from collections.abc import Iterable
+from io import BytesIO
+from itertools import chain
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.io.adapters.accepts_mesh import writes_mesh
+from quasiharmonic.ui.plot.canvas import as_mesh, new_figure, not_positive, paint_map, verdict
+from quasiharmonic.ui.plot.shading import view
+from quasiharmonic.util.arrays import FloatArray, map_array, whole_number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+
+# A GIF tells how long a picture stays in hundredths of a second, and viewers take one for a mistake.
+_HUNDREDTHS, _SHORTEST = 100, 2
+# The palette of a GIF: how many colours, and of how many bits of each channel what is the same colour to it.
+_COLOURS, _BITS = 255, 5
+_NONE = "there are no frames"
+
+
+@writes_mesh
+def save_animation(
+    path: str | PathLike[str],
+    V: ArrayLike,
+    F: ArrayLike,
+    frames: Iterable[tuple[str, ArrayLike]],
+    *,
+    fixed: ArrayLike | None = None,
+    frames_per_second: int = 12,
+) -> None:
+    """Write an animation of maps of one surface, inverted triangles in red; 600 × 600 pixels.
+
+    Parameters
+    ----------
+    path, frames_per_second
+        As for `save_figures`.
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+        The rest surface, whose look colours the triangles.
+    F : (f, 3) int
+    frames : iterable of (str, (n, 2) float)
+        What each frame is called, and its map. All are shown in one window, with room for each.
+    fixed : (k,) int, optional
+        Vertices held in place; those not on the boundary are marked.
+
+    Raises
+    ------
+    ValueError
+        When a vertex is not finite, and what `save_figures` raises.
+    ImportError, quasiharmonic.io.errors.OutputError
+        As for `save_figures`.
+    """
+    save_figures(path, _figures(V, F, list(frames), fixed), frames_per_second=frames_per_second)
+
+
+def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames_per_second: int = 12) -> None:
+    """Write figures as an animation.
+
+    Parameters
+    ----------
+    path : path
+        Ends in ``.gif``, or in ``.mp4`` where the program ffmpeg or the extra ``video`` is installed. Replaced as a
+        whole once the animation is complete.
+    figures : iterable of matplotlib Figure
+        Of one size. They are drawn one after another, so a generator will do.
+    frames_per_second : int
+        At most 50 of a GIF, whose last frame stays for a second more.
+
+    Raises
+    ------
+    ValueError
+        When there are no figures, the suffix is another, or there is no such rate.
+    ImportError
+        When the suffix is ``.mp4`` and neither is there.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    from quasiharmonic.io.atomic import write_whole
+
+    suffix = check_animation(path, frames_per_second)
+    encode = _gif if suffix == ".gif" else _mp4
+    write_whole(path, encode(map(_picture, figures), frames_per_second))
+
+
+def check_animation(path: str | PathLike[str], frames_per_second: int) -> str:
+    """Say early what `save_figures` would say of where to write, and how fast; the suffix in small letters.
+
+    Raises
+    ------
+    ValueError, ImportError, quasiharmonic.io.errors.OutputError
+        As `save_figures`.
+    """
+    from quasiharmonic.io.atomic import check_writable
+
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise ValueError(f"{path}: animations are written as .gif or .mp4")
+    whole_number("frames_per_second", frames_per_second, least=1)
+    most = _HUNDREDTHS // _SHORTEST
+    if suffix == ".gif" and frames_per_second > most:
+        raise ValueError(f"frames_per_second of a GIF must be at most {most}, not {frames_per_second}: write an .mp4")
+    if suffix == ".mp4":
+        _ffmpeg()
+    check_writable(path)
+    return suffix
+
+
+def _figures(
+    V: ArrayLike, F: ArrayLike, frames: list[tuple[str, ArrayLike]], fixed: ArrayLike | None
+) -> Iterable[Figure]:
+    """Yield a figure of every frame."""
+    rest, F = as_mesh(V, F)
+    color = view(rest, F).color
+    corners = [_extent(map_array(name, uv, len(rest))) for name, uv in frames]
+    window = _extent(np.concatenate(corners)) if corners else None
+    for name, uv in frames:
+        place = map_array(name, uv, len(rest))
+        figure = new_figure((6, 6))
+        ax = figure.add_axes((0.02, 0.02, 0.96, 0.88))
+        inverted = not_positive(F, place)
+        paint_map(ax, F, place, color, inverted, fixed, window)
+        verdict(ax, name, len(inverted))
+        yield figure
+
+
+def _extent(points: FloatArray) -> FloatArray:
+    """The lower left and the upper right corner of the box around points."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _picture(figure: Figure) -> NDArray[np.uint8]:
+    """A figure's pixels, (height, width, 3)."""
+    file = BytesIO()
+    figure.savefig(file, format="rgba")
+    width, height = (int(side) for side in figure.bbox.size)
+    return np.frombuffer(file.getvalue(), dtype=np.uint8).reshape(height, width, 4)[..., :3]
+
+
+def _gif(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
+    from PIL import Image
+
+    palette = _Palette()
+    # All are looked at for their colours before the first is written, and take little room until then.
+    packed = []
+    shape: tuple[int, ...] = ()
+    for picture in pictures:
+        palette.look_at(picture)
+        packed.append(zlib.compress(picture.tobytes(), 1))
+        shape = picture.shape
+    if not packed:
+        raise ValueError(_NONE)
+    colours = palette.picture()
+
+    def drawn(data: bytes) -> Image.Image:
+        picture = np.frombuffer(zlib.decompress(data), dtype=np.uint8).reshape(shape)
+        return Image.fromarray(picture).quantize(palette=colours, dither=Image.Dither.NONE)
+
+    # What a frame is late in whole hundredths the next one makes up for.
+    ends = [round(_HUNDREDTHS * (k + 1) / rate) for k in range(len(packed))]
+    times = [1000 // _HUNDREDTHS * (end - begin) for begin, end in zip([0, *ends], ends, strict=False)]
+    times[-1] += 1000
+    file = BytesIO()
+    others = map(drawn, packed[1:])
+    drawn(packed[0]).save(file, "GIF", save_all=True, append_images=others, duration=times, loop=0, optimize=False)
+    return file.getvalue()
+
+
+class _Palette:
+    """One palette for all frames, so that colours do not flicker, with what is in few of them too."""
+
+    def __init__(self) -> None:
+        self._count = np.zeros(1 << 3 * _BITS)
+        self._sum = np.zeros((1 << 3 * _BITS, 3))
+
+    def look_at(self, picture: NDArray[np.uint8]) -> None:
+        """Take down the colours of every other pixel of every other row."""
+        pixels = picture[::2, ::2].reshape(-1, 3)
+        red, green, blue = (pixels >> (8 - _BITS)).astype(np.intp).T
+        cell = (red << 2 * _BITS) | (green << _BITS) | blue
+        self._count += np.bincount(cell, minlength=self._count.size)
+        for channel in range(3):
+            self._sum[:, channel] += np.bincount(cell, weights=pixels[:, channel], minlength=self._count.size)
+
+    def picture(self) -> Image.Image:
+        """A picture that has the palette."""
+        from PIL import Image
+
+        there = np.flatnonzero(self._count)
+        colours = np.rint(self._sum[there] / self._count[there, None]).astype(np.uint8)
+        # By the root of its area, a colour that is rare counts too.
+        often = np.ceil(np.sqrt(self._count[there] / self._count.max()) * _COLOURS).astype(np.intp)
+        return Image.fromarray(np.repeat(colours, often, axis=0)[None]).quantize(_COLOURS, dither=Image.Dither.NONE)
+
+
+def _ffmpeg() -> str:
+    """Where the program ffmpeg is, on the path or in the extra ``video``."""
+    if (found := shutil.which("ffmpeg")) is not None:
+        return found
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError:
+        raise ImportError(
+            "an .mp4 needs the program ffmpeg: pip install 'quasiharmonic[video]' brings it, or write a .gif"
+        ) from None
+    return str(get_ffmpeg_exe())
+
+
+def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
+    from matplotlib import rc_context
+    from matplotlib.animation import FFMpegWriter
+
+    pictures = iter(pictures)
+    first = next(pictures, None)
+    if first is None:
+        raise ValueError(_NONE)
+    height, width = (side - side % 2 for side in first.shape[:2])  # of which the codec wants even ones
+    figure = new_figure((width / 100, height / 100))
+    image = figure.add_axes((0, 0, 1, 1))
+    image.set_axis_off()
+    shown = image.imshow(first, interpolation="none")
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "animation.mp4"
+        # yuv420p is what browsers and phones play.
+        writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p"])
+        with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, str(target), dpi=100):
+            for picture in chain([first], pictures):
+                shown.set_data(picture)
+                writer.grab_frame()
+        return target.read_bytes()

@@ -1,0 +1,100 @@
+"""Figures of a surface whose boundary vertices are numbered, as many of them as can be read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.adapters.accepts_mesh import writes_mesh
+from quasiharmonic.ui.plot.canvas import (
+    BORDER,
+    INK,
+    RED,
+    as_mesh,
+    caption,
+    fit,
+    new_figure,
+    paint_surface,
+    save_picture,
+)
+from quasiharmonic.ui.plot.shading import view
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Of a figure's side and of the numbers in it: inches, points.
+_INCHES, _SIZE = 10.0, 7.5
+# Room that a number takes, in shares of its size: each digit across, and up; and how far off its vertex it is.
+_DIGIT, _HEIGHT, _OFF = 0.68, 1.25, 0.3
+
+
+@writes_mesh
+def save_boundary_figure(
+    path: str | PathLike[str], V: ArrayLike, F: ArrayLike, loops: Sequence[IntArray], corners: ArrayLike = ()
+) -> None:
+    """Write a picture of a surface with its boundary vertices numbered, 1000 × 1000 pixels.
+
+    A number that would lie over another one is left out; corners have theirs first. Boundaries that the surface hides
+    are drawn too.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+    F : (f, 3) int
+    loops : sequence of (l,) int64
+        Boundary vertices in order.
+    corners : (k,) int
+        Boundary vertices that are marked, in the order in which they are to have their numbers.
+
+    Raises
+    ------
+    ValueError
+        When a vertex of the surface is not finite.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    rest, F = as_mesh(V, F)
+    seen, marked = view(rest, F), np.asarray(corners, dtype=np.int64)
+    figure = new_figure((_INCHES, _INCHES))
+    ax = figure.add_axes((0.04, 0.02, 0.92, 0.9))
+    # Pale, so that what is written over it can be read.
+    paint_surface(ax, seen, F, 0.4 * seen.color + 0.6)
+    scale = fit(ax, seen.points)
+    for loop in loops:
+        ax.plot(*seen.points[np.append(loop, loop[0])].T, color=INK, linewidth=BORDER, zorder=4)
+        ax.plot(*seen.points[loop].T, ".", color=INK, markersize=2.5, zorder=5)
+    ax.plot(*seen.points[marked].T, "o", color=RED, markersize=5, zorder=6)
+    border = np.concatenate([marked, *(loop[~np.isin(loop, marked)] for loop in loops)])
+    digits = np.array([len(str(vertex)) for vertex in border.tolist()])
+    half = _SIZE / 2 * np.stack([_DIGIT * (digits + 1), np.full(len(digits), _HEIGHT)], axis=1)
+    places = scale * seen.points[border] + (half + _OFF * _SIZE) * _outward(seen.points, F, border)
+    for k in _readable(places, half):
+        color = RED if k < len(marked) else INK
+        x, y = places[k] / scale
+        ax.text(x, y, str(border[k]), size=_SIZE, color=color, ha="center", va="center", zorder=7)
+    count, many = sum(len(loop) for loop in loops), "" if len(loops) == 1 else "s"
+    caption(ax, f"{count:,} boundary vertices in {len(loops)} loop{many}; corners in red")
+    save_picture(path, figure)
+
+
+def _outward(points: FloatArray, F: IntArray, border: IntArray) -> FloatArray:
+    """Directions away from the triangles around some vertices of the boundary; (k, 2)."""
+    middles, count = np.zeros_like(points), np.zeros(len(points))
+    for corner in F.T:
+        np.add.at(middles, corner, points[F].mean(axis=1))
+        np.add.at(count, corner, 1)
+    away = points[border] - middles[border] / count[border, None]
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1), np.finfo(float).tiny)[:, None])
+
+
+def _readable(places: FloatArray, half: FloatArray) -> list[int]:
+    """Which boxes, of half such sizes (k, 2) around places (k, 2), lie over no earlier one that is chosen."""
+    chosen: list[int] = []
+    for k in range(len(places)):
+        apart = np.abs(places[chosen] - places[k]) >= half[chosen] + half[k]
+        if apart.any(axis=1).all():
+            chosen.append(k)
+    return chosen

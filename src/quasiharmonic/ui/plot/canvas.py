@@ -1,0 +1,197 @@
+"""What all figures are drawn with: figures without global state, triangles painted in order, captions."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.ui.plot.shading import View, drawable, edge_style, least_heights
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, triangle_rows, vertex_array
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+#: Endings of pictures: pixels, and two in which lines stay lines.
+PICTURES = (".png", ".svg", ".pdf")
+# So many triangles and more are pixels in these too: as shapes they would fill megabytes.
+_MOST_SHAPES = 10_000
+
+RED = (0.89, 0.07, 0.17)
+INK = (0.06, 0.12, 0.29)
+BORDER = 1.2  # width in points
+_INSIDE = np.array((0.80, 0.82, 0.86))
+
+
+def new_figure(inches: tuple[float, float]) -> Figure:
+    """A white figure of 100 pixels an inch, known to nobody but its owner; a notebook shows it."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        from quasiharmonic.ui.plot.figures import ShownFigure
+    except ImportError as error:
+        raise ImportError(f"pictures need matplotlib ({error}): pip install 'matplotlib>=3.8'") from error
+
+    figure = ShownFigure(figsize=inches, dpi=100, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_picture(path: str | PathLike[str], figure: Figure) -> None:
+    """Write a figure in the format that the file's ending says, replacing the file as a whole.
+
+    Raises
+    ------
+    ValueError
+        When the ending is none of `PICTURES`.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    from matplotlib import rc_context
+
+    from quasiharmonic.io.atomic import write_whole
+
+    suffix = check_ending(path)
+    # The same figure is the same file: no date, and no name drawn by lot.
+    metadata: dict[str, dict[str, Any]] = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    with rc_context({"svg.hashsalt": "quasiharmonic"}):
+        write_whole(path, lambda file: figure.savefig(file, format=suffix[1:], metadata=metadata[suffix]))
+
+
+def check_ending(path: str | PathLike[str]) -> str:
+    """The ending of a picture's name in small letters, or a ValueError where it is none of `PICTURES`."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in PICTURES:
+        raise ValueError(f"{path}: pictures are written as {', '.join(PICTURES)}")
+    return suffix
+
+
+def panels(figure: Figure, count: int) -> list[Axes]:
+    """Axes side by side, with room for a caption above each."""
+    width = 1 / count
+    return [figure.add_axes((i * width + 0.005, 0.02, width - 0.01, 0.88)) for i in range(count)]
+
+
+def caption(ax: Axes, text: str, color: tuple[float, float, float] = INK) -> None:
+    """Write above a panel, at the same height in all."""
+    left, right = ax.get_position(original=True).intervalx
+    ax.figure.text((left + right) / 2, 0.93, text, ha="center", size=12.5, color=color)
+
+
+def verdict(ax: Axes, name: str, inverted: int) -> None:
+    """Write above a panel what map it shows and how many triangles of it are inverted."""
+    text = f"{name}: {inverted:,} inverted" if inverted else f"{name}: no triangle inverted"
+    caption(ax, text, RED if inverted else INK)
+
+
+def fit(ax: Axes, points: FloatArray) -> float:
+    """Fit the view to the points, without frame; return how many points of print a unit has."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.03 * (float((high - low).max()) or 1.0)
+    low, high = low - margin, high + margin
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    box = ax.get_window_extent()
+    pixels = min(box.width / (high - low)[0], box.height / (high - low)[1])
+    return float(pixels) * 72 / ax.figure.dpi
+
+
+def paint_surface(ax: Axes, seen: View, F: IntArray, color: FloatArray) -> None:
+    """Paint a surface as it is seen, its outer side in the given colours (f, 3), its inner side greyed."""
+    color = np.where(seen.inside[:, None], _INSIDE * (0.5 + 0.5 * color), color)
+    scale = fit(ax, seen.points)
+    edges, width = edge_style(color, scale * least_heights(seen.points[F]))
+    # What is nearer is painted later. The boundary takes part, each edge just after its triangle.
+    border = boundary_edges(F, len(seen.points))[:, [0, 1, 1]]
+    ink = np.broadcast_to(INK, (len(border), 3))
+    corners = np.concatenate([F, border])
+    near = np.concatenate([seen.depth[F].mean(axis=1), seen.depth[border].max(axis=1)])
+    order = np.argsort(near, kind="stable")
+    _fill(
+        ax,
+        seen.points[corners[order]],
+        np.concatenate([color, ink])[order],
+        np.concatenate([edges, ink])[order],
+        np.concatenate([width, np.full(len(border), BORDER)])[order],
+    )
+
+
+def paint_map(
+    ax: Axes,
+    F: IntArray,
+    uv: FloatArray,
+    color: FloatArray,
+    inverted: IntArray,
+    fixed: ArrayLike | None = None,
+    window: FloatArray | None = None,
+) -> None:
+    """Paint a map in the given colours (f, 3), inverted triangles in red over all others.
+
+    All of it is in view, or what lies about the points of a ``window``.
+    """
+    window = uv if window is None else window
+    uv = drawable(uv, window)
+    scale = fit(ax, drawable(window))
+    color = color.copy()
+    color[inverted] = RED
+    height = scale * least_heights(uv[F])
+    edges, width = edge_style(color, height)
+    # The inverted ones come last, over whatever they overlap.
+    order = np.concatenate([np.delete(np.arange(len(F)), inverted), inverted])
+    _fill(ax, uv[F[order]], color[order], edges[order], width[order])
+    tiny = inverted[height[inverted] < 0.7]
+    ax.plot(*uv[F[tiny]].mean(axis=1).T, ".", markersize=3, markeredgewidth=0, color=RED, zorder=3)
+    outline(ax, F, uv)
+    if fixed is not None:
+        held = index_array("fixed", fixed)
+        check_range("fixed", held, len(uv))
+        pins = np.setdiff1d(held, boundary_edges(F, len(uv)))
+        ax.plot(*uv[pins].T, "o", markersize=5, color="white", mec=INK, mew=1.4, zorder=5)
+
+
+def outline(ax: Axes, F: IntArray, uv: FloatArray) -> None:
+    """Draw the boundary of a map."""
+    from matplotlib.collections import LineCollection
+
+    border = uv[boundary_edges(F, len(uv))]
+    lines = LineCollection(_polygons(border), colors=[INK], linewidths=BORDER, capstyle="round", zorder=4)
+    ax.add_collection(lines, autolim=False)
+
+
+def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
+    """Triangles whose area, in floating point, is not positive."""
+    uv = drawable(uv)
+    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
+    return np.flatnonzero(~(a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0]))
+
+
+def as_mesh(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
+    """Positions, checked to be finite, and triangles, be it none, checked to refer to them, as arrays."""
+    rest, triangles = vertex_array(V), triangle_rows(F)
+    check_range("F", triangles, len(rest))
+    return rest, triangles
+
+
+def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, width: FloatArray) -> None:
+    """Paint triangles in their order; corners (f, 3, 2), colours (f, 3)."""
+    from matplotlib.collections import PolyCollection
+
+    triangles = PolyCollection(
+        _polygons(corners), facecolors=color, edgecolors=edges, linewidths=width, joinstyle="round", zorder=1
+    )
+    triangles.set_rasterized(len(corners) > _MOST_SHAPES)
+    ax.add_collection(triangles, autolim=False)
+
+
+def _polygons(corners: FloatArray) -> Sequence[ArrayLike]:
+    """Corners as matplotlib's annotations want them; it is fastest with the array as it is."""
+    return cast("Sequence[ArrayLike]", corners)

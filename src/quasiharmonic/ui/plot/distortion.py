@@ -1,0 +1,211 @@
+"""Pictures of distortion: a surface and its map coloured by a measure, and how much area has how much of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.measures import Distortion, distortion
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh, writes_mesh
+from quasiharmonic.ui.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_picture
+from quasiharmonic.ui.plot.shading import lit, view
+from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
+
+_GREY = (0.6, 0.6, 0.6)  # of triangles on which nothing can be measured
+
+#: The measures that can be drawn: what their axis says, the value of a perfect map, and their scale.
+LABELS = {
+    "sigma1": ("σ₁", None, "log"),
+    "sigma2": ("σ₂", None, "log"),
+    "mips": ("MIPS: σ₁/σ₂ + σ₂/σ₁ − 2", 0.0, "asinh"),
+    "conformal": ("conformal ratio σ₁/σ₂", 1.0, "log"),
+    "isometric": ("isometric distortion max(σ₁, 1/σ₂)", 1.0, "log"),
+    "symmetric_dirichlet": ("symmetric Dirichlet energy", 0.0, "asinh"),
+    "arap": ("ARAP energy", 0.0, "asinh"),
+    "area_ratio": ("area ratio σ₁σ₂", 1.0, "both ways"),
+    "shear": ("|μ|", 0.0, "linear"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Scale:
+    """Colours for the values of one measure.
+
+    Attributes
+    ----------
+    label : str
+    norm : matplotlib Normalize
+        Its ends are where all but a hundredth of the area lies between.
+    colormap : str
+        Diverging where a perfect map lies in the middle; none has red, which is for inverted triangles.
+    beyond : {"max", "both"}
+        The ends beyond which there may be values.
+    """
+
+    label: str
+    norm: Normalize
+    colormap: str
+    beyond: str = "max"
+
+    def place(self, values: FloatArray) -> FloatArray:
+        """Where values (k,) stand between the ends, 0 to 1."""
+        return np.asarray(self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))).clip(0, 1)
+
+    @property
+    def ticks(self) -> tuple[FloatArray, list[str]]:
+        """Values at even steps of the colours, (5,) float64, and how they read."""
+        values = np.asarray(self.norm.inverse(np.linspace(0, 1, 5)))
+        return values, [f"{value:.3g}" for value in values]
+
+    def colors(self, values: FloatArray) -> FloatArray:
+        """Colours (f, 3) of values (f,), grey where there is no value."""
+        import matplotlib
+
+        colors = np.asarray(matplotlib.colormaps[self.colormap](self.place(np.nan_to_num(values, nan=1.0))))[:, :3]
+        colors[np.isnan(values)] = _GREY
+        return colors
+
+
+@takes_mesh
+def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric") -> Figure:
+    """Draw a surface and its map coloured by a measure of distortion, and the measure's histogram.
+
+    Triangles that the map inverts are red, those without area in the rest mesh grey. The colours reach from
+    the best value to the one that a hundredth of the area exceeds.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+        The rest surface.
+    F : (f, 3) int
+    uv : (n, 2) float
+        The map.
+    measure : str
+        One of `quasiharmonic.energies.measures.MEASURES`; `quasiharmonic.Distortion` says what each is.
+
+    Returns
+    -------
+    matplotlib Figure
+        Three panels: the surface, the map, and the share of the surface's area over the measure.
+
+    Raises
+    ------
+    ValueError
+        When there is no such measure, what `quasiharmonic.distortion` raises, or no triangle has a finite value.
+    """
+    check_choice("measure", measure, LABELS)
+    rest, F = as_mesh(V, F)
+    uv = map_array("uv", uv, len(rest))
+    found = distortion(rest, F, uv)
+    values: FloatArray = found.per_triangle()[measure]
+    scale = _scale(measure, values, found.share)
+    color = scale.colors(values)
+
+    figure = new_figure((13.5, 4.5))
+    surface, plane, bars = (figure.add_axes((x, y, w, h)) for x, y, w, h in _LAYOUT)
+    seen = view(rest, F)
+    tinted = color.copy()
+    tinted[found.flipped] = RED
+    paint_surface(surface, seen, F, lit(tinted, seen.light))
+    caption(surface, f"surface: {len(F):,} triangles")
+    paint_map(plane, F, uv, color, found.flipped)
+    many = len(found.flipped)
+    caption(plane, f"map: {many:,} inverted" if many else "map", RED if many else INK)
+    _bar(figure, scale)
+    _histogram(bars, found, measure, values, scale)
+    return figure
+
+
+@writes_mesh
+def save_distortion_figure(
+    path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric"
+) -> None:
+    """Write `plot_distortion`'s figure, a picture of 1350 × 450 pixels.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+    V, F, uv, measure
+        As for `plot_distortion`.
+
+    Raises
+    ------
+    ValueError
+        What `plot_distortion` raises.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    save_picture(path, plot_distortion(V, F, uv, measure))
+
+
+_LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.265, 0.74))
+
+
+def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
+    """Choose the colours for a measure by what values of it there are."""
+    from matplotlib.colors import AsinhNorm, LogNorm, Normalize
+
+    label, perfect, kind = LABELS[measure]
+    usable = np.isfinite(values) & ((values > 0) | (kind in ("asinh", "linear")))
+    if not usable.any():
+        raise ValueError(f"{measure} has no finite value on any triangle that is not inverted")
+    low, high = _between(values[usable], share[usable], 0.01, 0.99)
+    if kind == "linear":
+        return _Scale(label, Normalize(0.0, max(min(high, 1.0), 1e-3)), "viridis")
+    if kind == "asinh":
+        top = max(high, 1e-3)
+        return _Scale(label, AsinhNorm(linear_width=min(1.0, top), vmin=0.0, vmax=top), "viridis")
+    if kind == "both ways":
+        reach = max(high, 1 / low, 1.1)
+        return _Scale(label, LogNorm(1 / reach, reach), "PuOr", "both")
+    if perfect is None:
+        return _Scale(label, LogNorm(low, max(high, 1.01 * low)), "viridis", "both")
+    return _Scale(label, LogNorm(perfect, max(high, 1.01 * perfect)), "viridis")
+
+
+def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> tuple[float, float]:
+    """Quantiles by area."""
+    order = np.argsort(values)
+    below = np.cumsum(share[order])
+    at = np.searchsorted(below, np.array([low, high]) * below[-1]).clip(max=len(order) - 1)
+    first, last = values[order[at]]
+    return float(first), float(last)
+
+
+def _bar(figure: Figure, scale: _Scale) -> None:
+    """The colours' meaning, between the map and the histogram."""
+    from matplotlib.cm import ScalarMappable
+
+    drawn = ScalarMappable(scale.norm, scale.colormap)
+    bar = figure.colorbar(drawn, cax=figure.add_axes((0.605, 0.14, 0.012, 0.74)), extend=scale.beyond)
+    # The histogram's ticks: a logarithmic bar over less than a decade would have one of its own, or none.
+    bar.ax.set_yticks(*scale.ticks, size=9)
+    bar.ax.minorticks_off()
+
+
+def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, scale: _Scale) -> None:
+    """How much of the surface has how much of the measure, in equal steps of the colours."""
+    import matplotlib
+
+    known = np.isfinite(values)
+    shares, steps = np.histogram(scale.place(values[known]), bins=40, range=(0, 1), weights=100 * found.share[known])
+    middle = (steps[1:] + steps[:-1]) / 2
+    ax.bar(steps[:-1], shares, width=1 / 40, align="edge", color=matplotlib.colormaps[scale.colormap](middle))
+    _, names = scale.ticks
+    ax.set_xticks(np.linspace(0, 1, len(names)), names, size=9)
+    ax.set_xlabel(scale.label, color=INK)
+    ax.set_ylabel("% of the surface's area", color=INK)
+    ax.spines[["top", "right"]].set_visible(False)
+    summed = found.summary(measure)
+    caption(ax, f"median {summed.median:.3g}, 95 % < {summed.p95:.3g}, max {summed.maximum:.3g}")

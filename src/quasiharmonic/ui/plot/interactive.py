@@ -1,0 +1,162 @@
+"""A window with a surface, its map, and what the map does to it; drawn by polyscope."""
+
+from __future__ import annotations
+
+import tempfile
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.ui.plot.canvas import RED, as_mesh
+from quasiharmonic.util.arrays import FloatArray, map_array
+
+#: Measures of distortion that the window offers as colours.
+SHOWN = ("isometric", "conformal", "area_ratio", "mips")
+_CHECKERS = (0.93, 0.93, 0.90), (0.16, 0.38, 0.75)
+
+
+@takes_mesh
+def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLike[str] | None = None) -> None:
+    """Open a window on a surface and its map, and return when it is closed.
+
+    The surface carries a checkerboard that the map puts on it; the map lies beside it. Inverted triangles are red in
+    both, and measures of distortion can be switched on as colours of the others.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+        The rest surface.
+    F : (f, 3) int
+    uv : (n, 2) float
+        The map.
+    screenshot : path, optional
+        Write what the window would show as a PNG instead of opening it; no display is needed.
+
+    Raises
+    ------
+    ImportError
+        When polyscope is not installed.
+    ValueError
+        What `quasiharmonic.distortion` raises.
+    RuntimeError
+        When no window can be opened.
+    """
+    polyscope = _polyscope()
+    polyscope.set_verbosity(0)
+    polyscope.set_use_prefs_file(False)
+    polyscope.set_program_name("quasiharmonic")
+    polyscope.set_ground_plane_mode("none")
+    polyscope.set_allow_headless_backends(screenshot is not None)
+    polyscope.init()
+    add(V, F, uv)
+    try:
+        if screenshot is None:
+            polyscope.show()
+        else:
+            _photograph(polyscope, screenshot)
+    finally:
+        polyscope.remove_all_structures()
+
+
+def _photograph(polyscope: Any, path: str | PathLike[str]) -> None:
+    """Write the view as a PNG, whole or not at all."""
+    from quasiharmonic.io.atomic import write_whole
+
+    with tempfile.TemporaryDirectory() as folder:
+        picture = Path(folder) / "view.png"
+        polyscope.screenshot(str(picture), transparent_bg=False)
+        write_whole(path, picture.read_bytes())
+
+
+def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
+    """Add a surface and its map to polyscope, which has been initialised, for pictures of one's own.
+
+    Parameters
+    ----------
+    V, F, uv
+        As for `show`. What is added is called "surface" and "map", and the inverted triangles of each, if there are
+        any, "surface: inverted" and "map: inverted".
+    """
+    polyscope = _polyscope()
+    rest, F = as_mesh(V, F)
+    plane = map_array("uv", uv, len(rest))
+    found = distortion(rest, F, plane)
+    solid = rest if rest.shape[1] == 3 else np.column_stack([rest, np.zeros(len(rest))])
+    middle, size = (solid.min(axis=0) + solid.max(axis=0)) / 2, float(np.ptp(solid, axis=0).max()) or 1.0
+    low, extent = plane.min(axis=0), float(np.ptp(plane, axis=0).max()) or 1.0
+    unit = (plane - low) / extent
+    beside = np.column_stack([(unit - 0.5) * size, np.zeros(len(unit))]) + middle + [1.3 * size, 0, 0]
+
+    inverted = np.zeros(len(F), dtype=np.bool_)
+    inverted[found.flipped] = True
+    for name, points in (("surface", solid), ("map", beside)):
+        if not inverted.all():
+            drawn = polyscope.register_surface_mesh(name, points, F[~inverted], edge_width=0.3)
+            drawn.add_parameterization_quantity(
+                "checkerboard",
+                unit,
+                enabled=True,
+                coords_type="unit",
+                viz_style="checker",
+                checker_size=1 / 24,
+                checker_colors=_CHECKERS,
+            )
+            for measure in SHOWN:
+                _colour_by(drawn, measure, found.per_triangle()[measure][~inverted])
+        if inverted.any():
+            # In the map they lie among the others: a little above, to be seen.
+            lifted = points if name == "surface" else points + np.array((0, 0, 2e-3 * size))
+            polyscope.register_surface_mesh(
+                f"{name}: inverted", lifted, F[inverted], color=RED, edge_width=0.3, back_face_policy="identical"
+            )
+    width, height = polyscope.get_window_size()
+    angle = float(np.radians(polyscope.get_view_camera_parameters().get_fov_vertical_deg()))
+    polyscope.look_at(*view_of(np.concatenate([solid, beside]), width / height, angle))
+
+
+def _colour_by(drawn: Any, measure: str, values: FloatArray) -> None:
+    """Offer a measure as the colour of a mesh."""
+    known = np.isfinite(values)
+    top = float(np.quantile(values[known], 0.99)) if known.any() else 1.0
+    low_end = float(values[known].min()) if known.any() else 0.0
+    drawn.add_scalar_quantity(
+        measure,
+        np.where(known, values, top),
+        defined_on="faces",
+        vminmax=(low_end, max(top, np.nextafter(low_end, np.inf))),
+    )
+
+
+def view_of(points: FloatArray, aspect: float, angle: float) -> tuple[FloatArray, FloatArray]:
+    """Where to look at points from the front, such that all are in the picture.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    aspect : float
+        The picture's width by its height.
+    angle : float
+        How much is seen from its lower to its upper side, in radians.
+
+    Returns
+    -------
+    camera, target : (3,) float64
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 1.05 * (high - low) / 2
+    middle = (low + high) / 2
+    away = max(half[1], half[0] / aspect) / np.tan(angle / 2) + half[2]
+    return middle + np.array((0, 0, away)), middle
+
+
+def _polyscope() -> Any:
+    try:
+        import polyscope
+    except ImportError as error:
+        raise ImportError("a window needs polyscope: pip install 'quasiharmonic[view]'") from error
+    return polyscope

@@ -1,0 +1,203 @@
+"""Figures of maps: the surface, the map, and what was inverted before."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh, writes_mesh
+from quasiharmonic.ui.plot.canvas import (
+    as_mesh,
+    caption,
+    new_figure,
+    not_positive,
+    paint_map,
+    paint_surface,
+    panels,
+    save_picture,
+    verdict,
+)
+from quasiharmonic.ui.plot.shading import View, view
+from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@takes_mesh
+def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
+    """Draw a rest surface, shaded and coloured as `plot_map` colours its map.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+    F : (f, 3) int
+    ax : matplotlib Axes
+        Ordinary two-dimensional ones; the surface is projected here.
+
+    Raises
+    ------
+    ValueError
+        When a vertex is not finite.
+    """
+    rest, F = as_mesh(V, F)
+    seen = view(rest, F)
+    paint_surface(ax, seen, F, seen.color)
+
+
+@takes_mesh
+def plot_map(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    flipped: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a map, its inverted triangles in red over all others.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+        The rest surface, whose look colours the triangles.
+    F : (f, 3) int
+    uv : (n, 2) float
+        The map.
+    flipped : (k,) int or (f,) bool, optional
+        The triangles to show as inverted, as a certificate lists them. By default those whose area
+        in floating point is not positive.
+    fixed : (k,) int, optional
+        Vertices held in place; those not on the boundary are marked.
+    ax : matplotlib Axes, optional
+        Where to draw; the axes of a new `matplotlib.figure.Figure` by default.
+
+    Returns
+    -------
+    matplotlib Axes
+
+    Raises
+    ------
+    ValueError
+        When a vertex of the surface or the map is not finite.
+    """
+    rest, F = as_mesh(V, F)
+    if ax is None:
+        from quasiharmonic.ui.plot.figures import ShownAxes
+
+        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9), axes_class=ShownAxes)
+    _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), flipped, fixed)
+    return ax
+
+
+@takes_mesh
+def plot_before_after(
+    V: ArrayLike,
+    F: ArrayLike,
+    before: ArrayLike,
+    after: ArrayLike,
+    *,
+    fixed: ArrayLike | None = None,
+) -> Figure:
+    """Draw two maps of one surface side by side, inverted triangles in red.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+    F : (f, 3) int
+    before, after : (n, 2) float
+    fixed : (k,) int, optional
+        As for `plot_map`.
+
+    Returns
+    -------
+    matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        When a vertex of the surface or a map is not finite.
+    """
+    rest, F = as_mesh(V, F)
+    figure, seen = new_figure((9, 4.8)), view(rest, F)
+    for ax, uv, name in zip(panels(figure, 2), (before, after), ("before", "after"), strict=True):
+        verdict(ax, name, _draw_map(ax, seen, F, map_array(name, uv, len(rest)), None, fixed))
+    return figure
+
+
+@writes_mesh
+def save_map_figure(
+    path: str | PathLike[str],
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    before: ArrayLike | None = None,
+    *,
+    flipped: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
+) -> None:
+    """Write a picture of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+    F : (f, 3) int
+    uv : (n, 2) float
+    before : (n, 2) float, optional
+        The first guess; without it the picture has two panels and is 800 pixels wide.
+    flipped, fixed
+        As for `plot_map`, of ``uv``.
+
+    Raises
+    ------
+    ValueError
+        When a vertex of the surface or a map is not finite, or the path has another ending.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    save_picture(path, map_figure(V, F, uv, before, flipped=flipped, fixed=fixed))
+
+
+def map_figure(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    before: ArrayLike | None = None,
+    *,
+    flipped: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
+) -> Figure:
+    """Draw what `save_map_figure` writes."""
+    rest, F = as_mesh(V, F)
+    seen = view(rest, F)
+    count = 2 if before is None else 3
+    figure = new_figure((4 * count, 4.5))
+    axes = panels(figure, count)
+    plot_surface(rest, F, axes[0])
+    caption(axes[0], f"surface: {len(F):,} triangles")
+    if before is not None:
+        guess = map_array("before", before, len(rest))
+        verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, guess, None, fixed))
+    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, map_array("uv", uv, len(rest)), flipped, fixed))
+    return figure
+
+
+def _draw_map(
+    ax: Axes,
+    seen: View,
+    F: IntArray,
+    uv: FloatArray,
+    flipped: ArrayLike | None,
+    fixed: ArrayLike | None,
+) -> int:
+    """Draw a map into axes and return the number of its inverted triangles."""
+    inverted = not_positive(F, uv) if flipped is None else np.asarray(flipped)
+    inverted = np.flatnonzero(inverted) if inverted.dtype == bool else inverted.astype(np.int64)
+    paint_map(ax, F, uv, seen.color, inverted, fixed)
+    return int(inverted.size)

@@ -1,0 +1,237 @@
+"""A checkerboard of the plane, or a picture, seen on the surface: what a map does, as an artist looks at it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.adapters.accepts_mesh import takes_mesh, writes_mesh
+from quasiharmonic.ui.plot.canvas import (
+    RED,
+    as_mesh,
+    caption,
+    new_figure,
+    not_positive,
+    outline,
+    panels,
+    save_picture,
+    verdict,
+)
+from quasiharmonic.ui.plot.shading import drawable, lit, view
+from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_LIGHT, _DARK = np.array((0.93, 0.93, 0.90)), np.array((0.16, 0.38, 0.75))
+_SIDE = 600  # pixels of a panel
+_SAMPLES = 2  # per pixel and direction
+_CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
+
+
+@takes_mesh
+def plot_texture(
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24, picture: str | PathLike[str] | None = None
+) -> Figure:
+    """Draw a surface with a checkerboard that a map puts on it, beside the same board in the plane.
+
+    Squares stay squares where the map keeps angles and are of one size where it keeps areas. Inverted
+    triangles are red.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+        The rest surface.
+    F : (f, 3) int
+    uv : (n, 2) float
+        The map.
+    squares : int
+        Of the board along the longer side of the map's bounding box.
+    picture : path, optional
+        A picture, PNG or JPEG, in place of the board: the unit square, repeated beyond it, as in any viewer.
+
+    Returns
+    -------
+    matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        When there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``picture`` is none.
+    """
+    rest, F = as_mesh(V, F)
+    uv = drawable(map_array("uv", uv, len(rest)))
+    if not F.size:
+        raise ValueError("the mesh has no triangles")
+    if squares < 1:
+        raise ValueError(f"squares must be at least 1, not {squares}")
+    color: Callable[[FloatArray], FloatArray]
+    if picture is None:
+        low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
+        board, color = (uv - low) / size * squares, _checkered
+    else:
+        board, color = uv, _pictured(picture)
+    inverted = not_positive(F, uv)
+    seen = view(rest, F)
+    figure = new_figure((9.6, 4.8))
+    surface, plane = panels(figure, 2)
+    _show(surface, seen.points, _painted(seen.points, seen.depth, F, board, color, inverted, seen.light))
+    caption(surface, f"surface: {len(F):,} triangles")
+    _show(plane, board, _painted(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
+    outline(plane, F, board)
+    verdict(plane, "map", len(inverted))
+    return figure
+
+
+@writes_mesh
+def save_texture_figure(
+    path: str | PathLike[str],
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    squares: int = 24,
+    picture: str | PathLike[str] | None = None,
+) -> None:
+    """Write `plot_texture`'s figure, a picture of 960 × 480 pixels.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+    V, F, uv, squares, picture
+        As for `plot_texture`.
+
+    Raises
+    ------
+    ValueError
+        What `plot_texture` raises.
+    quasiharmonic.io.errors.OutputError
+        When the file cannot be written.
+    """
+    save_picture(path, plot_texture(V, F, uv, squares=squares, picture=picture))
+
+
+def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
+    """Lay a painted image under axes in the units of its points."""
+    low, high = _window(points)
+    ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
+    ax.set_axis_off()
+
+
+def _window(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of the square that a panel shows."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    reach = 0.52 * (float((high - low).max()) or 1.0)
+    return (low + high) / 2 - reach, (low + high) / 2 + reach
+
+
+def _painted(
+    points: FloatArray,
+    depth: FloatArray,
+    F: IntArray,
+    board: FloatArray,
+    color_at: Callable[[FloatArray], FloatArray],
+    inverted: IntArray,
+    light: FloatArray,
+) -> FloatArray:
+    """An image (side, side, 4) of triangles seen in the plane, the nearest of them at each pixel.
+
+    ``points`` (n, 2) and ``depth`` (n,) are where vertices are seen, ``board`` (n, 2) their places on what
+    ``color_at`` gives colours (k, 3) for places (k, 2), and ``light`` (f,) falls on the triangles.
+    """
+    side = _SIDE * _SAMPLES
+    low, high = _window(points)
+    place = (points - low) / (high - low) * side
+    bad = np.zeros(len(F), dtype=bool)
+    bad[inverted] = True
+
+    image = np.zeros((side * side, 4))
+    nearest = np.full(side * side, -np.inf)
+    for triangle, pixel, weights in _samples(place[F], side):
+        z = np.einsum("kc,kc->k", weights, depth[F[triangle]])
+        # The last of repeated indices stays: sorted by depth, the nearest one.
+        order = np.argsort(z, kind="stable")
+        order = order[z[order] >= nearest[pixel[order]]]
+        triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
+        nearest[pixel] = z
+        color = color_at(np.einsum("kc,kcd->kd", weights, board[F[triangle]]))
+        color[bad[triangle]] = RED
+        image[pixel, :3] = lit(color, light[triangle])
+        image[pixel, 3] = 1
+    grid = image.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 4)[::-1]
+    cover = grid[..., 3].sum(axis=(1, 3))
+    shown = grid[..., :3].sum(axis=(1, 3)) / np.maximum(cover, 1)[..., None]
+    return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
+
+
+def _checkered(places: FloatArray) -> FloatArray:
+    """Colours (k, 3) of a checkerboard whose squares have side 1."""
+    return np.where(np.floor(places).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
+
+
+def _pictured(path: str | PathLike[str]) -> Callable[[FloatArray], FloatArray]:
+    """What gives the colours (k, 3) of a picture that is the unit square, and is repeated beyond it."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(f"pictures need Pillow ({error}): pip install pillow") from error
+    from quasiharmonic.io import read_texture
+    from quasiharmonic.io.errors import MeshFileError
+
+    data = read_texture(path).data
+    try:
+        with Image.open(BytesIO(data)) as image:
+            # What is finer than the panel's samples would only glitter.
+            image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
+            glass = image.convert("RGBA")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise MeshFileError(path, f"is a damaged picture: {error}") from error
+    white = Image.new("RGBA", glass.size, "white")
+    # Lines from below, as v counts.
+    pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
+    size = np.array(pixels.shape[1::-1])
+
+    def color(places: FloatArray) -> FloatArray:
+        within = (places - np.floor(places)) * size - 0.5
+        left = np.floor(within).astype(np.int64)
+        (x, y), (s, t) = left.T, (within - left).T[:, :, None]
+        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1], (y + 1) % size[1]
+        below, above = (1 - s) * pixels[y, x] + s * pixels[y, right], (1 - s) * pixels[up, x] + s * pixels[up, right]
+        return np.asarray((1 - t) * below + t * above)
+
+    return color
+
+
+def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
+    """Yield, in chunks, triangles (k,), the samples (k,) that lie in them, and their barycentric coordinates (k, 3)."""
+    first = np.maximum(np.ceil(corners.min(axis=1) - 0.5), 0).astype(np.int64)
+    last = np.minimum(np.floor(corners.max(axis=1) - 0.5), side - 1).astype(np.int64)
+    extent = np.maximum(last - first + 1, 0)
+    count = extent.prod(axis=1)
+    cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
+    for part in np.split(np.arange(len(corners)), np.unique(cuts)):
+        many = count[part]
+        triangle = np.repeat(part, many)
+        within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+        column = first[triangle, 0] + within % np.maximum(extent[triangle, 0], 1)
+        row = first[triangle, 1] + within // np.maximum(extent[triangle, 0], 1)
+        at = np.stack([column, row], axis=1) + 0.5
+        a, b, c = corners[triangle].transpose(1, 0, 2)
+        whole = _cross(b - a, c - a)
+        whole = np.where(whole == 0, np.nan, whole)
+        weights = np.stack([_cross(b - at, c - at), _cross(c - at, a - at), _cross(a - at, b - at)], axis=1)
+        weights /= whole[:, None]
+        inside = (weights >= 0).all(axis=1)
+        yield triangle[inside], (row * side + column)[inside], weights[inside]
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

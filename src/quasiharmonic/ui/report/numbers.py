@@ -1,0 +1,190 @@
+"""What a report says in numbers: records as arrays, and what is counted of them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.problems import MARKER
+from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.arrays import FloatArray
+
+PHASES = "read", "setup", "map", "polish", "write", "measure"
+
+
+@dataclass(frozen=True)
+class Run:
+    """The records of a run, or of another program on the same problems.
+
+    Attributes
+    ----------
+    name : str
+        How the page calls it.
+    rows : list of dict
+        The records.
+    results : Path or None
+        Where the maps are, if they are at hand.
+    about : dict
+        What the run's own folder says of it; empty elsewhere.
+    """
+
+    name: str
+    rows: list[Record]
+    results: Path | None
+    about: Record
+
+    @property
+    def wanted(self) -> str:
+        """What maps were asked to be: ``"bijective"`` where boundaries were free, else ``"injective"``."""
+        free = any(row.get("outcome") in ("bijective", "not bijective") for row in self.rows)
+        return "bijective" if free or self.about.get("settings", {}).get("flatten") is True else "injective"
+
+    def column(self, name: str) -> FloatArray:
+        """A column of numbers, NaN where there is none; (records,)."""
+        values = (row.get(name) for row in self.rows)
+        return np.array([np.nan if not _is_number(v) else v for v in values], dtype=np.float64)
+
+    @property
+    def certified(self) -> NDArray[np.bool_]:
+        """Which records have a map certified to be what was asked for."""
+        return np.array([row.get("certified") is True for row in self.rows], dtype=np.bool_)
+
+
+def load(source: str | os.PathLike[str]) -> Run:
+    """Read the records of a run.
+
+    Parameters
+    ----------
+    source : path
+        The folder of a run, finished or going on, or a table of records.
+
+    Raises
+    ------
+    ValueError
+        When there are no records, or they cannot be read.
+    """
+    path = Path(source)
+    if not path.exists():
+        raise ValueError(f"there is no folder and no table {source}")
+    if not path.is_dir():
+        rows = list(records.read_table(path))
+        folder = path.parent
+    else:
+        folder = path
+        table = next((path / name for name in records.TABLES if (path / name).exists()), None)
+        rows = list(_single(path / "results") if table is None else records.read_table(table))
+    if not rows:
+        raise ValueError(f"there are no records in {source}: the folder of a run or a table of records is needed")
+    results = folder / "results"
+    return Run(path.resolve().name, rows, results if results.is_dir() else None, _about(folder))
+
+
+def _about(folder: Path) -> Record:
+    """What a run's folder says of it; nothing where it is none, or spoilt."""
+    try:
+        about = json.loads((folder / MARKER).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return about if isinstance(about, dict) and isinstance(about.get("settings"), dict) else {}
+
+
+def _single(results: Path) -> Iterable[Record]:
+    """Records of a run without a table: those that there are so far."""
+    for path in sorted(results.rglob(records.FILE)):
+        record = records.read_record(path.parent)
+        if record is not None:
+            yield record
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Group:
+    """What is counted of some records.
+
+    Attributes
+    ----------
+    name : str
+    problems, certified : int
+    seconds : tuple of float
+        Median, 95 % and maximum of the time of those certified; NaN where there are none.
+    stretch, mips : tuple of float
+        Worst and median of the worst stretch of those certified, and of their MIPS; NaN where there are none.
+    triangles : int
+    """
+
+    name: str
+    problems: int
+    certified: int
+    seconds: tuple[float, float, float]
+    stretch: tuple[float, float]
+    mips: tuple[float, float]
+    triangles: int
+
+
+def groups(run: Run) -> list[Group]:
+    """Count by the first part of the problems' names, and all together."""
+    first = np.array([row["problem"].partition("/")[0] if "/" in row["problem"] else "" for row in run.rows])
+    parts = [_group(run, str(name), first == name) for name in np.unique(first)]
+    everything = _group(run, "all", np.ones(len(run.rows), dtype=np.bool_))
+    # A folder for each problem, say, is no grouping.
+    return [*(parts if 1 < len(parts) <= 40 else []), everything]
+
+
+def _group(run: Run, name: str, chosen: NDArray[np.bool_]) -> Group:
+    good = run.certified & chosen
+    seconds, stretch, mips, triangles = (run.column(column) for column in ("seconds", "isometric", "mips", "triangles"))
+    return Group(
+        name=name,
+        problems=int(chosen.sum()),
+        certified=int(good.sum()),
+        seconds=(quantile(seconds[good], 0.5), quantile(seconds[good], 0.95), quantile(seconds[good], 1.0)),
+        stretch=(worst(stretch[good]), quantile(stretch[good], 0.5)),
+        mips=(worst(mips[good]), quantile(mips[good], 0.5)),
+        triangles=int(np.nansum(triangles[chosen])),
+    )
+
+
+def quantile(values: FloatArray, share: float) -> float:
+    """A quantile of the values that are finite, NaN where there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.quantile(finite, share)) if finite.size else float("nan")
+
+
+def worst(values: FloatArray) -> float:
+    """The largest of the values that there are, infinite ones included; NaN where there are none."""
+    known = values[~np.isnan(values)]
+    return float(known.max()) if known.size else float("nan")
+
+
+def outcomes(run: Run) -> list[tuple[str, int]]:
+    """How many records ended how, in the order of `records.OUTCOMES`; what is not known there comes last."""
+    counted = Counter(str(row.get("outcome") or _guess(row)) for row in run.rows)
+    order = [*records.OUTCOMES, *sorted(set(counted) - set(records.OUTCOMES))]
+    return [(name, counted[name]) for name in order if counted[name]]
+
+
+def _guess(row: Record) -> str:
+    return "injective" if row.get("certified") is True else "not injective"
+
+
+def matched(run: Run, other: Run, column: str) -> tuple[FloatArray, FloatArray]:
+    """A column of both for the problems that both have."""
+    theirs = {row["problem"]: row.get(column) for row in other.rows}
+    pairs = [
+        (row[column], theirs[row["problem"]])
+        for row in run.rows
+        if _is_number(row.get(column)) and _is_number(theirs.get(row["problem"]))
+    ]
+    ours, others = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+    return ours, others

@@ -1,0 +1,311 @@
+"""The page: what a run came to, in one file that opens anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Sequence
+from html import escape
+from math import isfinite, isnan
+
+import numpy as np
+
+from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.ui.batch.records import OUTCOMES, SOLVED, Record
+from quasiharmonic.ui.report import figures, numbers
+from quasiharmonic.ui.report.numbers import PHASES, Run
+from quasiharmonic.ui.report.style import STYLE
+from quasiharmonic.ui.report.thumbnails import thumbnail
+
+# Problems shown with a picture in each list, and failures named in all.
+_PICTURES, _FAILURES, _NAMED = 12, 24, 500
+
+
+def write_report(
+    path: str | os.PathLike[str],
+    source: str | os.PathLike[str],
+    against: str | os.PathLike[str] | None = None,
+) -> None:
+    """Write a page about a run: success, distortion, times, and the problems worth a look.
+
+    Parameters
+    ----------
+    path : path
+        The HTML file to write. Pictures and style are in it; it refers to nothing outside.
+    source : path
+        The folder of a run, or a table of records.
+    against : path, optional
+        The same of another run, or a table about another program, to compare with: columns ``problem``, named as
+        here, and ``seconds``, and ``mips`` and ``certified`` if there are any.
+
+    Raises
+    ------
+    ValueError
+        When there are no records, or they cannot be read.
+    OutputError
+        When the page cannot be written.
+    """
+    check_writable(path)
+    run = numbers.load(source)
+    other = None if against is None else numbers.load(against)
+    write_whole(path, _page(run, other).encode())
+
+
+def _page(run: Run, other: Run | None) -> str:
+    title = f"Report: {shown(run.name)}"
+    pictures = _Pictures(run)
+    sections = [
+        f"<h1>{title}</h1>",
+        _origin(run),
+        _tiles(run),
+        _outcomes(run),
+        _groups(run),
+        '<div class="pair">',
+        _distortion(run, other),
+        _times(run) if other is None else _compared(run, other),
+        *([] if other is None else [_times(run)]),
+        _phases(run),
+        "</div>",
+        _gallery("Most stretched of the certified, max(σ₁, 1/σ₂)", pictures, _worst(run, "isometric")),
+        _gallery("Most distorted of the certified (MIPS)", pictures, _worst(run, "mips")),
+        _gallery("Slowest of the certified", pictures, _worst(run, "seconds")),
+        _failures(run, pictures),
+    ]
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
+        'img-src data:">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{title}</title><style>{STYLE}</style></head>\n<body><main>\n"
+        + "\n".join(filter(None, sections))
+        + "\n</main></body></html>\n"
+    )
+
+
+def shown(text: object) -> str:
+    """Text from elsewhere as HTML: escaped, and what would not print or turns the reading direction spelled out."""
+    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+    return escape(plain)
+
+
+def number(value: float, unit: str = "") -> str:
+    """A number to three digits; a dash where there is none."""
+    if isnan(value):
+        return "–"
+    text = f"{value:,.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}" if isfinite(value) else "∞"
+    if "e" in text:
+        mantissa, exponent = text.split("e")
+        text = f"{mantissa}·{figures.power(int(exponent))}"
+    return text + (f" {unit}" if unit else "")
+
+
+def percent(part: int, whole: int) -> str:
+    """A share; 100 % only where it is all."""
+    share = 100 * part / whole
+    return "100 %" if part == whole else f"{min(share, 99.99):.2f} %" if share >= 99 else f"{share:.1f} %"
+
+
+def _origin(run: Run) -> str:
+    words = []
+    if run.about.get("source"):
+        words.append(f"Problems of <code>{shown(run.about['source'])}</code>.")
+    settings = run.about.get("settings", {})
+    if settings:
+        words.append("Settings: " + ", ".join(f"{shown(k)} {shown(v)}" for k, v in settings.items() if v) + ".")
+    for versions in sorted({str(row["versions"]) for row in run.rows if row.get("versions")}):
+        try:
+            words.append(", ".join(f"{shown(k)} {shown(v)}" for k, v in json.loads(versions).items()) + ".")
+        except (ValueError, AttributeError):
+            continue
+    return f'<p class="quiet">{" ".join(words)}</p>' if words else ""
+
+
+def _tiles(run: Run) -> str:
+    whole = numbers.groups(run)[-1]
+    tiles = [
+        (percent(whole.certified, whole.problems), f"{whole.certified:,} of {whole.problems:,} certified {run.wanted}"),
+        (number(whole.stretch[0]), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {number(whole.stretch[1])}"),
+        (number(whole.mips[0]), f"worst MIPS distortion of a map; median {number(whole.mips[1])}"),
+        (number(whole.seconds[0], "s"), f"median time of these; 95 % within {number(whole.seconds[1], 's')}"),
+        (number(whole.triangles), "triangles in all"),
+        (number(numbers.quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "memory of one problem at most"),
+    ]
+    cells = "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles)
+    return f'<div class="tiles">{cells}</div>'
+
+
+def _outcomes(run: Run) -> str:
+    counted = numbers.outcomes(run)
+    css = {**dict.fromkeys(SOLVED, "good"), "not injective": "bad", "not bijective": "bad"}
+    bar = "".join(f'<i class="{css.get(name, "broken")}" style="flex:{count}"></i>' for name, count in counted)
+    words = ", ".join(f"{count:,} {shown(OUTCOMES.get(name, name))}" for name, count in counted)
+    impossible = sum(row.get("status") == "impossible" for row in run.rows)
+    words += f"; it is proven of {impossible:,} that they have no such map" if impossible else ""
+    return f'<div class="bar">{bar}</div><p class="quiet">{words}</p>'
+
+
+def _groups(run: Run) -> str:
+    groups = numbers.groups(run)
+    if len(groups) == 1:
+        return ""
+    head = "problems", "certified", "success", "worst stretch", "worst MIPS", "median MIPS", "median", "95 %", "longest"
+    rows = [
+        (
+            shown(group.name or "(top)"),
+            *(f"{group.problems:,}", f"{group.certified:,}", percent(group.certified, group.problems)),
+            *(number(value) for value in (group.stretch[0], *group.mips)),
+            *(number(value, "s") for value in group.seconds),
+        )
+        for group in groups
+    ]
+    return _table(("folder", *head), rows, last_is_sum=True)
+
+
+def _distortion(run: Run, other: Run | None) -> str:
+    series = [("ours", run.column("mips")[run.certified])]
+    legend = [("ours", run.name)]
+    if other is not None:
+        mips = other.column("mips")
+        known = np.array(["certified" in row for row in other.rows], dtype=np.bool_)
+        mips = mips[other.certified | ~known]
+        if np.isfinite(mips).any():
+            series.append(("theirs", mips))
+            legend.append(("theirs", other.name))
+    medians = [number(numbers.quantile(values, 0.5)) for _, values in series]
+    caption = f"Over the certified maps. Median {' against '.join(medians)}."
+    return _figure(
+        "Distribution of distortion",
+        figures.histogram(series, "MIPS: mean of σ₁/σ₂ + σ₂/σ₁ − 2 over the surface"),
+        legend if len(legend) > 1 else [],
+        caption,
+    )
+
+
+def _times(run: Run) -> str:
+    good = run.certified
+    size, seconds = run.column("triangles"), run.column("seconds")
+    series = [("ours", size[good], seconds[good]), ("failed", size[~good], seconds[~good])]
+    legend = [("ours", f"certified {run.wanted}"), ("failed", "not")] if not good.all() else []
+    caption = "Each dot is a problem; wall time from the file to the record."
+    return _figure("Time and size", figures.scatter(series, "triangles", "seconds"), legend, caption)
+
+
+def _compared(run: Run, other: Run) -> str:
+    ours, theirs = numbers.matched(run, other, "seconds")
+    name = shown(other.name)
+    if not ours.size:
+        words = f"No problem of {name} has the name of one here and a time."
+        return f'<section class="card"><h2>Time against {name}</h2><p>{words}</p></section>'
+    with np.errstate(divide="ignore"):
+        ratio = numbers.quantile(theirs / ours, 0.5)
+    sentence = f"median {number(ratio)} times faster" if ratio >= 1 else f"median {number(1 / ratio)} times slower"
+    return _figure(
+        f"Time against {name}",
+        figures.scatter([("ours", theirs, ours)], f"seconds, {name}", f"seconds, {shown(run.name)}", same=True),
+        [],
+        f"Each dot is one of the {ours.size:,} problems that both have; {sentence}.",
+    )
+
+
+def _phases(run: Run) -> str:
+    totals = [(phase, float(np.nansum(run.column(f"seconds_{phase}")))) for phase in PHASES]
+    whole = sum(total for _, total in totals)
+    if not whole:
+        return ""
+    rows = [(phase, number(total, "s"), f"{100 * total / whole:.1f} %") for phase, total in totals if total]
+    rows.append(("all", number(whole, "s"), "100 %"))
+    table = _table(("phase", "time", "share"), rows, last_is_sum=True)
+    return f'<section class="card"><h2>Where the time went</h2>{table}</section>'
+
+
+def _worst(run: Run, column: str) -> list[Record]:
+    """The certified records with the highest values in a column, the highest first."""
+    values = np.where(run.certified, run.column(column), np.nan)
+    order = np.argsort(-values, kind="stable")
+    return [run.rows[k] for k in order[:_PICTURES] if not np.isnan(values[k])]
+
+
+class _Pictures:
+    """Thumbnails of a run, each drawn once."""
+
+    def __init__(self, run: Run) -> None:
+        self._results = run.results
+        self._drawn: dict[str, str] = {}
+
+    def of(self, row: Record) -> str:
+        """The ``data:`` address of a picture, or nothing."""
+        name = row["problem"]
+        if name not in self._drawn:
+            self._drawn[name] = thumbnail(row, self._results)
+        return self._drawn[name]
+
+
+def _gallery(title: str, pictures: _Pictures, rows: Sequence[Record]) -> str:
+    if not rows:
+        return ""
+    return f'<h2>{title}</h2><div class="gallery">{"".join(_card(row, pictures.of(row)) for row in rows)}</div>'
+
+
+def _card(row: Record, address: str) -> str:
+    picture = f'<img src="{address}" alt="">' if address else '<div class="nothing">no picture</div>'
+    facts = []
+    for column, form in (
+        ("triangles", "{} triangles"),
+        ("seconds", "{} s"),
+        ("mips", "MIPS {}"),
+        ("isometric", "max(σ₁, 1/σ₂) {}"),
+    ):
+        value = row.get(column)
+        if isinstance(value, int | float):
+            facts.append(form.format(number(value)))
+    if row.get("flips_after"):
+        facts.append(f"{row['flips_after']} inverted, {row.get('flips_before')} at the start")
+    words = f'<p class="why">{shown(_reason(row))}</p>' if row.get("certified") is not True else ""
+    title, line = shown(row["problem"]), shown(" · ".join(facts))
+    return f'<div class="card item">{picture}<h3>{title}</h3><p>{line}</p>{words}</div>'
+
+
+def _reason(row: Record) -> str:
+    outcome = str(row.get("outcome") or "")
+    error = " ".join(str(row.get("error") or "").split())
+    words = OUTCOMES.get(outcome, outcome)
+    text = f"{words}: {error}" if words and error else words or error
+    return text if len(text) <= 400 else text[:399] + "…"
+
+
+def _failures(run: Run, pictures: _Pictures) -> str:
+    rows = [row for row in run.rows if row.get("certified") is not True]
+    if not rows:
+        return "<h2>Failed</h2><p>None.</p>"
+    parts = [_gallery(f"Failed ({len(rows):,})", pictures, rows[:_FAILURES])]
+    rest = rows[_FAILURES:_NAMED]
+    if rest:
+        parts.append(_table(("problem", "triangles", "time", "why"), [_line(row) for row in rest]))
+    if len(rows) > _NAMED:
+        parts.append(f"<p>And {len(rows) - _NAMED:,} more, which the table of records has.</p>")
+    return "".join(parts)
+
+
+def _line(row: Record) -> tuple[str, ...]:
+    sizes = (row.get(column) for column in ("triangles", "seconds"))
+    triangles, seconds = (float("nan") if value is None else float(value) for value in sizes)
+    return shown(row["problem"]), number(triangles), number(seconds, "s"), shown(_reason(row))
+
+
+def _figure(title: str, drawing: str, legend: Iterable[tuple[str, str]], caption: str) -> str:
+    """A card with a figure; title and caption are HTML."""
+    keys = "".join(f'<span><i class="{css}"></i>{shown(name)}</span>' for css, name in legend)
+    keys = f'<div class="legend">{keys}</div>' if keys else ""
+    return f'<section class="card"><h2>{title}</h2>{keys}{drawing}<p class="quiet">{caption}</p></section>'
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, last_is_sum: bool = False) -> str:
+    """A table; all cells are HTML."""
+    top = "".join(f"<th>{cell}</th>" for cell in head)
+    lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
+    body = "".join(
+        f'<tr class="sum">{line}</tr>' if last_is_sum and k == len(lines) - 1 else f"<tr>{line}</tr>"
+        for k, line in enumerate(lines)
+    )
+    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -1,0 +1,78 @@
+"""Small pictures of problems and their maps, as they stand in files."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic import io
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.records import Record
+
+if TYPE_CHECKING:
+    from quasiharmonic.io import MeshData
+
+# Drawing takes about a second for so many triangles.
+_MOST = 100_000
+
+
+def thumbnail(record: Record, results: Path | None) -> str:
+    """Draw the surface and, where there is one, the map of a record.
+
+    Parameters
+    ----------
+    record : dict
+    results : Path or None
+        Where the run's maps are.
+
+    Returns
+    -------
+    str
+        A ``data:`` address of a PNG; empty where there is nothing that could be drawn.
+    """
+    if (record.get("triangles") or 0) > _MOST:
+        return ""
+    mesh, mapped = _read(record, results)
+    if mesh is None or not len(mesh.F) or len(mesh.F) > _MOST:
+        return ""
+    from quasiharmonic.ui.plot import plot_map, plot_surface
+    from quasiharmonic.ui.plot.canvas import new_figure, panels
+
+    figure = new_figure((3.2, 1.6) if mapped else (1.6, 1.6))
+    axes = panels(figure, 2 if mapped else 1)
+    for ax in axes:
+        ax.set_position((ax.get_position().x0, 0.03, ax.get_position().width, 0.94))
+    V = _framed(mesh.V)
+    plot_surface(V, mesh.F, axes[0])
+    if mapped:
+        opened, F, uv = io.without_idle(*io.cut_at_seams(mesh))
+        plot_map(_framed(opened), F, _framed(uv), ax=axes[1])
+    file = BytesIO()
+    figure.savefig(file, format="png")
+    return "data:image/png;base64," + b64encode(file.getvalue()).decode()
+
+
+def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
+    """The mesh to draw, and whether it has a map."""
+    places = [] if results is None else [(records.map_path(results / record["problem"]), True)]
+    if record.get("source"):
+        places.append((Path(record["source"]), False))
+    for path, mapped in places:
+        try:
+            if path.is_file():
+                return io.read_mesh(path), mapped
+        except (ValueError, OSError):
+            continue
+    return None, False
+
+
+def _framed(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points moved and scaled by powers of two into a box around the origin, where nothing overflows."""
+    points = np.ldexp(points, -int(np.frexp(np.abs(points).max())[1]))
+    points = points - points.mean(axis=0)
+    return np.ldexp(points, -int(np.frexp(np.abs(points).max() or 1.0)[1]))

@@ -1,0 +1,71 @@
+"""What moves with the hand: how far the boundary around a vertex goes along with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+#: How far along its loop a vertex that is no corner takes the boundary with it, as a share of the loop's length.
+REACH = 0.08
+
+
+def grip(
+    vertex: int, fixed: IntArray, target: FloatArray, loops: Sequence[IntArray], corners: Sequence[int]
+) -> FloatArray:
+    """Say by which share of the hand's way every held vertex moves.
+
+    A pin moves alone. A corner takes the sides beside it along, so that they stay as straight as they are; any other
+    boundary vertex bends its side, smoothly, and no farther than the side's ends.
+
+    Parameters
+    ----------
+    vertex : int
+        The vertex that is held by the hand.
+    fixed : (k,) int64
+    target : (k, 2) float64
+        Where they are.
+    loops : list of (l,) int64
+        Boundary loops.
+    corners : sequence of int
+        Boundary vertices at which sides end.
+
+    Returns
+    -------
+    (k,) float64
+        From 0 to 1, and 1 at the vertex.
+
+    Raises
+    ------
+    ValueError
+        When the vertex is not among those held.
+    """
+    row = np.flatnonzero(fixed == vertex)
+    if not row.size:
+        raise ValueError(f"vertex {vertex} is held by nothing: pin it first")
+    share = np.zeros(len(fixed))
+    share[row] = 1.0
+    loop = next((loop for loop in loops if vertex in loop), None)
+    if loop is None:
+        return share
+    loop = np.roll(loop, -int(np.flatnonzero(loop == vertex)[0]))
+    rows = np.empty(int(fixed.max()) + 1, dtype=np.int64)
+    rows[fixed] = np.arange(len(fixed))
+    places = target[rows[loop]]
+    lengths = np.hypot(*(np.roll(places, -1, axis=0) - places).T)
+    ahead = np.concatenate([[0.0], np.cumsum(lengths)])
+    whole, ahead = ahead[-1], ahead[:-1]
+    others = np.flatnonzero(np.isin(loop, [c for c in corners if c != vertex]))
+    is_corner = vertex in corners
+    for way, last in ((ahead, others[:1]), (whole - ahead, others[-1:])):
+        end = float(way[last[0]]) if last.size else (0.25 if is_corner else 1.0) * whole
+        if not is_corner:
+            end = min(end, REACH * whole)
+        if end <= 0:
+            continue
+        t = np.minimum(way / end, 1.0)
+        share[rows[loop]] = np.maximum(share[rows[loop]], 1 - t if is_corner else (1 - t**2) ** 2)
+    share[row] = 1.0
+    return share

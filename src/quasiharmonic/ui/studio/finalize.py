@@ -1,0 +1,82 @@
+"""The map at rest: the one that the command makes, found from nothing and smoothed, so that all can make it again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.energies.smoothing import LARGEST, STEPS, smoothed
+from quasiharmonic.geometry.curves import Rails
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import diagnose
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.solver.search.solving import solve
+
+#: Seconds for a search from nothing, where a map is at hand that has followed a hand there.
+PATIENCE = 10.0
+
+
+class Settled(NamedTuple):
+    """A map at rest.
+
+    Attributes
+    ----------
+    result : MapResult
+    anew : bool
+        Whether it is the one that is found from nothing, and so the command's; else it comes from the map before.
+    """
+
+    result: MapResult
+    anew: bool
+
+
+def settle(
+    problem: Problem,
+    before: MapResult | None = None,
+    *,
+    energy: str | None = None,
+    slide: bool | Rails = False,
+    callback: Callable[[Step], object] | None = None,
+) -> Settled:
+    """Find the map of a problem, and take the worst distortion off it.
+
+    Parameters
+    ----------
+    problem : Problem
+    before : MapResult, optional
+        An injective map of the same problem, which is kept where nothing better is found.
+    energy : str, optional
+        Lower this until it converges; a few steps of the blend otherwise.
+    slide : bool or Rails
+        As of `solve`, for ``energy``.
+    callback : callable, optional
+        Hears every `Step`; may raise `KeyboardInterrupt`.
+
+    Returns
+    -------
+    Settled
+        Whose result has a diagnosis where no bijective map was found.
+    """
+    until = time.monotonic() + PATIENCE
+
+    def hurry(step: Step) -> None:
+        if callback is not None:
+            callback(step)
+        if before is not None and energy is None and time.monotonic() > until:
+            raise KeyboardInterrupt
+
+    result = solve(problem, polish=energy, slide=slide, callback=hurry)
+    if result.status is Status.INJECTIVE and energy is None:
+        result = smoothed(problem, result, callback=callback)
+    anew = result.injective
+    if not anew and before is not None:
+        result = before
+        if len(problem.F) <= LARGEST:
+            further = polish_map(problem.domain, before.uv, energy="blend", max_iterations=STEPS, callback=callback)
+            result = replace(further, status=before.status)
+    if not result.certificate.bijective and result.diagnosis is None and result.status is not Status.INTERRUPTED:
+        result = replace(result, diagnosis=diagnose(problem))
+    return Settled(result, anew)

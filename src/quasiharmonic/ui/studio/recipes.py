@@ -1,0 +1,151 @@
+"""How a map on the page was made, and the command line and the Python that make it again."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+
+from quasiharmonic.energies.smoothing import LARGEST, STEPS
+from quasiharmonic.ui.studio.outlines import Outline
+from quasiharmonic.ui.studio.surface import Sheet
+
+#: What the page calls the files that it hands over.
+MAP, FIXED = "map.obj", "fixed.txt"
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """How a map was made.
+
+    Attributes
+    ----------
+    sheet : Sheet
+    outline : Outline or None
+        What the boundary was laid along, and has not been moved away from since; None where a hand, the file or a
+        free boundary has put it where it is.
+    corners : str or None
+        As ``--corners`` of the command takes them.
+    pinned : bool
+        Whether vertices inside are held.
+    free : bool
+        Whether the boundary went where distortion is least.
+    energy : str or None
+        What was lowered until it converged.
+    slide : bool
+        Whether the boundary slid meanwhile.
+    anew : bool
+        Whether it was found from nothing.
+    """
+
+    sheet: Sheet
+    outline: Outline | None = None
+    corners: str | None = None
+    pinned: bool = False
+    free: bool = False
+    energy: str | None = None
+    slide: bool = False
+    anew: bool = True
+
+    def files(self) -> list[str]:
+        """What the command and the Python read besides the surface's own file: names, in the order to be saved."""
+        if self.outline is None and not (self.free and not self.pinned):
+            return [MAP, FIXED] if self.pinned else [MAP]
+        return [self.outline.to] if self.outline is not None and self.outline.content is not None else []
+
+    def command(self) -> str:
+        """The line for a terminal."""
+        words = ["qhm"]
+        if self.free:
+            words += ["flatten", MAP if self.pinned else self.sheet.name]
+            words += self._fixed() if self.pinned else list(self.sheet.flags)
+            return shlex.join([*words, "-o", "flat.obj"])
+        if self.outline is not None:
+            words += ["map", self.sheet.name, *self.sheet.flags, "--to", self.outline.to]
+            words += [] if self.corners is None else ["--corners", self.corners]
+        elif self.anew:
+            words += ["map", MAP, *self._fixed()]
+        else:
+            return shlex.join(["qhm", "polish", MAP, *self._fixed(), "--energy", "blend", "-o", "again.obj"])
+        words += [] if self.energy is None else ["--polish", self.energy]
+        words += ["--slide"] if self.slide else []
+        return shlex.join([*words, "-o", "again.obj"])
+
+    def _fixed(self) -> list[str]:
+        return ["--fixed", FIXED] if self.pinned else []
+
+    def python(self) -> str:
+        """A script that ends with ``result``."""
+        names, lines = {"io"}, []
+        if self.outline is not None and not self.sheet.flags and self.sheet.seamed.seamless:
+            lines += [
+                f"mesh = io.read_mesh({self.sheet.name!r})",
+                "V, F = mesh.V, mesh.F",
+                f"contours = {self._contours()}",
+                f"fixed, target = boundary_to(V, F, contours{self._corners()})",
+            ]
+        elif self.free and not self.pinned:
+            lines += [f"mesh = io.read_mesh({self.sheet.name!r})", "V, F = mesh.V, mesh.F"]
+        else:
+            lines += [f"mesh = io.read_mesh({MAP!r})", "V, F, uv = io.cut_at_seams(mesh)"]
+            lines += [
+                f"fixed = io.read_handles({FIXED!r}, len(V))"
+                if self.pinned
+                else "fixed = np.unique(np.concatenate(boundary_loops(F, len(V))))"
+            ]
+            lines += ["target = uv[fixed]"]
+        solved, more = self._solved()
+        names |= more
+        text = "\n".join([*lines, *solved])
+        head = ["import numpy as np", ""] if "np." in text else []
+        head += [f"from quasiharmonic import {', '.join(sorted(names))}"]
+        if "boundary_loops" in text:
+            head += ["from quasiharmonic.geometry.mesh.topology import boundary_loops"]
+        if "boundary_to" in text:
+            used = [name for name in ("boundary_to", "filled", "outline") if f"{name}(" in text]
+            head += [f"from quasiharmonic.targets import {', '.join(used)}"]
+        if "Rails(" in text:
+            head += ["from quasiharmonic.targets import outline_curves"]
+        return "\n".join([*head, "", text, "print(result.certificate.summary())", ""])
+
+    def _contours(self) -> str:
+        assert self.outline is not None
+        text = f"outline({self.outline.to!r})"
+        # The surface has no holes to lay along those of a letter.
+        return f"filled({text})" if len(self.outline.contours) > 1 and not self._holes() else text
+
+    def _holes(self) -> bool:
+        from quasiharmonic.geometry.mesh.topology import boundary_loops
+
+        island = self.sheet.island
+        return len(boundary_loops(island.F, len(island.V))) > 1
+
+    def _corners(self) -> str:
+        if self.corners is None:
+            return ""
+        if self.corners == "auto":
+            return ', corners="auto"'
+        return f", corners={{{', '.join(part.replace(':', ': ') for part in self.corners.split(','))}}}"
+
+    def _solved(self) -> tuple[list[str], set[str]]:
+        """The lines that solve, and the public names that they use."""
+        if self.free:
+            held = ", fixed=inside, target=uv[inside]" if self.pinned else ""
+            pins = ["edge = np.concatenate(boundary_loops(F, len(V)))", "inside = np.setdiff1d(fixed, edge)"]
+            return [*(pins if self.pinned else []), f"result = flatten(V, F{held})"], {"flatten"}
+        options = "" if self.energy is None else f", polish={self.energy!r}"
+        if self.slide and self.outline is not None:
+            options += f", slide=Rails(outline_curves({self.outline.to!r}){self._held()})"
+        elif self.slide:
+            options += ", slide=True"
+        start = "" if self.anew else ", start=uv"
+        lines = [f"result = injective_map(V, F, fixed, target{options}{start})"]
+        names = {"injective_map"} | ({"Rails"} if self.slide and self.outline is not None else set())
+        if self.energy is None and len(self.sheet.island.F) <= LARGEST:
+            polished = f'polish(V, F, result.uv, fixed=fixed, energy="blend", max_iterations={STEPS})'
+            return [*lines, f"result = {polished}"], names | {"polish"}
+        return lines, names
+
+    def _held(self) -> str:
+        if self.corners is None or self.corners == "auto":
+            return ""
+        return f", held=[{', '.join(part.partition(':')[0] for part in self.corners.split(','))}]"

@@ -1,0 +1,209 @@
+"""The server of the page: the page's files, and for each page that is open a process that computes for it.
+
+It listens on this machine alone. Everything it hands out asks for the token that is in the address, which a
+browser sends for no other site; a request that names another host is refused, so that no other name can be made to
+point here, and so is a socket that was opened from another origin.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import logging
+import secrets
+from collections.abc import Callable
+from http import HTTPStatus
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.http11 import Request, Response
+
+from quasiharmonic.ui.studio.assets import assets
+from quasiharmonic.ui.studio.pages import Page
+from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
+
+HOST = "127.0.0.1"
+#: Bytes of a file dropped on a page, and pages at a time.
+MOST_BYTES, MOST_PAGES = 128 << 20, 8
+#: How a socket is closed while there are so many.
+TRY_LATER = 1013
+# Nothing is loaded from elsewhere, nothing may frame the page, and the address with its token is told to nobody.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class Studio:
+    """The server.
+
+    Parameters
+    ----------
+    source : str
+        The file that pages begin with; a surface of ours if it is empty.
+    token : str, optional
+        What has to be in the address.
+    """
+
+    def __init__(self, source: str = "", token: str | None = None) -> None:
+        self.source = source
+        self.token = secrets.token_urlsafe(24) if token is None else token
+        self.port = 0
+        self._pages: set[Page] = set()
+        self._open = 0
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        return f"http://{HOST}:{self.port}/{self.token}/"
+
+    async def run(self, port: int = 0, ready: Callable[[str], object] = lambda address: None) -> None:
+        """Serve until cancelled.
+
+        Parameters
+        ----------
+        port : int
+            Any that is free for 0.
+        ready : callable
+            Is told the address.
+
+        Raises
+        ------
+        OSError
+            When the port is taken.
+        """
+        async with serve(
+            self._page,
+            HOST,
+            port,
+            process_request=self._request,
+            max_size=MOST_BYTES + (1 << 20),
+            # A message is read when the one before it has been taken: no more than one waits, however large.
+            max_queue=0,
+            compression=None,
+            logger=_logger(),
+            server_header=None,
+            ping_timeout=60,
+            close_timeout=2,
+        ) as server:
+            self.port = _port_of(server)
+            ready(self.address)
+            try:
+                await server.serve_forever()
+            finally:
+                await asyncio.gather(*(page.ended() for page in list(self._pages)))
+
+    def _request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse a request, answer it with a file, or let it become a socket."""
+        hosts = request.headers.get_all("Host")
+        if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
+            return _answer(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
+        if getattr(request, "method", "GET") != "GET":
+            return _answer(HTTPStatus.METHOD_NOT_ALLOWED, "files are read with GET", allow="GET")
+        path = request.path.partition("?")[0]
+        key = "".join(request.headers.get_all("Sec-WebSocket-Key"))
+        if not path.startswith("/") or not path.isascii() or not key.isascii():
+            return _answer(HTTPStatus.BAD_REQUEST, "the request is malformed")
+        token, slash, name = path[1:].partition("/")
+        if not hmac.compare_digest(token.encode(), self.token.encode()):
+            return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of it")
+        if not slash:
+            # What the page asks for lies beside it, behind the slash that was left out.
+            return _answer(HTTPStatus.PERMANENT_REDIRECT, "the address ends with a slash", location=f"/{self.token}/")
+        if name == "socket":
+            origins = request.headers.get_all("Origin")
+            if origins != [f"http://{hosts[0]}"]:
+                return _answer(HTTPStatus.FORBIDDEN, "the page of another site must not speak to this one")
+            return None
+        asset = assets().get(name or "index.html")
+        if asset is None:
+            return _answer(HTTPStatus.NOT_FOUND, "there is no such file")
+        return _answer(HTTPStatus.OK, asset.content, asset.kind)
+
+    async def _page(self, connection: ServerConnection) -> None:
+        """Connect a page with a process, if there are not too many pages."""
+        if self._open >= MOST_PAGES:
+            # Said here and not in the answer to the request, which a browser shows to no script.
+            await connection.close(TRY_LATER, f"{MOST_PAGES} pages are open")
+            return
+        # Counted before anything is awaited: pages that are opened at once must not all find room.
+        self._open += 1
+        try:
+            await self._carry(connection)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._open -= 1
+
+    async def _carry(self, connection: ServerConnection) -> None:
+        """Carry messages between a page and its process until one of them ends."""
+
+        async def tell(message: bytes) -> None:
+            await connection.send(message)
+
+        await tell(encode({"kind": "hello", "most_bytes": MOST_BYTES}))
+        try:
+            page = await Page.start(self.source, tell)
+        except OSError as error:
+            reason = f"no process can be started for this page: {error.strerror or error}"
+            await tell(encode({"kind": "note", "level": "error", "text": reason}))
+            await connection.close(TRY_LATER, reason[:100])
+            return
+        self._pages.add(page)
+        listening = asyncio.ensure_future(self._listen(connection, page))
+        try:
+            why = await page.run()
+            await tell(encode({"kind": "note", "level": "gone", "text": f"{why}. The page begins anew."}))
+            await connection.close(1011, "the process has ended")
+        finally:
+            listening.cancel()
+            await page.ended()
+            self._pages.discard(page)
+
+    async def _listen(self, connection: ServerConnection, page: Page) -> None:
+        """Hand over what the page sends."""
+        try:
+            async for message in connection:
+                if isinstance(message, str):
+                    await connection.close(1003, "messages are binary")
+                    break
+                try:
+                    stops = decode(message).header.get("do") == "stop"
+                except ProtocolError as error:
+                    await connection.close(1007, str(error)[:100])
+                    break
+                await page.send(message, stops=stops)
+        except ConnectionClosed:
+            pass
+        finally:
+            # Whoever has gone waits for nothing.
+            page.end()
+
+
+def _logger() -> logging.Logger:
+    """A logger that passes on errors of the server, and leaves out what only a client has done wrong."""
+    logger = logging.getLogger(__name__)
+    logger.addFilter(_not_the_clients)
+    return logger
+
+
+def _not_the_clients(record: logging.LogRecord) -> bool:
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, (WebSocketException, EOFError, ConnectionError))
+
+
+def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; charset=utf-8", **further: str) -> Response:
+    content = body.encode() + b"\n" if isinstance(body, str) else body
+    headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
+    headers.update({name.title(): value for name, value in further.items()})
+    return Response(status.value, status.phrase, headers, content)
+
+
+def _port_of(server: Server) -> int:
+    port: int = next(iter(server.sockets)).getsockname()[1]
+    return port

@@ -1,0 +1,61 @@
+"""Display of results: one line in a console, a picture in a notebook.
+
+A result does not import the code that draws it. The drawing package is registered here as a function that imports it,
+and that function is called when a result is displayed for the first time.
+"""
+
+from __future__ import annotations
+
+# As of `typing`, whose import would take longer than all else here.
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+    from matplotlib.figure import Figure
+
+_loader: Callable[[], Any] | None = None
+
+
+def register_renderer(loader: Callable[[], Any]) -> None:
+    """Set the function that imports the drawing package.
+
+    Parameters
+    ----------
+    loader : callable
+        Called without arguments. What it returns has ``html(result) -> str`` and
+        ``draw(result, kind, **options) -> Figure``.
+    """
+    global _loader
+    _loader = loader
+
+
+class Displayable:
+    """Base of the results that have a short text, a summary and a picture in a notebook."""
+
+    def summary(self) -> str:
+        """Describe the result in a few lines."""
+        raise NotImplementedError
+
+    def short_repr(self) -> str:
+        """Describe the result in a few words."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.short_repr()}>"
+
+    def _repr_html_(self) -> str:
+        html: str = _renderer().html(self)
+        return html
+
+    def _draw(self, kind: str, **options: Any) -> Figure:
+        """Draw one kind of figure of the result."""
+        figure: Figure = _renderer().draw(self, kind, **options)
+        return figure
+
+
+def _renderer() -> Any:
+    """The drawing package, imported at the first call."""
+    assert _loader is not None, "quasiharmonic/__init__.py registers it"
+    return _loader()
