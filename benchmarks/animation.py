@@ -146,7 +146,7 @@ def ways(scene: Scene) -> dict[str, tuple[FloatArray, FloatArray, float]]:
             results, last = [], None
             for target in targets:
                 start = last if name == "from the last" else None
-                results.append(solve(problem.moved(target), start=start, polish=ENERGY))
+                results.append(solve(problem.with_target(target), start=start, polish=ENERGY))
                 assert results[-1].injective, results[-1].status
                 last = results[-1].uv
             uv = np.stack([result.uv for result in results])

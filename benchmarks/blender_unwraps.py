@@ -1,4 +1,4 @@
-"""Blender's own unwraps and ours, on surfaces that are disks: flipped and overlapping faces, stretch, seconds.
+"""Blender's own unwraps and ours, on surfaces that are disks: inverted and overlapping faces, stretch, seconds.
 
     python benchmarks/blender_unwraps.py [FILE.obj | FOLDER …]
 
@@ -7,7 +7,7 @@ folders; without any, surfaces that the project makes. Blender unwraps in its th
 the two vertices of the border that are farthest apart pinned as far apart as they are in space, the surface's area
 taken for 1; ours is `flatten`, the same two held or none. Flipped triangles and overlap are judged exactly, on what
 Blender holds, in single precision; ours after the same rounding. Stretch is the mean symmetric Dirichlet energy at the
-surface's area, 4 for an isometry, "∞" where a triangle is flipped. Seconds are of the wall.
+surface's area, 4 for an isometry, "∞" where a triangle is inverted. Seconds are of the wall.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def stretch(V: FloatArray, F: IntArray, uv: FloatArray) -> float:
 def row(name: str, way: str, V: FloatArray, F: IntArray, uv: FloatArray, seconds: float) -> str:
     """A line of the table."""
     verdict = certify(F, uv.astype(np.float32).astype(np.float64))
-    wrong = len(verdict.flipped) + len(verdict.degenerate)
+    wrong = len(verdict.inverted) + len(verdict.degenerate)
     told = "∞" if wrong else f"{stretch(V, F, uv):.3f}"
     overlap = "no" if verdict.bijective else "yes"
     return f"| {name} | {len(F):,} | {way} | {wrong} | {overlap} | {told} | {seconds:.2f} |"
@@ -121,7 +121,7 @@ def main() -> None:
     # Without the cube, which would be unwrapped too.
     bpy.ops.wm.read_factory_settings(use_empty=True)
     print(f"{platform.machine()}, Blender {bpy.app.version_string}, Python {platform.python_version()}\n")
-    print("| surface | triangles | way | flipped | overlap | stretch | seconds |\n|---|---|---|---|---|---|---|")
+    print("| surface | triangles | way | inverted | overlap | stretch | seconds |\n|---|---|---|---|---|---|---|")
     for name, V, F in cases(options.paths):
         print(name, file=sys.stderr, flush=True)
         for line in compare(name, V, F):

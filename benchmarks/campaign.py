@@ -35,7 +35,7 @@ import numpy as np
 from problems import ADVERSARIAL, FAMILIES, make, parse
 from quasiharmonic import Problem, Status, solve
 from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.solver.refine.solve_refining import climb
+from quasiharmonic.solver.refine.attempts import solve_refining
 from quasiharmonic.solver.search.strategy import STRATEGIES
 
 Record = dict[str, Any]
@@ -88,20 +88,20 @@ def run(
 
 def _solved(problem: Problem, strategy: str, max_iterations: int, refine: bool) -> Record:
     began, effort = time.perf_counter(), time.process_time()
-    way = climb if refine else solve
+    way = solve_refining if refine else solve
     result = way(problem, strategy=strategy, max_iterations=max_iterations)
     seconds, cpu = time.perf_counter() - began, time.process_time() - effort
     told = {}
     if refine:
         # What is sure to have a bijective map, on a mesh that is fine enough, if doubles have room for one.
-        told = {"promised": is_simple(problem), "no_room": result.status is Status.NO_ROOM}
-        told |= {"added": result.added, "rung": result.rungs[-1].name}
+        told = {"promised": is_simple(problem), "no_room": result.status is Status.PRECISION_LIMIT}
+        told |= {"added": result.added, "rung": result.refinement_attempts[-1].name}
     verdict = "injective" if result.injective else "not injective"
     energy = min((step.energy for step in result.history), default=np.nan)
     return {
         "outcome": verdict if np.isfinite(result.uv).all() else "not finite",
         "status": result.status.name.lower(),
-        "flipped": len(result.certificate.flipped) + len(result.certificate.degenerate),
+        "inverted": len(result.certificate.inverted) + len(result.certificate.degenerate),
         "bijective": result.certificate.bijective,
         "iterations": result.iterations,
         "energy": energy if np.isfinite(energy) else None,
@@ -110,7 +110,7 @@ def _solved(problem: Problem, strategy: str, max_iterations: int, refine: bool) 
         "loops": len(problem.domain.loops),
         "pins": len(problem.domain.pins),
         "interior": problem.n - len(problem.fixed),
-        "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
+        "stages": [(s.name, s.iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
         **told,
     }
 

@@ -57,7 +57,7 @@ def main() -> None:
                     )
                 )
             result = solve(problem, strategy=stages)
-            flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
+            flips = len(result.certificate.inverted) + len(result.certificate.degenerate)
             mips = distortion(problem.V, problem.F, result.uv).summary("mips").mean if result.injective else np.nan
             row = [f"{folder.parent.name}/{folder.name}", len(problem.F), functional, parameterisation, method]
             table.writerow([*row, flips, result.iterations, f"{result.seconds:.3f}", f"{mips:.3f}"])

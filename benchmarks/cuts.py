@@ -103,7 +103,7 @@ def compare(cases: Iterator[Surface], gains: list[float], pictures: Path | None)
         ways = {f"gain {gain:g}": gain for gain in [np.inf, *gains]}
         for way in ["before", *ways]:
             began = time.process_time()
-            cut = find_cuts(V, F, gain=ways[way]) if way in ways else former_cuts(V, F)
+            cut = find_cuts(V, F, min_gain=ways[way]) if way in ways else former_cuts(V, F)
             seconds = time.process_time() - began
             rows.append(judged(name, way, V, F, cut, seconds))
             if pictures is not None and way in ways:

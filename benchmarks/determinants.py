@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic import Problem
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.field.functionals import beltrami_gradient, twist
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TensorField
@@ -72,7 +72,7 @@ def descend(problem: Problem, *, iterations: int, free: bool, parameterisation: 
     fewest = f
     for k in range(1, iterations + 1):
         _, *slopes, w = functional.evaluate(xi, s)
-        flips = flipped_triangles(problem.F, problem.positions(w)).size
+        flips = inverted_triangles(problem.F, problem.positions(w)).size
         fewest = min(fewest, flips)
         if flips == 0:
             return 0, k - 1

@@ -130,7 +130,7 @@ def measured(name: str) -> dict[str, Any]:
             continue
         result, seconds = limited(problem, strategy)
         if run == "paper":
-            row["start_flipped"] = result.history[0].flipped
+            row["start_flipped"] = result.history[0].inverted
         row[f"{run}_stage"] = len(result.stages) if result.injective else 0
         row[f"{run}_iterations"] = result.iterations
         row[f"{run}_seconds"] = f"{seconds:.4f}"

@@ -78,7 +78,7 @@ def main(output: Path, counts: tuple[int, ...] = COUNTS) -> list[dict[str, float
     for count in counts:
         field = synthetic(count)
         began = time.process_time()
-        mended = nearest_invertible(field, least=LEAST)
+        mended = nearest_invertible(field, min_jacobian=LEAST)
         seconds = time.process_time() - began
         assert fold_free(mended.field).all()
         assert lowest(mended.field) > LEAST
@@ -89,7 +89,7 @@ def main(output: Path, counts: tuple[int, ...] = COUNTS) -> list[dict[str, float
                 "bumps": count,
                 "side": len(field),
                 "cells": mended.folds,
-                "moved": float(mended.moved.mean()),
+                "moved": float(mended.moved_mask.mean()),
                 "rms": near[0],
                 "largest": near[1],
                 "bijective": bool(mended.certificate.bijective),

@@ -23,7 +23,7 @@ import positive_weights
 import problems
 from hyperbolic import HyperbolicAdam
 from quasiharmonic import Problem, boundary_loops, solve, targets
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.util.arrays import FloatArray
 
@@ -58,7 +58,7 @@ def trials(seeds: int = 1, surfaces: Sequence[str] = ("angel", "rabbit", "hand")
 def outcome(problem: Problem, stage: VectorAdam, start: FloatArray | None = None) -> Outcome:
     """Of one method alone."""
     result = solve(problem, strategy=[stage], start=start, max_iterations=stage.iterations)
-    return len(result.certificate.flipped) + len(result.certificate.degenerate), result.iterations
+    return len(result.certificate.inverted) + len(result.certificate.degenerate), result.iterations
 
 
 def hyperbolic(problem: Problem) -> dict[str, Outcome]:
@@ -126,7 +126,7 @@ def starts(problem: Problem) -> dict[str, Any]:
             continue
         uv = np.array(uv, dtype=np.float64)
         uv[fixed] = target
-        found[name] = f"{flipped_triangles(F, uv).size} inverted"
+        found[name] = f"{inverted_triangles(F, uv).size} inverted"
         found[f"from {name}"] = outcome(problem, VectorAdam(iterations=ITERATIONS), uv)
     return found
 

@@ -84,7 +84,7 @@ def measure(surface: str, V: FloatArray, F: IntArray, letter: str, column: str, 
     began = time.process_time()
     result = solve(problem, strategy=[stage], max_iterations=iterations)
     seconds = time.process_time() - began
-    flips = len(result.certificate.flipped) + len(result.certificate.degenerate)
+    flips = len(result.certificate.inverted) + len(result.certificate.degenerate)
     mips = f"{distortion(V, F, result.uv).summary('mips').mean:.3g}" if result.injective else ""
     return Run(surface, letter, len(F), column, result.iterations, flips, mips, round(seconds, 2))
 

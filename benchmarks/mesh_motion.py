@@ -26,9 +26,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from mesh_movers import Extended, Kratos, Morphed, Mover, Ours, compact, elasticity, harmonic, thin_plate
+from mesh_movers import Extended, Kratos, MorphResult, Mover, Ours, compact, elasticity, harmonic, thin_plate
 from moving_scenes import SCENES, Scene
-from quasiharmonic import __version__, flipped_triangles
+from quasiharmonic import __version__, inverted_triangles
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.util.arrays import FloatArray
 
@@ -50,7 +50,7 @@ if importlib.util.find_spec("KratosMultiphysics") is not None:
         ("Kratos, similarity", "own"): partial(Kratos, kind="structural_similarity"),
     }
 METHODS[OURS, "last"] = Ours
-METHODS[MORPH, "first"] = Morphed
+METHODS[MORPH, "first"] = MorphResult
 #: Methods of which only every so many-th step is taken, and the last: a step of theirs costs as much as many of others.
 SELDOM = {(MORPH, "first"): 8}
 #: Scenes of which something is known that forbids to go on.
@@ -107,7 +107,7 @@ def race(scene: Scene, steps: int | None = None) -> tuple[dict[tuple[str, str], 
             began = time.process_time()
             V = mover.step(target)
             runs[key].seconds.append(time.process_time() - began)
-            if V is None or not np.isfinite(V).all() or flipped_triangles(scene.F, V).size:
+            if V is None or not np.isfinite(V).all() or inverted_triangles(scene.F, V).size:
                 del movers[key]
                 continue
             shape, like = mean_ratio(V, scene.F), likeness(scene, V)

@@ -186,7 +186,7 @@ class Ours:
             return None
 
 
-class Morphed:
+class MorphResult:
     """`quasiharmonic.morph`, as it comes: each displacement as one step from the first mesh."""
 
     def __init__(self, scene: Scene) -> None:

@@ -29,7 +29,7 @@ from skfem.models.poisson import laplace, mass
 
 from mesh_movers import Extended, Mover, Ours, elasticity, harmonic
 from moving_scenes import Scene, travelling_hole
-from quasiharmonic import flipped_triangles
+from quasiharmonic import inverted_triangles
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -107,7 +107,7 @@ def run(scene: Scene, mover: Mover, steps: int) -> History:
     history = History([0.0], [0.0], [mean_ratio(V, F).min()], [V], [spot])
     for k in range(1, steps + 1):
         there = mover.step(scene.target(k / steps))
-        if there is None or flipped_triangles(F, there).size or flipped_triangles(F, (V + there) / 2).size:
+        if there is None or inverted_triangles(F, there).size or inverted_triangles(F, (V + there) / 2).size:
             break
         u = step(V, there, F, u, dt)
         V = there

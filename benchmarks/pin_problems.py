@@ -242,14 +242,14 @@ def _flow(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, f
 
 def _mixed(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
     """Two to four of these, one after the other, each about as strong as it leaves the map bijective."""
-    for name in rng.choice(["swirl", "overwound", "bend", "pinch", "wave", "flow"], rng.integers(2, 5)).tolist():
+    for name in rng.choice(["swirl", "multiply_wound", "bend", "pinch", "wave", "flow"], rng.integers(2, 5)).tolist():
         z, strength = FAMILIES[name](rng, (z - z.mean()) / planar.span(z), F)
     return z, strength
 
 
 FAMILIES: dict[str, Callable[[Generator, ComplexArray, IntArray], tuple[ComplexArray, float]]] = {
     "swirl": _swirl,
-    "overwound": _overwound,
+    "multiply_wound": _overwound,
     "bend": _bend,
     "pinch": _pinch,
     "wave": _wave,
@@ -257,4 +257,4 @@ FAMILIES: dict[str, Callable[[Generator, ComplexArray, IntArray], tuple[ComplexA
     "mixed": _mixed,
 }
 # Strengths below which a problem is not worth its name.
-WEAKEST = {"swirl": 0.5, "overwound": 4.0, "bend": 0.5, "pinch": 0.4, "wave": 0.3, "flow": 0.1, "mixed": 0.0}
+WEAKEST = {"swirl": 0.5, "multiply_wound": 4.0, "bend": 0.5, "pinch": 0.4, "wave": 0.3, "flow": 0.1, "mixed": 0.0}

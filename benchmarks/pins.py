@@ -58,11 +58,11 @@ def run(name: str, scans: Sequence[Path]) -> Record:
                 "outcome": "solved" if certificate.bijective and met else "not solved",
                 "status": result.status.name.lower(),
                 "placing": round(sum(stage.seconds for stage in result.stages[:-1]), 4),
-                "flipped": len(certificate.flipped),
+                "inverted": len(certificate.inverted),
                 "summary": certificate.summary(),
                 "energy": result.history[-1].energy if result.history else None,
                 "diagnosis": result.diagnosis.summary() if result.diagnosis is not None else None,
-                "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
+                "stages": [(s.name, s.iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
             }
         except Exception as error:
             record |= {"outcome": "exception", "message": repr(error), "trace": traceback.format_exc(limit=-4)}

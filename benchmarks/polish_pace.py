@@ -48,7 +48,7 @@ _CLOCKED = (
 PHASES = tuple(dict.fromkeys(phase for *_, phase in _CLOCKED))
 
 
-class Pace(NamedTuple):
+class AdamState(NamedTuple):
     """One polish: seconds of the processor and energy after each step, seconds of all, and seconds by phase."""
 
     seconds: list[float]
@@ -64,7 +64,7 @@ class Pace(NamedTuple):
         return None
 
 
-def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e-4, most: int = 200) -> Pace:
+def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e-4, most: int = 200) -> AdamState:
     """Polish a first map and write down how it goes."""
     seconds: list[float] = []
     energies: list[float] = []
@@ -82,7 +82,7 @@ def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e
             problem.domain, uv, tolerance=tolerance, max_iterations=most, linear_solver=solver, callback=told
         )
         whole = phases.clock() - began
-    return Pace(seconds, energies, whole, clock.seconds)
+    return AdamState(seconds, energies, whole, clock.seconds)
 
 
 def cases(folders: list[Path], sizes: list[int]) -> Iterator[tuple[str, Problem]]:

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from quasiharmonic import Problem
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
@@ -86,7 +86,7 @@ class Means:
         for sharp in np.repeat(SHARPENING, iterations):
             w, slope = self.evaluate(theta, float(sharp))
             done += 1
-            fewest = min(fewest, flipped_triangles(self.problem.F, self.problem.positions(w)).size)
+            fewest = min(fewest, inverted_triangles(self.problem.F, self.problem.positions(w)).size)
             if fewest == 0:
                 break
             mean = 0.9 * mean + 0.1 * slope

@@ -213,7 +213,7 @@ def animation(triangles: int) -> list[Record]:
             if record is afresh:
                 result = mapping.injective_map(V, F, loop, bent(angle))
             else:
-                problem = problem.moved(bent(angle))
+                problem = problem.with_target(bent(angle))
                 result = solve(problem, start=last)
                 last = result.uv
             record.seconds.append(phases.clock() - began)

@@ -141,8 +141,8 @@ def run(number: int, pose: Callable[[int], Pair]) -> Record:
         "injective": result.injective,
         "impossible": result.status is Status.IMPOSSIBLE,
         "iterations": result.iterations,
-        "flipped": len(result.certificate.flipped),
-        "stages": [(s.name, s.iterations, *s.flipped, round(s.seconds, 4)) for s in result.stages],
+        "inverted": len(result.certificate.inverted),
+        "stages": [(s.name, s.iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
     }
 
 

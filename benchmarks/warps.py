@@ -36,9 +36,9 @@ def scenes() -> dict[str, dict[str, Any]]:
     line = SIDE * np.stack([along, 0.5 + 0 * along], axis=1)
     bend = SIDE * np.stack([along, 0.5 + 0.15 * np.sin(2 * np.pi * (along - 0.25) / 0.5)], axis=1)
     return {
-        "one landmark": {"landmarks": [[104, 128]], "moved": [[152, 128]]},
-        "six, turned": {"landmarks": ring, "moved": went},
-        "a curve": {"landmarks": [], "moved": [], "curves": [(line, bend)]},
+        "one landmark": {"landmarks": [[104, 128]], "target": [[152, 128]]},
+        "six, turned": {"landmarks": ring, "target": went},
+        "a curve": {"landmarks": [], "target": [], "curves": [(line, bend)]},
     }
 
 
@@ -62,7 +62,7 @@ def measured(resolutions: list[int]) -> list[dict[str, Any]]:
                         "scene": scene,
                         "kind": kind,
                         "resolution": resolution,
-                        "stretch": worst(warped.points, warped.F, warped.moved),
+                        "stretch": worst(warped.points, warped.F, warped.positions),
                         "seconds": time.process_time() - began,
                         "bijective": warped.result.certificate.bijective,
                     }

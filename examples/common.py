@@ -18,7 +18,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from quasiharmonic import MapResult, Problem, boundary_loops, flipped_triangles, solve, surfaces, targets
+from quasiharmonic import MapResult, Problem, boundary_loops, inverted_triangles, solve, surfaces, targets
 from quasiharmonic.plot import plot_map
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.util.arrays import FloatArray
@@ -70,7 +70,7 @@ def mips(problem: Problem, uv: FloatArray) -> float:
 
 def flips(problem: Problem, uv: FloatArray) -> int:
     """Triangles that are not strictly positive, exactly."""
-    return int(flipped_triangles(problem.F, uv).size)
+    return int(inverted_triangles(problem.F, uv).size)
 
 
 def colorbar(figure: Figure, drawn: PolyCollection, label: str = "σ₁/σ₂", extend: str = "max") -> None:

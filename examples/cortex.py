@@ -213,7 +213,7 @@ def main(output: Path, rings: int = 20, autoflatten: bool = False, subdivided: b
         show_map(axes[1][k], brain, uv, errors.to_rgba(100 * around)[:, :3])
         took = "" if seconds is None else f", {seconds:.1f} s"
         axes[0][k].set_title(f"{name}{took}", size=11)
-        inverted = judged.flipped.size + judged.degenerate.size
+        inverted = judged.inverted.size + judged.degenerate.size
         axes[1][k].set_title(
             f"distances {100 * error.mean:.1f} % off, {'bijective' if judged.bijective else f'{inverted} inverted'}",
             size=11,

@@ -3,10 +3,10 @@
 
 Two closed surfaces made of formulas. Middle: ``flatten`` after one cut, ``cut_open(V, F)``, between two points far from
 each other. A limb that no cut reaches lies there as a disk, its rim stretched and its end pressed together. Right:
-``flatten`` after all cuts that are worth their length, ``cut_open(V, F, gain=0.1)``. They go to the ends of arms, legs,
-ears and fingers, are drawn at the left, and worth a factor of 80 in the one energy and of 25 in the other. Colours are
-how far lengths change at most, max(σ₁, 1/σ₂); the creatures have those of the map at the right. All four maps are
-bijective, and took 1 to 7 s on one core.
+``flatten`` after all cuts that are worth their length, ``cut_open(V, F, min_gain=0.1)``. They go to the ends of arms,
+legs, ears and fingers, are drawn at the left, and worth a factor of 80 in the one energy and of 25 in the other.
+Colours are how far lengths change at most, max(σ₁, 1/σ₂); the creatures have those of the map at the right. All four
+maps are bijective, and took 1 to 7 s on one core.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for row, (name, turned) in zip(axes, CREATURES.items(), strict=True):
         V, F = creature(name, size)
-        cut = find_cuts(V, F, gain=GAIN)
+        cut = find_cuts(V, F, min_gain=GAIN)
         one, every = cut_open(V, F), cut_open(V, F, edges=cut)
         numbers[name] = {"triangles": len(F), "edges cut": len(cut)}
         for ax, title, (X, T) in (

@@ -56,7 +56,7 @@ def iterations(problem: Problem, functional: str, parameterisation: str) -> int 
     """Iterations of VectorAdam to an injective map."""
     stage = VectorAdam(functional=functional, parameterisation=parameterisation, iterations=600)
     result = solve(problem, strategy=[stage])
-    return result.iterations if result.injective else f"{len(result.certificate.flipped)} inverted"
+    return result.iterations if result.injective else f"{len(result.certificate.inverted)} inverted"
 
 
 def main(output: Path, size: int = 10, cells: int = 24) -> dict[str, Any]:
@@ -90,7 +90,7 @@ def main(output: Path, size: int = 10, cells: int = 24) -> dict[str, Any]:
     return {
         "star": {
             "triangles": len(problem.F),
-            "inverted where V₄ is zero": there.flipped,
+            "inverted where V₄ is zero": there.inverted,
             "V₄ there": there.value / area,
             "V₃ there": there.dirichlet / area,
             "least V₄ on the way": float(values["V₄"].min()),

@@ -49,14 +49,14 @@ def main(output: Path, size: int = 96) -> dict[str, Any]:
     save(figure, output, "figure_01")
     return {
         "triangles": len(problem.F),
-        "inverted by Tutte's embedding": result.history[0].flipped,
-        "inverted": len(result.certificate.flipped),
+        "inverted by Tutte's embedding": result.history[0].inverted,
+        "inverted": len(result.certificate.inverted),
         "bijective": bool(result.certificate.bijective),
         "iterations": result.iterations,
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "MIPS": round(mips(problem, result.uv), 2),
         "untangling": {
-            "inverted": len(untangled.certificate.flipped),
+            "inverted": len(untangled.certificate.inverted),
             "iterations": untangled.iterations,
             "MIPS": round(mips(problem, untangled.uv), 2),
         },

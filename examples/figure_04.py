@@ -75,7 +75,7 @@ def outcome(result: MapResult) -> str:
     """For a cell of the table."""
     if result.injective:
         return f"{result.iterations}"
-    return "none exists" if result.status is Status.IMPOSSIBLE else f"{len(result.certificate.flipped)} inverted"
+    return "none exists" if result.status is Status.IMPOSSIBLE else f"{len(result.certificate.inverted)} inverted"
 
 
 def main(output: Path, size: int = 12, full: bool = False) -> dict[str, Any]:

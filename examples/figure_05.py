@@ -36,18 +36,18 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
     colors = COLORS | {"untangling": GREEN}
     for row, name in zip(axes, colors, strict=False):
         if name == "untangling":
-            result = solve(problem, strategy=[Untangling()], record=1)
+            result = solve(problem, strategy=[Untangling()], record_every=1)
         else:
-            result = first_map(problem, name, record=1)
-        for ax, at in zip(row, frames([step.flipped**0.5 for step in result.history], SHOTS), strict=True):
+            result = first_map(problem, name, record_every=1)
+        for ax, at in zip(row, frames([step.inverted**0.5 for step in result.history], SHOTS), strict=True):
             snapshot = result.path[at]
             show(ax, problem, snapshot.uv, f"{name}, iteration {snapshot.iteration}", size=9)
         steps = [step.iteration for step in result.history]
-        curves[0].plot(steps, [step.flipped for step in result.history], color=colors[name], lw=2, label=name)
+        curves[0].plot(steps, [step.inverted for step in result.history], color=colors[name], lw=2, label=name)
         curves[1].plot(steps, [step.energy for step in result.history], color=colors[name], lw=2, label=name)
         numbers[name] = {
-            "flips at the start": result.history[0].flipped,
-            "flips": len(result.certificate.flipped),
+            "flips at the start": result.history[0].inverted,
+            "flips": len(result.certificate.inverted),
             "iterations": result.iterations,
             "MIPS": round(mips(problem, result.uv), 2),
         }

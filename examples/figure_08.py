@@ -38,7 +38,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
                 ax, problem, result.uv, f"{parameterisation}: {result.iterations} iterations\nMIPS {energy:.2f}", 100
             )
             numbers[name][parameterisation] = {
-                "flips": len(result.certificate.flipped),
+                "flips": len(result.certificate.inverted),
                 "iterations": result.iterations,
                 "MIPS": round(energy, 2),
                 "mean σ₁/σ₂": round(float(share @ ratio), 2),

@@ -66,7 +66,7 @@ def main(output: Path, size: int = 64, surfaces: int = 5, iterations: int = 600)
             numbers[f"{surface} onto {letter}"] = {
                 "triangles": len(F),
                 "iterations": result.iterations,
-                "flips": len(result.certificate.flipped) + len(result.certificate.degenerate),
+                "flips": len(result.certificate.inverted) + len(result.certificate.degenerate),
                 "MIPS": round(mips(problem, result.uv), 2) if result.injective else None,
             }
     save(figure, output, "figure_10")

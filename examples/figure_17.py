@@ -60,8 +60,8 @@ def main(output: Path, size: int = 160, finest: bool = False) -> dict[str, Any]:
             result = solve(problem)
             numbers[f"{what}, {cells} × {cells}"] = {
                 "held": len(problem.domain.pins),
-                "first guess": result.history[0].flipped,
-                "flips": len(result.certificate.flipped),
+                "first guess": result.history[0].inverted,
+                "flips": len(result.certificate.inverted),
                 "iterations": result.iterations,
                 "stages": [stage.name for stage in result.stages],
                 "seconds": round(result.seconds, 1),

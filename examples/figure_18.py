@@ -56,19 +56,19 @@ def main(output: Path, size: int = 16) -> dict[str, Any]:
     cases = problems(size)
     figure, axes = panels(2, len(cases), (3.6, 3.9))
     for above, below, (name, problem) in zip(*axes, cases.items(), strict=True):
-        result = first_map(problem, "tanh", 3000, record=3000)
-        deepest, uv = min(result.history, key=lambda step: step.energy), result.uv
+        result = first_map(problem, "tanh", 3000, record_every=3000)
+        lowest_energy, uv = min(result.history, key=lambda step: step.energy), result.uv
         area = problem.domain.mesh("rest").derivatives(uv @ (1, 1j)).area
         signed, unsigned = float(area.sum()), float(np.abs(area).sum())
         show(above, problem, result.path[0].uv, f"{name}: first guess")
         show(below, problem, uv, f"{result.status.name.lower()} after {result.iterations} iterations")
         numbers[name] = {
-            "flips at first": result.history[0].flipped,
-            "flips": deepest.flipped,
+            "flips at first": result.history[0].inverted,
+            "flips": lowest_energy.inverted,
             "iterations": result.iterations,
             "status": result.status.name,
             "unsigned area": round(unsigned, 4),
-            "A-Dirichlet energy": round(signed + deepest.energy * abs(signed), 4),
+            "A-Dirichlet energy": round(signed + lowest_energy.energy * abs(signed), 4),
             "least unsigned area of any map": round(winding_area(problem), 4),
             "known obstructions": sorted({o.kind.name for o in result.diagnosis.obstructions}),
         }

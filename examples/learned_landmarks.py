@@ -2,10 +2,11 @@
 ====================================================================================
 
 Faces of a kind: a disk with two bumps and a ridge between them, each of these elsewhere in every face. Four landmarks
-on each, the bumps' tops and the ridge's ends. A small network looks at every triangle (where it is, how it slopes, and
-how far away the landmarks are) and says one number for it, the Beltrami coefficient of a tensor. The map of these
-tensors, onto the unit disk, is ``quasiharmonic.torch.quasi_harmonic_map``, a layer like any other: the loss is how far
-landmarks come to lie from where those of the mean face do, and its gradient goes through the map into the network.
+on each, the bumps' tops and the ridge's ends. A small network looks at every triangle (where it is, how it
+slopes, and how far away the landmarks are) and says one number for it, the Beltrami coefficient of a tensor.
+The map of these tensors, onto the unit disk, is ``quasiharmonic.torch.quasi_harmonic_map``, a layer like any other: the
+loss is how far landmarks come to lie from where those of the mean face do, and its gradient goes through the map into
+the network.
 
 At the default size there are 60 faces to learn from and 12 others to be judged by. The landmarks of the others come to
 lie 0.24 from where they should (root of the mean square) with all tensors the identity, and 0.11 after 150 steps. Of

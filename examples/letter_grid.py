@@ -53,7 +53,7 @@ def main(output: Path, size: int = 26, steps: int = 40) -> dict[str, Any]:
     def value(bends: Array) -> tuple[float, Array]:
         nonlocal start, lowest
         bends = bends.reshape(-1, 2)
-        moved = problem.moved(drawn + smoothed(bends, WIDTH))
+        moved = problem.with_target(drawn + smoothed(bends, WIDTH))
         found = solve(moved, polish="symmetric-dirichlet", start=start)
         if not found.injective:
             return 1e3, np.zeros(bends.size)
@@ -68,7 +68,7 @@ def main(output: Path, size: int = 26, steps: int = 40) -> dict[str, Any]:
         return height, slope.ravel()
 
     best = minimize(value, np.zeros(drawn.size), jac=True, method="L-BFGS-B", options={"maxiter": steps})
-    fitted = problem.moved(drawn + smoothed(best.x.reshape(-1, 2), WIDTH))
+    fitted = problem.with_target(drawn + smoothed(best.x.reshape(-1, 2), WIDTH))
     last = polish_derivative(V, F, solve(fitted, polish="symmetric-dirichlet", start=start).uv, fixed=fixed).uv
 
     def off(uv: Array) -> float:

@@ -4,8 +4,8 @@
 One map, of a cat's head onto the letter R, seen as ``qhm plot`` and ``qhm view`` show it: ``--kind distortion`` colours
 the triangles by how much they are stretched, with a histogram; ``--kind texture`` puts a checkerboard on the surface,
 which shows at once where the map does not keep angles or sizes; and the window has both, to turn around (polyscope, the
-extra ``view``). The animation is that of the search itself: ``record=1`` keeps every iteration's map, and inverted
-triangles are red until there is none.
+extra ``view``). The animation is that of the search itself: ``record_every=1`` keeps every iteration's map, and
+inverted triangles are red until there is none.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ def main(output: Path, size: int = 24, window: bool = False) -> dict[str, Any]:
     output.mkdir(parents=True, exist_ok=True)
     V, F = surfaces.cat(size)
     fixed, target = targets.boundary_to(V, F, targets.filled(targets.letter("R")))
-    result = injective_map(V, F, fixed, target, record=1, polish="symmetric-dirichlet")
+    result = injective_map(V, F, fixed, target, record_every=1, polish="symmetric-dirichlet")
     frames = [(f"iteration {step.iteration}", step.uv) for step in result.path]
     save_animation(output / "looks.gif", V, F, frames, fixed=fixed)
     save_texture_figure(output / "looks.png", V, F, result.uv)
     save_distortion_figure(output / "looks_distortion.png", V, F, result.uv)
     numbers = {
         "frames": len(frames),
-        "inverted at first": int(result.history[0].flipped),
-        "inverted": int(result.history[-1].flipped),
+        "inverted at first": int(result.history[0].inverted),
+        "inverted": int(result.history[-1].inverted),
         "median stretch": float(distortion(V, F, result.uv).summary("isometric").median),
     }
     if window and find_spec("polyscope") is not None:

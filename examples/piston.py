@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from common import panels, run, save
-from quasiharmonic import AirMesh, Moment
+from quasiharmonic import AirMesh, AirMeshState
 from quasiharmonic.plot import save_figures
 from quasiharmonic.util.arrays import FloatArray
 
@@ -67,7 +67,7 @@ def piston(bottom: float, neck: float = 0.35) -> FloatArray:
     return np.concatenate([below, np.stack([x[::-1], np.full(33, bottom + 0.12)], axis=1)])
 
 
-def draw(ax: Axes, moment: Moment, frame: FloatArray) -> None:
+def draw(ax: Axes, moment: AirMeshState, frame: FloatArray) -> None:
     for triangles, face, edge in ((moment.air, "#fbe7a1", "#e3b93c"), (moment.F, "#4f7fd0", "#24447e")):
         ax.add_collection(PolyCollection(moment.points[triangles], facecolors=face, edgecolors=edge, linewidths=0.25))
     ax.fill(*frame.T, color="#5a5a5a")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from common import INK, RED, FloatArray, onto, panels, run, save
-from quasiharmonic import flipped_triangles, repair, solve, surfaces, targets
+from quasiharmonic import inverted_triangles, repair, solve, surfaces, targets
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_map, plot_surface
 from quasiharmonic.util.arrays import IntArray
@@ -55,8 +55,8 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     cut = np.empty((len(uv), 3))
     cut[FT] = V[F]
     for ax, places, title in zip(axes[0][1:], (damaged, result.uv), ("damaged", "repaired"), strict=True):
-        flips = flipped_triangles(FT, places)
-        plot_map(cut, FT, places, flipped=flips, ax=ax)
+        flips = inverted_triangles(FT, places)
+        plot_map(cut, FT, places, inverted=flips, ax=ax)
         verdict = f"{flips.size} inverted" if flips.size else "none inverted"
         ax.set_title(f"{title}\n{verdict}", size=10, color=RED if flips.size else INK)
     axes[0][2].plot(*result.uv[moved].T, "o", ms=1.5, color="black")

@@ -67,7 +67,7 @@ class Plate:
 
     def carried(self, shape: Array) -> Any:
         """The derivative of the mesh around a body, and by it the mesh."""
-        problem = self.problem.moved(self.target(shape))
+        problem = self.problem.with_target(self.target(shape))
         found = solve(problem, polish="symmetric-dirichlet", start=self.uv)
         derivative = polish_derivative(self.V, self.F, found.uv, fixed=self.fixed)
         assert found.injective

@@ -48,7 +48,7 @@ def main(output: Path, size: int = 80) -> dict[str, Any]:
             row[column] = {
                 "seconds": round(perf_counter() - start, 3),
                 "iterations": result.iterations,
-                "flips": len(result.certificate.flipped),
+                "flips": len(result.certificate.inverted),
             }
         numbers[name] = row
     figure, ((ax,),) = panels(1, 1, (8.0, 4.6))

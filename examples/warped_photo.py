@@ -62,7 +62,7 @@ def main(output: Path, photo: Path | None = None, landmarks: Path | None = None)
         ax.set_axis_off()
     left.plot(*moves[:, :2].T, "o", color="white", mec="black", markersize=4)
     left.plot(*np.stack([moves[:, [0, 2]], moves[:, [1, 3]]]).transpose(0, 2, 1), color="white", lw=1)
-    mesh.triplot(*warped.moved.T, warped.F, lw=0.4, color="0.2")
+    mesh.triplot(*warped.positions.T, warped.F, lw=0.4, color="0.2")
     mesh.set(xlim=left.get_xlim(), ylim=left.get_ylim(), aspect="equal")
     mesh.set_axis_off()
     for ax, title in ((left, "landmarks"), (mesh, "where the picture goes"), (right, "warped")):

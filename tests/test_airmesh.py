@@ -140,7 +140,12 @@ def test_thin_air_is_raised_to_the_gap():
         (lambda V, F, frame: (V, F, [square(4), square(1, 1)]), "and obstacle 0 meet at"),
         (lambda V, F, frame: (V, F, [square(4), square(1, 9)]), "not inside"),
         (lambda V, F, frame: (V, F, [square(4) * np.nan]), "loop 0 of the frame is not finite at points 0, 1, "),
-        (lambda V, F, frame: (V, F, []), "loops"),
+        (lambda V, F, frame: (V, F, []), "frame has no loops, but the first must be the container's"),
+        (lambda V, F, frame: (V, F, frame[0]), r"not a single loop: hand over \[frame\]"),
+        (
+            lambda V, F, frame: (V, F, [*frame, np.ones((4, 3))]),
+            r"loop 1 of the frame .* \(k, 2\), not \(4, 3\)",
+        ),
     ],
 )
 def test_wrong_input(change, message):
@@ -188,8 +193,10 @@ def test_wrong_options(options):
 
 def test_frames_of_another_size():
     air = AirMesh(*surfaces.disk(2), [square(4)])
-    with pytest.raises(ValueError, match="loops of"):
+    with pytest.raises(ValueError, match=r"loops of \[\d+\] points, as at the start, not of \[\d+\]$"):
         air.advance([square(4, count=9)])
+    with pytest.raises(ValueError, match="frame has no loops"):
+        air.advance([])
 
 
 def test_without_shapely(monkeypatch):

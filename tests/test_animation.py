@@ -100,8 +100,10 @@ def test_the_sweeps_are_what_shortens_leaps(head):
     targets = turning_stars(len(loop), 12, depth=0.85)
     problem = Problem(V, F, loop, targets[0])
     swept = []
-    tight = animate(problem, targets, polish="symmetric-dirichlet", limit=1.2, callback=lambda s: swept.append(s.sweep))
-    loose = animate(problem, targets, polish="symmetric-dirichlet", limit=1000)
+    tight = animate(
+        problem, targets, polish="symmetric-dirichlet", max_motion_ratio=1.2, callback=lambda s: swept.append(s.sweep)
+    )
+    loose = animate(problem, targets, polish="symmetric-dirichlet", max_motion_ratio=1000)
     assert max(swept) >= 1
     assert tight.largest_move < loose.largest_move
     assert loose.energies.mean() < tight.energies.mean()
@@ -151,7 +153,7 @@ def test_a_frame_that_crosses_itself_is_told(head):
 
 def test_an_impossible_frame_is_bridged(backwards):
     problem, targets = backwards
-    animation = animate(problem, targets, bridge=True)
+    animation = animate(problem, targets, fill_gaps=True)
     assert animation.found.all()
     assert np.flatnonzero(animation.bridged).tolist() == [4]
     assert np.allclose(animation.uv[4][problem.fixed], (targets[3] + targets[5]) / 2)
@@ -160,7 +162,7 @@ def test_an_impossible_frame_is_bridged(backwards):
 
 def test_the_first_frame_has_none_before_it(backwards):
     problem, targets = backwards
-    animation = animate(problem, targets[4:], bridge=True)
+    animation = animate(problem, targets[4:], fill_gaps=True)
     assert np.flatnonzero(~animation.found).tolist() == [0]
     assert not animation.bridged.any()
 
@@ -192,10 +194,10 @@ def test_wrong_options_are_told(head):
     problem = Problem(V, F, loop, V[loop, :2])
     targets = turning_stars(len(loop), 2)
     for limit in (0.5, np.nan, "3", [3]):
-        with pytest.raises(ValueError, match="limit must be a number of at least 1"):
-            animate(problem, targets, polish="mips", limit=limit)
-    with pytest.raises(ValueError, match="limit is for frames that are polished"):
-        animate(problem, targets, limit=2)
+        with pytest.raises(ValueError, match="max_motion_ratio must be a number of at least 1"):
+            animate(problem, targets, polish="mips", max_motion_ratio=limit)
+    with pytest.raises(ValueError, match="max_motion_ratio is for frames that are polished"):
+        animate(problem, targets, max_motion_ratio=2)
 
 
 def test_what_is_given_is_not_changed(head):
@@ -204,7 +206,7 @@ def test_what_is_given_is_not_changed(head):
     before = targets.copy()
     targets.setflags(write=False)
     problem = Problem(V, F, loop, targets[0])
-    first, second = (animate(problem, targets, polish="mips", bridge=True) for _ in range(2))
+    first, second = (animate(problem, targets, polish="mips", fill_gaps=True) for _ in range(2))
     assert np.array_equal(targets, before)
     assert np.array_equal(first.uv, second.uv)
     assert repr(first) == "<Animation: 4 frames, 4 injective, largest move 1>"
@@ -214,7 +216,7 @@ def test_what_is_given_is_not_changed(head):
 def test_no_frame_has_a_map(head, energy):
     V, F, loop = head
     targets = turning_stars(len(loop), 3)[:, ::-1]
-    animation = animate(Problem(V, F, loop, targets[0]), targets, polish=energy, bridge=True)
+    animation = animate(Problem(V, F, loop, targets[0]), targets, polish=energy, fill_gaps=True)
     assert not animation.found.any()
     assert animation.largest_move == 0
     assert {frame.status for frame in animation.frames} == {Status.IMPOSSIBLE}
@@ -228,7 +230,7 @@ def test_interrupted_before_the_first_frame(head, monkeypatch):
 
     monkeypatch.setattr("quasiharmonic.apps.animation.following.solve", interrupted)
     targets = turning_stars(len(loop), 3)
-    animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips", bridge=True)
+    animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips", fill_gaps=True)
     assert animation.interrupted
     assert animation.frames == []
     assert animation.moves.shape == (0,)
@@ -247,7 +249,7 @@ def test_interrupted_with_what_is_there(head, sweep):
             raise KeyboardInterrupt
 
     animation = animate(
-        Problem(V, F, loop, targets[0]), targets, polish="symmetric-dirichlet", limit=1.2, callback=stop
+        Problem(V, F, loop, targets[0]), targets, polish="symmetric-dirichlet", max_motion_ratio=1.2, callback=stop
     )
     assert len(animation.frames) == (6 if sweep == 0 else 12)
     assert animation.found.all()
@@ -313,7 +315,7 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
         ("short.npy", ["-o", tmp_path / "out"], "the same output is named twice"),
         ("short.npy", ["-o", tmp_path / "f.gif", "--frames-per-second", 60], "of a GIF must be at most 50"),
         ("empty", [], "no mesh in this folder"),
-        ("short.npy", ["--limit", 2], "--limit belongs to --polish"),
+        ("short.npy", ["--max-motion-ratio", 2], "--max-motion-ratio belongs to --polish"),
         ("short.npy", ["--frames-per-second", 2], "belongs to a moving picture"),
     ):
         assert run("animate", surface, tmp_path / frames, "-o", tmp_path / "out", *options) == 2
@@ -347,7 +349,7 @@ def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys)
     assert run("animate", surface, *frames, "-o", tmp_path / "out") == 1
     assert "frame 4: " in capsys.readouterr().out
     assert len(list((tmp_path / "out").iterdir())) == len(targets) - 1
-    assert run("animate", surface, *frames, "-o", tmp_path / "out", "--bridge") == 0
+    assert run("animate", surface, *frames, "-o", tmp_path / "out", "--fill-gaps") == 0
     assert len(list((tmp_path / "out").iterdir())) == len(targets)
     # A frame that is there from another run is told.
     assert "not of this run" not in capsys.readouterr().out

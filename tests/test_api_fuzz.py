@@ -23,8 +23,8 @@ from quasiharmonic import (
     certify,
     diagnose,
     distortion,
-    flipped_triangles,
     injective_map,
+    inverted_triangles,
     is_injective,
     polish,
     refine,
@@ -233,7 +233,7 @@ def test_problem_and_diagnosis(arguments):
     interior = {tuple(edge) for edge in problem.domain.edges.interior.tolist()}
     assert {tuple(edge) for edge in diagnosis.split.tolist()} <= interior
     if more["reference"] == "equilateral":
-        refined = refine_problem(problem, most_rounds=1)
+        refined = refine_problem(problem, max_rounds=1)
         assert np.isfinite(refined.problem.V).all()
 
 
@@ -260,15 +260,15 @@ def test_certificate(data):
     V, F = data.draw(st.sampled_from(MESHES))
     places, triangles = data.draw(positions(V)), data.draw(indices(F, len(V)))
     certificate = outcome(certify, triangles, places)
-    flipped = outcome(flipped_triangles, triangles, places)
+    inverted = outcome(inverted_triangles, triangles, places)
     good = outcome(is_injective, triangles, places)
-    assert (certificate is None) == (flipped is None) == (good is None)
+    assert (certificate is None) == (inverted is None) == (good is None)
     if certificate is None:
         return
     assert certificate.summary()
     assert certificate.injective == good
-    bad = np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
-    np.testing.assert_array_equal(np.sort(bad), flipped)
+    bad = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
+    np.testing.assert_array_equal(np.sort(bad), inverted)
     if certificate.bijective:
         assert certificate.injective
     uv, corners = np.asarray(places).astype(np.float64), np.asarray(triangles).astype(np.int64)
@@ -338,7 +338,7 @@ def test_arrays_of_any_kind(data):
     one, two, three, four = (data.draw(anything) for _ in range(4))
     outcome(Problem, one, two, three, four)
     outcome(certify, two, one)
-    outcome(flipped_triangles, two, one)
+    outcome(inverted_triangles, two, one)
     outcome(distortion, one, two, three)
     outcome(refine, one, two, three)
     outcome(polish, one, two, four, fixed=three)

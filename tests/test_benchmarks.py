@@ -168,7 +168,7 @@ def test_fallbacks_solve_what_the_search_over_tensors_leaves(name):
     result = solve(problem)
     assert result.injective
     assert len(result.stages) > 1
-    assert result.stages[-1].flipped[0] > 0
+    assert result.stages[-1].inverted[0] > 0
 
 
 def test_loops_drift_as_rigid_bodies():

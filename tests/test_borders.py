@@ -13,15 +13,15 @@ import pytest
 
 from quasiharmonic import (
     AirMesh,
+    BoundaryCurves,
     InverseMap,
     Problem,
-    Rails,
     SurfacePoints,
     certify,
     distortion,
     flatten,
-    flipped_triangles,
     injective_map,
+    inverted_triangles,
     is_injective,
     polish,
     refine,
@@ -56,7 +56,7 @@ SQUARE = [[(-3, -3), (3, -3), (3, 3), (-3, 3)]]
 REWRITTEN = """
 import sys, threading, time
 import numpy as np
-from quasiharmonic import certify, distortion, flatten, flipped_triangles, injective_map, is_injective
+from quasiharmonic import certify, distortion, flatten, inverted_triangles, injective_map, is_injective
 from quasiharmonic import InverseMap, polish
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
@@ -99,7 +99,7 @@ _RINGS = {"flatten": 20, "injective_map": 30, "polish": 30, "distortion": 60}
 CALLS = {
     "certify": "certify(F, V)",
     "certify, the loops known": "certify(F, folded, loops=[rim])",
-    "flipped_triangles": "flipped_triangles(F, V)",
+    "inverted_triangles": "inverted_triangles(F, V)",
     "is_injective": "is_injective(F, V)",
     "boundary_loops": "boundary_loops(F, len(V))",
     "components": "components(F, len(V))",
@@ -137,7 +137,7 @@ KERNELS = {
 FUNCTIONS = {
     "certify": lambda V, F, uv, rim: certify(F, uv),
     "certify, the loops known": lambda V, F, uv, rim: certify(F, uv * [[1.0, -1.0]], loops=[rim]),
-    "flipped_triangles": lambda V, F, uv, rim: flipped_triangles(F, uv),
+    "inverted_triangles": lambda V, F, uv, rim: inverted_triangles(F, uv),
     "is_injective": lambda V, F, uv, rim: is_injective(F, uv),
     "boundary_loops": lambda V, F, uv, rim: boundary_loops(F, len(V)),
     "components": lambda V, F, uv, rim: components(F, len(V)),
@@ -158,12 +158,12 @@ FUNCTIONS = {
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_kernels_are_handed_nothing_that_the_caller_can_change(name, monkeypatch):
     given = [np.ascontiguousarray(array) for array in (V[:, :2].copy(), F.copy(), UV.copy(), RIM.copy())]
-    heard = []
+    reports_progress = []
 
     def listening(kernel, function):
         def listened(*arguments):
             arrays = [array for array in arguments if isinstance(array, np.ndarray)]
-            heard.append((kernel, any(np.may_share_memory(array, g) for array in arrays for g in given)))
+            reports_progress.append((kernel, any(np.may_share_memory(array, g) for array in arrays for g in given)))
             return function(*arguments)
 
         return listened
@@ -173,8 +173,8 @@ def test_kernels_are_handed_nothing_that_the_caller_can_change(name, monkeypatch
         for kernel in kernels:
             monkeypatch.setattr(module, kernel, listening(kernel, getattr(module, kernel)))
     FUNCTIONS[name](*given)
-    assert heard
-    assert [kernel for kernel, shared in heard if shared] == []
+    assert reports_progress
+    assert [kernel for kernel, shared in reports_progress if shared] == []
 
 
 def plain(array, folder):
@@ -317,7 +317,7 @@ TAKERS = {
     "certify one loop": lambda x: certify(F, UV, loops=[x]),
     "certify F": lambda x: certify(x, UV),
     "is_injective": lambda x: is_injective(x, UV),
-    "flipped_triangles": lambda x: flipped_triangles(x, UV),
+    "inverted_triangles": lambda x: inverted_triangles(x, UV),
     "Problem F": lambda x: Problem(V, x, RIM, UV[RIM]),
     "Problem fixed": lambda x: Problem(V, F, x, UV[RIM]),
     "polish fixed": lambda x: polish(V, F, UV, fixed=x),
@@ -333,8 +333,8 @@ TAKERS = {
     "AirMesh F": lambda x: AirMesh(UV, x, SQUARE),
     "AirMesh frame": lambda x: AirMesh(UV, F, x),
     "landmarks": lambda x: warp_by_landmarks(np.zeros((9, 9)), x, x),
-    "Rails.around": lambda x: Rails.around(x, UV),
-    "Rails on": lambda x: Rails([UV[RIM]], on=x),
+    "BoundaryCurves.around": lambda x: BoundaryCurves.around(x, UV),
+    "BoundaryCurves on": lambda x: BoundaryCurves([UV[RIM]], on=x),
     "packed uv": lambda x: packed(x, [F], [1.0]),
     "packed F": lambda x: packed([UV], x, [1.0]),
     "plot_map": lambda x: plot_map(V, x, UV),
@@ -406,12 +406,33 @@ def test_lists_of_integers_and_floats_are_not_rounded():
     T = [[0, 1, 2]]
     for wide in (2**53 + 1, -(2**53) - 1, np.int64(2**62 + 1)):
         for uv in ([[0, 0.5], [wide, 0], [0, 1]], [np.array([0, 0.5]), (wide, 0), [0.0, 1]]):
-            for function in (certify, is_injective, flipped_triangles):
+            for function in (certify, is_injective, inverted_triangles):
                 with pytest.raises(ValueError, match=r"uv does not fit double precision at vertex 1$"):
                     function(T, uv)
     assert is_injective(T, [[0, 0.5], [2**60, 0], [0, 1]])
     assert is_injective(T, [[0, 0.5], [2.0**60, 0], [0, 1]])
     assert certify(T, [[0, 0.5], [np.inf, 2**53], [0, 1]]).nonfinite.tolist() == [0]
+
+
+@pytest.mark.parametrize("large", [2**63, 2**70, -(2**70)])
+def test_integers_beyond_64_bits_are_named(large):
+    for loops in ([[large, 1, 2]], [np.array([large, 1, 2], dtype=object)]):
+        with pytest.raises(ValueError, match=rf"loops\[0\] refers to vertex {large}, which no mesh has$"):
+            certify(F, UV, loops=loops)
+
+
+def test_integers_of_thousands_of_digits_are_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"F refers to vertex about 1e5000, which no mesh has$"):
+        certify([[10**5000, 1, 2]], UV)
+
+
+def test_objects_and_mixed_integers_are_indices():
+    wanted = certify(F, UV)
+    assert certify(F.astype(object), UV).injective == wanted.injective
+    assert certify([[np.uint64(0), np.int64(1), 2]], [[0, 0], [1, 0], [0, 1]]).injective
+    for entry in (None, True, 1.0):
+        with pytest.raises(ValueError, match="F must hold integer indices, not objects"):
+            certify(np.array([[0, 1, entry]], dtype=object), UV)
 
 
 def test_frames_that_are_none():
@@ -438,7 +459,8 @@ def test_a_corner_that_is_no_vertex():
         (["--to", "letter:QH"], "an outline is made of one character", False),
         (["--to", "star:30"], "too few to keep the 60 corners", False),
         (["--to", "rect:1x1", "--corners", "0,1,2,4"], "vertex 4 in corners, but not on the boundary", True),
-        (["--to", "rect:1x1", "--corners", "0,1,2,9"], "corners refers to vertex 9", True),
+        (["--to", "rect:1x1", "--corners", "0,1,2,9"], "corners refers to vertex 9, but there are only", False),
+        (["--to", "rect:1x1", "--corners", "0,1,2,1"], "vertex 1 is named more than once", False),
     ],
 )
 def test_how_it_counts_is_said_where_something_is_counted(options, said, counted, tmp_path, capsys):
@@ -447,7 +469,8 @@ def test_how_it_counts_is_said_where_something_is_counted(options, said, counted
     assert main(["map", str(mesh), "-o", str(tmp_path / "out.obj"), *options]) == 2
     complained = capsys.readouterr().err
     assert said in complained
-    assert complained.rstrip().endswith("(counting from 0)") == counted
+    assert complained.rstrip().endswith("(indices count from 0)") == counted
+    assert ("from 0)" in complained) == counted
 
 
 def test_an_energy_without_a_flattening(tmp_path, capsys):

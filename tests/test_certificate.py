@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.geometry.exact.certificate import Obstacle, certify, flipped_triangles, is_injective
+from quasiharmonic.geometry.exact.certificate import Obstacle, certify, inverted_triangles, is_injective
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.solver.refine.mapping import injective_map
@@ -124,15 +124,15 @@ def test_the_three_verdicts_on_a_triangle():
     F = np.array([[0, 1, 2], [0, 2, 1], [0, 1, 3], [0, 0, 1], [0, 1, 4], [5, 1, 2]])
     uv = np.array([[0.0, 0], [1, 0], [0, 1], [2, 0], [np.nan, 0], [0, np.inf]])
     c = certify(F, uv)
-    np.testing.assert_array_equal(c.flipped, [1])
+    np.testing.assert_array_equal(c.inverted, [1])
     np.testing.assert_array_equal(c.degenerate, [2, 3])
     np.testing.assert_array_equal(c.nonfinite, [4, 5])
-    np.testing.assert_array_equal(flipped_triangles(F, uv), [1, 2, 3, 4, 5])
-    assert all(array.dtype == np.int64 for array in (c.flipped, c.degenerate, c.nonfinite))
+    np.testing.assert_array_equal(inverted_triangles(F, uv), [1, 2, 3, 4, 5])
+    assert all(array.dtype == np.int64 for array in (c.inverted, c.degenerate, c.nonfinite))
     assert not c.injective
     assert c.bijective is False
     assert not is_injective(F, uv)
-    said = "of 6 triangles, 1 is flipped (1), 2 are degenerate (2, 3), 2 are not finite (4, 5)"
+    said = "of 6 triangles, 1 is inverted (1), 2 are degenerate (2, 3), 2 are not finite (4, 5)"
     assert said in c.summary()
 
 
@@ -145,9 +145,9 @@ def test_predicate_and_locator_agree_with_the_certificate(rng, monkeypatch):
         uv[3] = np.round(uv[3])
         signs = np.array([exact_orientation(*uv[t]) for t in F])
         c = certify(F, uv, boundary=False)
-        np.testing.assert_array_equal(c.flipped, np.flatnonzero(signs < 0))
+        np.testing.assert_array_equal(c.inverted, np.flatnonzero(signs < 0))
         np.testing.assert_array_equal(c.degenerate, np.flatnonzero(signs == 0))
-        np.testing.assert_array_equal(flipped_triangles(F, uv), np.flatnonzero(signs <= 0))
+        np.testing.assert_array_equal(inverted_triangles(F, uv), np.flatnonzero(signs <= 0))
         assert is_injective(F, uv) == c.injective == bool((signs > 0).all())
         assert c.bijective is None
 
@@ -158,7 +158,7 @@ def test_verdicts_do_not_depend_on_scale(scale):
     assert certify(F, uv * scale).bijective
     uv[1] = uv[5]
     c = certify(F, uv * scale)
-    assert c.degenerate.size + c.flipped.size == flipped_triangles(F, uv).size
+    assert c.degenerate.size + c.inverted.size == inverted_triangles(F, uv).size
     assert Obstacle.SELF_INTERSECTION in kinds(c)
 
 
@@ -210,7 +210,7 @@ def test_vertices_of_no_triangle_are_not_looked_at():
     ],
 )
 def test_malformed_input_is_named(F, uv, said):
-    for function in (certify, is_injective, flipped_triangles):
+    for function in (certify, is_injective, inverted_triangles):
         with pytest.raises(ValueError, match=said):
             function(F, uv)
 
@@ -280,7 +280,7 @@ def test_inner_loop_outside_the_outer_one():
     F, uv = ring()
     uv[1::2] += [5, 0]
     c = certify(F, uv)
-    assert c.flipped.size
+    assert c.inverted.size
     assert Obstacle.WINDING in kinds(c)
     assert [r.loops for r in c.reasons if r.kind is Obstacle.WINDING] == [(1,)]
     assert "loop 1 runs clockwise and no other loop is around it" in c.summary()
@@ -297,7 +297,7 @@ def test_inner_loop_touching_or_crossing_the_outer_one():
 
 def test_mirrored_map():
     c = certify(ring()[0], ring()[1] * [-1, 1])
-    assert c.flipped.size == 24
+    assert c.inverted.size == 24
     assert {Obstacle.WINDING, Obstacle.NESTING} <= kinds(c)
 
 
@@ -307,27 +307,27 @@ def test_a_fan_wound_twice():
         c = certify(*fan(polar(np.linspace(1, 2, 10), t)))
         assert c.injective
         assert c.bijective is False
-        np.testing.assert_array_equal(c.overwound, [0])
-        assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.OVERWOUND}
+        np.testing.assert_array_equal(c.multiply_wound, [0])
+        assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.MULTIPLY_WOUND}
 
 
 def test_a_fan_wound_once_is_not_overwound(rng):
     for _ in range(20):
         t = np.sort(rng.random(9)) if rng.random() < 0.5 else (np.arange(8) / 8)
         uv = polar(rng.uniform(1, 2, len(t)), t)
-        assert not certify(*fan(np.round(uv, 1))).overwound.size
+        assert not certify(*fan(np.round(uv, 1))).multiply_wound.size
 
 
 def test_only_vertices_with_positive_triangles_are_overwound():
     F, uv = fan(polar(np.linspace(1, 2, 12), np.arange(12) / 5))
     c = certify(F[:-1], uv)  # vertex 0 is on the boundary now
     assert c.injective
-    assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.OVERWOUND}
-    np.testing.assert_array_equal(c.overwound, [0])
+    assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.MULTIPLY_WOUND}
+    np.testing.assert_array_equal(c.multiply_wound, [0])
     t = np.array([0, 0.3, 0.6, 0.5, 0.8, 1.1, 1.4, 1.7])
     c = certify(*fan(polar(np.linspace(1, 2, 8), t)))
-    np.testing.assert_array_equal(c.flipped, [2])
-    assert not c.overwound.size
+    np.testing.assert_array_equal(c.inverted, [2])
+    assert not c.multiply_wound.size
 
 
 def overwound_exactly(F, uv):
@@ -378,10 +378,10 @@ def test_boundary_vertices_around_which_triangles_wind_more_than_once(rng):
         F, uv = F[rng.permutation(len(F))], uv * rng.choice([1.0, 1e-200, 3e150])
         c = certify(F, uv)
         assert c.injective
-        np.testing.assert_array_equal(c.overwound, overwound_exactly(F, uv))
-        assert (Obstacle.OVERWOUND in kinds(c)) == bool(c.overwound.size)
-        assert not (c.bijective and c.overwound.size)
-        counted[bool(c.overwound.size)] += 1
+        np.testing.assert_array_equal(c.multiply_wound, overwound_exactly(F, uv))
+        assert (Obstacle.MULTIPLY_WOUND in kinds(c)) == bool(c.multiply_wound.size)
+        assert not (c.bijective and c.multiply_wound.size)
+        counted[bool(c.multiply_wound.size)] += 1
     assert counted[True] > 20
     assert counted[False] > 20
 
@@ -399,9 +399,9 @@ def test_maps_of_annuli_overwound_or_not(rng):
             F = F[:-2]
         F = np.roll(F, int(rng.integers(3)), axis=1)
         c = certify(F, uv)
-        np.testing.assert_array_equal(c.overwound, [] if c.bijective else overwound_exactly(F, uv))
+        np.testing.assert_array_equal(c.multiply_wound, [] if c.bijective else overwound_exactly(F, uv))
         assert not (c.bijective and overwound_exactly(F, uv))
-        seen += bool(c.overwound.size)
+        seen += bool(c.multiply_wound.size)
     assert seen
 
 
@@ -413,10 +413,10 @@ def test_an_annulus_with_its_inner_loop_reflected():
     c = result.certificate
     assert c.injective
     assert not c.bijective
-    assert c.overwound.tolist() == [21, 38] == overwound_exactly(F, result.uv)
-    assert set(c.overwound) <= set(inner)
+    assert c.multiply_wound.tolist() == [21, 38] == overwound_exactly(F, result.uv)
+    assert set(c.multiply_wound) <= set(inner)
     assert "triangles wind more than once around vertices 21, 38" in result.summary()
-    assert c.to_dict()["overwound"] == [21, 38]
+    assert c.to_dict()["multiply_wound"] == [21, 38]
 
 
 def test_a_slit_that_is_closed_is_not_overwound():
@@ -429,12 +429,12 @@ def test_a_slit_that_is_closed_is_not_overwound():
         turned = uv @ [[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[3, 4], [-4, 3]], [[5, -12], [12, 5]]][turn % 4]
         c = certify(F[:-1], turned)
         assert c.injective
-        assert not c.overwound.size
+        assert not c.multiply_wound.size
         assert len(c.crossings)
         turned[9] += (turned[2] - turned[9]) * 2.0**-40
-        assert certify(F[:-1], turned).overwound.tolist() == [0]
+        assert certify(F[:-1], turned).multiply_wound.tolist() == [0]
         turned[9] += (turned[8] - turned[9]) * 2.0**-30
-        assert not certify(F[:-1], turned).overwound.size
+        assert not certify(F[:-1], turned).multiply_wound.size
 
 
 def test_branched_sheets_with_simple_loops_apart():
@@ -443,8 +443,8 @@ def test_branched_sheets_with_simple_loops_apart():
     assert c.injective
     assert c.bijective is False
     assert not len(c.crossings)
-    np.testing.assert_array_equal(c.overwound, branches)
-    assert kinds(c) == {Obstacle.NESTING, Obstacle.OVERWOUND}
+    np.testing.assert_array_equal(c.multiply_wound, branches)
+    assert kinds(c) == {Obstacle.NESTING, Obstacle.MULTIPLY_WOUND}
     assert "covered 2 times" in c.summary()
 
 
@@ -486,7 +486,7 @@ def test_meshes_that_are_no_surface(F, said):
 def test_a_closed_surface():
     F = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
     c = certify(F, np.array([[0.0, 0], [3, 0], [0, 3], [1, 1]]))
-    np.testing.assert_array_equal(c.flipped, [0])
+    np.testing.assert_array_equal(c.inverted, [0])
     assert Obstacle.NO_BOUNDARY in kinds(c)
 
 
@@ -519,12 +519,12 @@ def test_certificate_is_frozen_and_fit_for_json():
         told = json.loads(json.dumps(c.to_dict()))
         assert told["injective"] == c.injective
         assert told["bijective"] == c.bijective
-        assert told["flipped"] == c.flipped.tolist()
+        assert told["inverted"] == c.inverted.tolist()
         assert len(told["reasons"]) == len(c.reasons)
         assert [str(r) for r in c.reasons] == [r["text"] for r in told["reasons"]]
     assert told["loops"] == [{"start": 0, "length": 12}, {"start": 1, "length": 12}]
     with pytest.raises(ValueError, match="read-only"):
-        c.flipped[:] = 0
+        c.inverted[:] = 0
     with pytest.raises(AttributeError):
         c.triangles = 3
 
@@ -587,5 +587,5 @@ def test_every_triangle_is_judged_as_in_rational_arithmetic(rng):
         uv[:, 1] = np.where(rng.random(len(uv)) < 0.3, uv[:, 0], uv[:, 1])
         signs = np.array([exact_orientation(*uv[t]) for t in F])
         c = certify(F, uv)
-        np.testing.assert_array_equal(c.flipped, np.flatnonzero(signs < 0))
+        np.testing.assert_array_equal(c.inverted, np.flatnonzero(signs < 0))
         np.testing.assert_array_equal(c.degenerate, np.flatnonzero(signs == 0))

@@ -55,7 +55,7 @@ class TestMap:
         assert signed_areas(F, uv).min() > 0
         facts = json.loads(report.read_text())
         assert facts["injective"] is True
-        assert facts["flipped"] == facts["degenerate"] == []
+        assert facts["inverted"] == facts["degenerate"] == []
         assert facts["iterations"] > 0
         assert facts["seconds"] > 0
         assert facts["linear_solver"]
@@ -84,11 +84,11 @@ class TestMap:
         out = tmp_path / "out.obj"
         assert run("map", problem, "-o", out, "--max-iterations", 2, "--json", tmp_path / "r.json") == 1
         said = capsys.readouterr().out
-        assert re.search(r"Not injective: of \d+ triangles, \d+ are flipped", said)
+        assert re.search(r"Not injective: of \d+ triangles, \d+ are inverted", said)
         assert "more iterations" in said
         facts = json.loads((tmp_path / "r.json").read_text())
         assert facts["injective"] is False
-        assert facts["flipped"]
+        assert facts["inverted"]
         assert run("check", out) == 1
 
     @pytest.mark.parametrize("scale", [1e-300, 1e160])
@@ -199,7 +199,7 @@ class TestRefuses:
         problem = write_problem(tmp_path, V, F, np.arange(3), np.zeros((3, 2)), handles=False)
         assert run("map", problem, "-o", tmp_path / "out.obj") == 2
         assert "input.obj" in (said := capsys.readouterr().err)
-        assert "(counting from 0)" in said
+        assert "(indices count from 0)" in said
         assert run("map", problem, "-o", tmp_path / "out.obj", "--reference", "equilateral") in (0, 1)
 
 

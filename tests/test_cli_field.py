@@ -22,11 +22,20 @@ def field(tmp_path):
 
 def test_a_field_and_its_inverse(tmp_path, field, capsys):
     paths = [str(tmp_path / name) for name in ("field.npy", "mended.npy", "back.npy")]
-    options = ["--spacing", "0.5", "2", "--hold-border", "--least", "0.02", "--json", str(tmp_path / "report.json")]
+    options = [
+        "--spacing",
+        "0.5",
+        "2",
+        "--hold-border",
+        "--min-jacobian",
+        "0.02",
+        "--json",
+        str(tmp_path / "report.json"),
+    ]
     assert main(["field", paths[0], "-o", paths[1], "--inverse", paths[2], *options]) == 0
     border = np.ones(field.shape[:2], dtype=bool)
     border[1:-1, 1:-1] = False
-    mended = nearest_invertible(field, spacing=(0.5, 2), least=0.02, held=border)
+    mended = nearest_invertible(field, spacing=(0.5, 2), min_jacobian=0.02, fixed=border)
     assert mended.folds > 0
     assert np.array_equal(np.load(paths[1]), mended.field)
     back = inverse_field(mended.field, spacing=(0.5, 2)).field

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, Status, distortion, flipped_triangles, is_injective, solve
+from quasiharmonic import Problem, Status, distortion, inverted_triangles, is_injective, solve
 from quasiharmonic.geometry.coarsening.levels import coarsen, touching
 from quasiharmonic.geometry.coarsening.prolongation import places, prolong, smooth
 from quasiharmonic.geometry.coarsening.removal import by_degree, remove_vertices, room_for_round
@@ -211,9 +211,9 @@ class TestSmoothing:
         z = V @ (1, 1j)
         w = np.abs(z) ** 3 * np.exp(10j * np.abs(z)) * z
         before = w.copy()
-        assert flipped_triangles(F, w.view(float).reshape(-1, 2)).size == 0
+        assert inverted_triangles(F, w.view(float).reshape(-1, 2)).size == 0
         smooth(w, F, held)
-        assert flipped_triangles(F, w.view(float).reshape(-1, 2)).size == 0
+        assert inverted_triangles(F, w.view(float).reshape(-1, 2)).size == 0
         assert 0.05 < np.mean(w[~held] == before[~held]) < 0.95
 
 
@@ -240,7 +240,7 @@ def test_injective_maps_stay_injective(name, V, F, pins, rng):
     w[used] = uv @ (1, 1j)
     out = prolong(w, coarse, held)
     np.testing.assert_array_equal(out[held], w[held])
-    assert flipped_triangles(F, np.stack([out.real, out.imag], axis=1)).size == 0
+    assert inverted_triangles(F, np.stack([out.real, out.imag], axis=1)).size == 0
 
 
 def on_letter(character, rings=50):
@@ -263,7 +263,7 @@ class TestSearch:
             return factor(laplacian, *arguments)
 
         monkeypatch.setattr(Laplacian, "factor", recorded)
-        problem = posed.moved(posed.target)
+        problem = posed.with_target(posed.target)
         steps = Told()
         result = solve(problem, callback=steps.append)
         assert result.injective
@@ -273,7 +273,7 @@ class TestSearch:
         assert steps == result.history
         assert [s.iteration for s in steps] == list(range(len(steps)))
         assert result.iterations == len(steps) - 1
-        assert (steps[-1].flipped, steps[-1].energy) == (0, 0.0)
+        assert (steps[-1].inverted, steps[-1].energy) == (0, 0.0)
         assert result.mu.shape == (len(problem.F),)
         assert np.all(np.abs(result.mu) < 1)
 
@@ -286,7 +286,7 @@ class TestSearch:
         assert mean(solve(posed).uv) < 2 * mean(direct.uv)
 
     def test_is_repeated_for_a_moved_target(self, posed):
-        shifted = posed.moved(2 * posed.target + 1)
+        shifted = posed.with_target(2 * posed.target + 1)
         strategy = [CoarseToFine(VectorAdam())]
         first, second = solve(posed, strategy=strategy), solve(shifted, strategy=strategy)
         np.testing.assert_allclose(second.uv, 2 * first.uv + 1, atol=1e-9)
@@ -328,11 +328,11 @@ class TestSearch:
     @pytest.mark.parametrize("repaired", [True, False])
     def test_what_a_coarse_search_leaves_inverted_is_repaired_on_the_mesh(self, posed, monkeypatch, repaired):
         """A search of the whole mesh for a triangle or two took many times as long."""
-        solved = stages._on_coarse
+        solved = stages.search_coarse
 
         def nearly(coarse, *further):
             _, uv, _, solver = solved(coarse, *further)
-            return Status.SETTLED, uv, 1, solver
+            return Status.STALLED, uv, 1, solver
 
         def displaced(coarse, w):
             fine = prolonged(coarse, w)
@@ -342,12 +342,12 @@ class TestSearch:
 
         prolonged = CoarseMesh.prolong
         monkeypatch.setattr(CoarseMesh, "prolong", displaced)
-        monkeypatch.setattr(stages, "_on_coarse", nearly)
+        monkeypatch.setattr(stages, "search_coarse", nearly)
         if not repaired:
-            monkeypatch.setattr(stages, "_LOCAL", ())
+            monkeypatch.setattr(stages, "LOCAL_REPAIRS", ())
         result = solve(posed, strategy=[CoarseToFine(VectorAdam()), VectorAdam(iterations=1)])
         first, *others = [s.name.split(",")[0] for s in result.stages]
-        left = result.stages[0].flipped[1]
+        left = result.stages[0].inverted[1]
         assert first == "coarse-to-fine"
         assert 0 < left <= 50
         assert result.injective is repaired
@@ -356,7 +356,7 @@ class TestSearch:
         else:
             # It begins anew, and what it comes to is worse than what was put aside.
             assert others == ["vector-adam"]
-            assert result.stages[1].flipped[1] > left == len(result.certificate.flipped)
+            assert result.stages[1].inverted[1] > left == len(result.certificate.inverted)
 
     def test_is_left_out_where_it_does_not_serve(self, posed):
         small = Problem(*on_letter("C", rings=12))
@@ -364,7 +364,7 @@ class TestSearch:
         names = [s.name.split(",")[0] for s in speed(small)]
         assert names.index("coarse-to-fine") == 3
         assert coarse_mesh(Problem(posed.V, posed.F, posed.fixed, posed.target, reference="rest")) is None
-        recorded = solve(Problem(*on_letter("C")), record=1)
+        recorded = solve(Problem(*on_letter("C")), record_every=1)
         assert "coarse-to-fine" not in recorded.stages[0].name
 
     def test_interrupted(self, posed):
@@ -374,7 +374,7 @@ class TestSearch:
 
         result = solve(posed, callback=stop)
         assert result.status is Status.INTERRUPTED
-        assert result.certificate.flipped.size > 0
+        assert result.certificate.inverted.size > 0
         # Not the middle of the target, but the coarse map carried here.
         assert np.count_nonzero(signed_areas(posed.F, result.uv) > 0) > len(posed.F) // 2
 

@@ -8,7 +8,7 @@ import pytest
 import problems
 from quasiharmonic import Problem, solve
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.solver.methods import Combing, Composite, Patches, Untangling
+from quasiharmonic.solver.methods import Composite, LineShift, LocalRepair, Untangling
 from quasiharmonic.solver.methods.line_shift import best_shift, combed, frame_along
 from quasiharmonic.surfaces import disk, random_delaunay
 
@@ -78,6 +78,6 @@ def test_a_fold_of_many_triangles_is_moved_as_a_whole():
 def test_it_solves_what_nothing_before_it_does():
     case = problems.make("needles", 4, 0.972)
     problem = Problem(case.V, case.F, case.fixed, case.target)
-    before = [Composite(iterations=100), Patches(resume=True), Untangling(resume=True)]
+    before = [Composite(iterations=100), LocalRepair(resume=True), Untangling(resume=True)]
     assert not solve(problem, strategy=before).injective
-    assert solve(problem, strategy=[*before, Combing(in_vain=20, resume=True)]).injective
+    assert solve(problem, strategy=[*before, LineShift(in_vain=20, resume=True)]).injective

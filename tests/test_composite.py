@@ -68,7 +68,7 @@ def test_fixed_vertices_are_in_their_places_and_few_triangles_inverted():
     w = composite_map(objective)
     assert np.array_equal(w[problem.fixed], problem.frame.inward(problem.target))
     tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
-    assert objective.near_map(w).flipped < 0.2 * tutte.flipped
+    assert objective.near_map(w).inverted < 0.2 * tutte.inverted
 
 
 def test_there_is_none_for_two_loops_or_pins_or_a_target_that_crosses_itself():

@@ -102,7 +102,7 @@ def test_a_ring_turned_inside_out():
     problem = turned_ring(0)
     away = problem.target / np.sum(problem.target**2, axis=1)[:, None]
     # An inversion reverses the sense of loops: reflected, they are wound as the mesh's.
-    problem = problem.moved(away * [1, -1])
+    problem = problem.with_target(away * [1, -1])
     assert is_simple(problem)
     check(problem, construct(problem))
 
@@ -117,7 +117,7 @@ def test_a_guide_need_not_be_injective():
 @pytest.mark.parametrize("exponent", [-900, -40, 900])
 def test_any_scale(exponent):
     problem = onto_polygon(2, "grid")
-    far = problem.moved(np.ldexp(problem.target, exponent))
+    far = problem.with_target(np.ldexp(problem.target, exponent))
     made = construct(far)
     check(far, made)
     assert np.array_equal(np.ldexp(made.uv, -exponent), construct(problem).uv)
@@ -193,7 +193,7 @@ def test_flattened_edges_at_any_scale(scale):
 
 def test_far_from_the_origin():
     problem = onto_polygon(2, "grid")
-    far = problem.moved(problem.target + 2.0**40)
+    far = problem.with_target(problem.target + 2.0**40)
     check(far, construct(far))
 
 
@@ -214,7 +214,7 @@ def test_thinning_leaves_what_is_needed():
     made = construct(chevron)
     check(chevron, made)
     assert len(made.refined.parents) == 1
-    turned = chevron.moved(np.roll(chevron.target, 1, axis=0))
+    turned = chevron.with_target(np.roll(chevron.target, 1, axis=0))
     made = construct(turned)
     check(turned, made)
     assert not len(made.refined.parents)
@@ -275,7 +275,7 @@ class TestWhichProblems:
         target = problem.target.copy()
         target[-1] = target[np.isin(problem.fixed, hole)].mean(axis=0)
         assert is_simple(problem)
-        assert not is_simple(problem.moved(target))
+        assert not is_simple(problem.with_target(target))
 
     @pytest.mark.parametrize("seed", range(5))
     def test_pins_level_with_corners(self, seed):

@@ -78,7 +78,7 @@ class TestDisks:
     def test_of_every_surface(self, name, gain):
         V, F = SURFACES[name]
         before = V.copy(), F.copy()
-        cut = find_cuts(V, F, gain=gain)
+        cut = find_cuts(V, F, min_gain=gain)
         assert parts(V, F, cut) == [(1, 1)]
         assert cut.dtype == np.int64
         assert np.array_equal(cut, np.unique(np.sort(cut, axis=1), axis=0))
@@ -127,24 +127,24 @@ class TestDisks:
         given = inner[rng.random(len(inner)) < rng.choice([0, 0.05, 0.3])]
         spared = inner[rng.random(len(inner)) < rng.choice([0, 0.2])]
         V = V * 10.0 ** rng.uniform(-3, 0, 3)
-        cut = find_cuts(V, F, edges=given, uncut=spared, gain=rng.choice([0.01, 0.1, np.inf]))
+        cut = find_cuts(V, F, edges=given, forbidden_edges=spared, min_gain=rng.choice([0.01, 0.1, np.inf]))
         assert set(parts(V, F, cut)) == {(1, 1)}
 
 
 class TestShortest:
     def test_two_edges_of_a_tetrahedron(self):
-        assert len(find_cuts(*TETRAHEDRON, gain=np.inf)) == 2
+        assert len(find_cuts(*TETRAHEDRON, min_gain=np.inf)) == 2
 
     @pytest.mark.parametrize(("hole", "width"), [((-0.5, -0.5, 0.5, 0.75), 0.25), ((-0.9, -0.2, 0.1, 0.25), 0.1)])
     def test_across_the_narrowest_strip(self, hole, width):
         V, F = surfaces.annulus(12, hole=hole)
-        assert length_of(V, find_cuts(V, F, gain=np.inf)) == pytest.approx(width)
+        assert length_of(V, find_cuts(V, F, min_gain=np.inf)) == pytest.approx(width)
 
     def test_a_ring_and_the_inner_equator_of_a_torus(self):
         V, F = torus(40, 20, radius=3)
         ring, equator = np.arange(20), 10 + 20 * np.arange(40)
         shortest = sum(np.linalg.norm(V[loop] - V[np.roll(loop, 1)], axis=1).sum() for loop in (ring, equator))
-        assert length_of(V, find_cuts(V, F, gain=np.inf)) == pytest.approx(shortest, rel=1e-3)
+        assert length_of(V, find_cuts(V, F, min_gain=np.inf)) == pytest.approx(shortest, rel=1e-3)
 
     def test_no_cut_where_nothing_is_gained(self):
         assert find_cuts(*surfaces.disk(8)).shape == (0, 2)
@@ -177,7 +177,7 @@ class TestShortest:
         assert np.allclose(inside_out.cost[corner], 0.5 * graph.length[corner])
         flat = np.isclose(graph.cost, graph.length)
         assert flat.sum() > corner.sum()
-        cut = find_cuts(V, F, gain=np.inf)
+        cut = find_cuts(V, F, min_gain=np.inf)
         number = graph.numbers(*cut.T)
         assert graph.cost[number].sum() < 0.9 * graph.length[number].sum()
 
@@ -249,7 +249,7 @@ class TestWorth:
     @pytest.mark.parametrize("gain", [0.1, np.inf])
     def test_the_energy_is_about_that_of_the_map(self, gain):
         for V, F in (surfaces.starfish(5, 24), surfaces.starfish(3, 24), double_torus()):
-            cut = find_cuts(V, F, gain=gain)
+            cut = find_cuts(V, F, min_gain=gain)
             graph, shrinking = edge_graph(V, F), Shrinking(edge_graph(V, F))
             open_at = np.zeros(len(V), dtype=bool)
             open_at[cut] = True
@@ -266,12 +266,12 @@ class TestWorth:
             assert np.linalg.norm(V[np.unique(cut)] - tip, axis=1).min() < 0.15
         # Little more than arms and the middle are long.
         assert length_of(V, cut) < 5 * 1.3
-        assert energy_of(V, F, cut) < 0.1 * energy_of(V, F, find_cuts(V, F, gain=np.inf))
+        assert energy_of(V, F, cut) < 0.1 * energy_of(V, F, find_cuts(V, F, min_gain=np.inf))
 
     @pytest.mark.slow
     def test_more_gain_asked_for_makes_cuts_shorter(self):
         V, F = surfaces.starfish(5, 24)
-        lengths = [length_of(V, find_cuts(V, F, gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
+        lengths = [length_of(V, find_cuts(V, F, min_gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]
 
@@ -293,20 +293,20 @@ class TestGiven:
     @pytest.mark.parametrize("gain", [0.1, np.inf])
     def test_a_ring_is_completed(self, gain):
         V, F = TORUS
-        cut = find_cuts(V, F, edges=self.RING, gain=gain)
+        cut = find_cuts(V, F, edges=self.RING, min_gain=gain)
         assert parts(V, F, cut) == [(1, 1)]
         assert {tuple(pair) for pair in np.sort(self.RING, axis=1).tolist()} <= {tuple(pair) for pair in cut.tolist()}
 
     def test_parts_are_disks_each(self):
         V, F = TORUS
-        cut = find_cuts(V, F, edges=np.concatenate([self.RING, self.RING + 14 * 18]), gain=np.inf)
+        cut = find_cuts(V, F, edges=np.concatenate([self.RING, self.RING + 14 * 18]), min_gain=np.inf)
         assert parts(V, F, cut) == [(1, 1), (1, 1)]
         assert length_of(V, cut) < length_of(V, self.RING) * 2 + 2 * np.pi
 
     def test_enough_is_enough(self):
         V, F = TORUS
-        enough = find_cuts(V, F, gain=np.inf)
-        assert np.array_equal(find_cuts(V, F, edges=enough[::-1, ::-1], gain=np.inf), enough)
+        enough = find_cuts(V, F, min_gain=np.inf)
+        assert np.array_equal(find_cuts(V, F, edges=enough[::-1, ::-1], min_gain=np.inf), enough)
 
     def test_one_edge_inside_opens_nothing(self):
         V, F = TORUS
@@ -325,7 +325,7 @@ class TestGiven:
         V, F = TORUS
         half = len(F) // 2
         diagonals = F[:half, [0, 2]]
-        cut = find_cuts(V, F, uncut=diagonals)
+        cut = find_cuts(V, F, forbidden_edges=diagonals)
         assert parts(V, F, cut) == [(1, 1)]
         assert not np.isin(edge_keys(*cut.T, len(V)), edge_keys(*diagonals.T, len(V))).any()
 
@@ -344,10 +344,10 @@ class TestGiven:
         ({"edges": [[0, 4]]}, r"edge \(0, 4\): no triangle has such a side"),
         ({"edges": [[0, 7]]}, "refers to vertex 7"),
         ({"edges": [[0.5, 1]]}, "edges must hold integer indices"),
-        ({"uncut": [[0, 7]]}, "uncut refers to vertex 7"),
-        ({"gain": 0}, "gain must be a positive number, not 0"),
-        ({"gain": np.nan}, "gain must be a positive number, not nan"),
-        ({"gain": "much"}, "gain must be a positive number, not 'much'"),
+        ({"forbidden_edges": [[0, 7]]}, "forbidden_edges refers to vertex 7"),
+        ({"min_gain": 0}, "min_gain must be a positive number, not 0"),
+        ({"min_gain": np.nan}, "min_gain must be a positive number, not nan"),
+        ({"min_gain": "much"}, "min_gain must be a positive number, not 'much'"),
     ],
 )
 def test_wrong_calls_are_refused(change, message):

@@ -79,11 +79,11 @@ class Restated(Isotropic):
     def density(self, d):
         return self.energy.density(d)
 
-    def slopes(self, d):
-        return self.energy.slopes(d)
+    def density_gradient(self, d):
+        return self.energy.density_gradient(d)
 
-    def bends(self, d):
-        return self.energy.bends(d)
+    def density_hessian(self, d):
+        return self.energy.density_hessian(d)
 
 
 @pytest.mark.parametrize("energy", [*ENERGIES.values(), Combination((2.0, conformal_area_blend()), (0.5, MIPS()))])
@@ -107,8 +107,8 @@ def test_an_energy_that_changes_a_part_of_another_is_asked_for_it():
             return 2 * super().density(d)
 
     class Bent(SymmetricDirichlet):
-        def bends(self, d):
-            return tuple(3 * bend for bend in super().bends(d))
+        def density_hessian(self, d):
+            return tuple(3 * bend for bend in super().density_hessian(d))
 
     V, F, w = bowl()
     plain, doubled, bent, both = (
@@ -177,12 +177,12 @@ def test_unsigned_arap_is_that_of_the_singular_values(rng):
     rest, image = ((x[F[:, 1:]] - x[F[:, :1]]).transpose(0, 2, 1) for x in (V, uv))
     J = image @ np.linalg.inv(rest)
     s = np.linalg.svd(J, compute_uv=False)
-    flipped = np.linalg.det(J) < 0
-    assert 10 < flipped.sum() < len(F) - 10
+    inverted = np.linalg.det(J) < 0
+    assert 10 < inverted.sum() < len(F) - 10
     share = np.linalg.det(rest) / np.linalg.det(rest).sum()
     mean = np.sum(share * ((s - 1) ** 2).sum(axis=1))
     assert DeformationEnergy(V, F, UnsignedARAP()).value(w) == pytest.approx(mean, rel=1e-12)
-    s[flipped, 1] *= -1
+    s[inverted, 1] *= -1
     assert DeformationEnergy(V, F, ARAP()).value(w) == pytest.approx(np.sum(share * ((s - 1) ** 2).sum(axis=1)))
     E = DeformationEnergy(V, F, UnsignedARAP())
     assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6

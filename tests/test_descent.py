@@ -22,20 +22,20 @@ from quasiharmonic.solver.methods import (
     LBFGS,
     Alternating,
     Descent,
+    LocalRepair,
     Newton,
-    Patches,
     RandomRestarts,
     Untangling,
     VectorAdam,
     reweighting,
 )
-from quasiharmonic.solver.methods.base import FunctionalDescent, SearchStage, SoFar, Steps
+from quasiharmonic.solver.methods.base import FunctionalDescent, SearchStage, SearchState, Steps
 from quasiharmonic.solver.methods.local_repair import Patch, last_untangled
 from quasiharmonic.solver.methods.newton import SecondOrderModel
 from quasiharmonic.solver.methods.random_restarts import left_of, nearest
 from quasiharmonic.solver.methods.reweighting import reweighted
 from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangled
-from quasiharmonic.solver.search.stages import InPassing
+from quasiharmonic.solver.search.stages import TentativeStage
 from quasiharmonic.solver.search.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
 from shared.meshes import bend, boundary_of, lift, random_xi
@@ -81,8 +81,8 @@ class TestEvery:
         problem = self.posed()
         objective = method.objective(problem, "auto")
         tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
-        assert tutte.flipped > 0
-        return objective, method.start(objective, SoFar(None, tutte.w, tutte))
+        assert tutte.inverted > 0
+        return objective, method.start(objective, SearchState(None, tutte.w, tutte))
 
     def test_is_one_with_defaults_a_word_and_a_way_to_resume(self, kind):
         method = kind()
@@ -288,9 +288,9 @@ class TestPatches:
     def test_only_the_patch_changes(self):
         vertex = 5 * 13 + 6
         objective, start = self.displaced(vertex)
-        assert start.flipped > 0
-        seen = path(Patches(tries=5), objective, start)
-        assert seen[-1].flipped == 0
+        assert start.inverted > 0
+        seen = path(LocalRepair(tries=5), objective, start)
+        assert seen[-1].inverted == 0
         moved = np.flatnonzero(seen[-1].w != start.w)
         assert vertex in moved
         near = np.abs(objective.problem.V[moved] - objective.problem.V[vertex]).max(axis=1)
@@ -299,7 +299,7 @@ class TestPatches:
 
     def test_two_places_one_after_the_other(self):
         objective, start = self.displaced(2 * 13 + 3, 9 * 13 + 8)
-        flips = [i.flipped for i in path(Patches(tries=20), objective, start)]
+        flips = [i.inverted for i in path(LocalRepair(tries=20), objective, start)]
         assert flips[-1] == 0
         assert np.all(np.diff(flips) < 0)
         assert len(flips) > 2
@@ -307,13 +307,13 @@ class TestPatches:
     def test_gives_a_quasi_harmonic_map(self):
         """Where it ends without a flip its tensors are those of the map, and V₃ is zero."""
         objective, start = self.displaced(5 * 13 + 6)
-        end = path(Patches(tries=5), objective, start)[-1]
+        end = path(LocalRepair(tries=5), objective, start)[-1]
         assert end.energy < 1e-20
         np.testing.assert_allclose(objective.evaluate(end.xi).w, end.w, atol=1e-9)
 
     def test_leaves_alone_what_is_injective(self):
         objective, start = self.displaced()
-        assert path(Patches(tries=5), objective, start) == [start]
+        assert path(LocalRepair(tries=5), objective, start) == [start]
 
 
 class TestUntangling:
@@ -397,23 +397,23 @@ class TestRandomRestarts:
         tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
         *_, w = untangled(problem.F, tutte.w, problem.fixed, grading=0.0)
         stuck = objective.of_map(w)
-        assert stuck.flipped > 0
-        assert path(Patches(tries=4), objective, stuck)[-1].flipped == stuck.flipped
+        assert stuck.inverted > 0
+        assert path(LocalRepair(tries=4), objective, stuck)[-1].inverted == stuck.inverted
         end = path(RandomRestarts(in_vain=50), objective, stuck)[-1]
-        assert end.flipped == 0
+        assert end.inverted == 0
         np.testing.assert_array_equal(end.w[problem.fixed], w[problem.fixed])
 
     def test_draws_the_same_numbers_every_time(self):
         objective, start = TestPatches().displaced(5 * 13 + 6)
         first, again = (path(RandomRestarts(in_vain=5), objective, start)[-1] for _ in range(2))
         np.testing.assert_array_equal(first.w, again.w)
-        assert first.flipped == 0
+        assert first.inverted == 0
 
     def test_untangles_first_what_is_too_much_for_local_repair(self):
         objective = Objective(Problem(*star_problem(depth=0.2, n=1000)))
         seen = path(RandomRestarts(in_vain=3), objective)
-        assert seen[0].flipped > 50
-        assert seen[-1].flipped < seen[0].flipped
+        assert seen[0].inverted > 50
+        assert seen[-1].inverted < seen[0].inverted
 
 
 class TestReweighting:
@@ -523,7 +523,7 @@ class TestStrategy:
         assert [stage.begins_with.parameterisation for stage in stages[:3]] == ["si-log", "tanh", "tanh"]
         assert [stage.begins_with.word for stage in stages[:2]] == ["vector-adam"] * 2
         assert [stage.begins_with.word for stage in stages[2:]] == ["alternating", "newton"] * 10
-        assert [isinstance(stage, InPassing) for stage in stages[2:]] == [True, False] * 10
+        assert [isinstance(stage, TentativeStage) for stage in stages[2:]] == [True, False] * 10
         assert sum(stage.begins_with.iterations for stage in stages) == 2000
 
     def test_iterations_in_passing_are_discarded_where_they_find_no_map(self):
@@ -534,11 +534,11 @@ class TestStrategy:
         @dataclass(frozen=True, kw_only=True)
         class Onlooker(Newton):
             def start(self, objective, found):
-                begun.append(found.deepest.energy)
+                begun.append(found.lowest_energy.energy)
                 return super().start(objective, found)
 
         alternation = Alternating(iterations=5, resume=True)
-        for tried in ([], [InPassing(alternation)], [alternation]):
+        for tried in ([], [TentativeStage(alternation)], [alternation]):
             solve(problem, strategy=[VectorAdam(iterations=3), *tried, Onlooker(iterations=1, resume=True)])
         alone, discarded, kept = begun
         assert kept < 0.999 * alone

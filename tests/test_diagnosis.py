@@ -46,7 +46,7 @@ def test_nothing_depends_on_scale_or_on_where_things_are(name):
     if np.all(problem.target * 8 == np.round(problem.target * 8)):
         changes.append(problem.target + 2.0**40)
     for target in changes:
-        found = diagnose(problem.moved(target)).obstructions
+        found = diagnose(problem.with_target(target)).obstructions
         assert [(o.kind, o.vertices.tolist(), o.split.tolist()) for o in found] == expected
 
 

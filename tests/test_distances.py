@@ -415,17 +415,24 @@ def test_starts_that_will_not_do(dome, change, message):
         keep_distances(V, F, change(V[:, :2]))
 
 
+@pytest.mark.parametrize("rings", [None, "a", [3], 0, 2.5])
+def test_rings_that_are_no_number_of_edges_are_refused(dome, rings):
+    V, F = dome
+    with pytest.raises(ValueError, match="rings must be a whole number of at least 1, not"):
+        keep_distances(V, F, V[:, :2], rings=rings)
+
+
 def test_record_keeps_maps_on_the_way(dome):
     V, F = dome
-    result = keep_distances(V, F, V[:, :2], rings=6, record=2)
+    result = keep_distances(V, F, V[:, :2], rings=6, record_every=2)
     last = result.history[-1].iteration
     assert [kept.iteration for kept in result.path] == [*range(0, last + 1, 2)]
     assert all(certify(F, kept.uv).bijective for kept in result.path)
     if last % 2 == 0:
         assert np.array_equal(result.path[-1].uv, result.uv)
     assert not keep_distances(V, F, V[:, :2], rings=6).path
-    with pytest.raises(ValueError, match="record must be a whole number"):
-        keep_distances(V, F, V[:, :2], record=-1)
+    with pytest.raises(ValueError, match="record_every must be a whole number"):
+        keep_distances(V, F, V[:, :2], record_every=-1)
 
 
 # --- by way of a coarse mesh
@@ -469,7 +476,7 @@ def test_rings_too_few_for_any_coarser_mesh(folded, asked):
 @pytest.mark.slow
 def test_what_the_coarse_way_tells_and_records(folded, asked):
     steps = []
-    found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record=1), least=900)
+    found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record_every=1), least=900)
     assert steps == found.history
     assert [step.iteration for step in steps] == [*range(len(steps))]
     assert steps[-1].energy < steps[0].energy
@@ -528,7 +535,7 @@ def test_three_hundred_thousand_triangles_take_about_as_long_as_without_distance
 def test_flatten_ends_with_the_descent_of_distances():
     V, F = surfaces.cat(6)
     plain = flatten(V, F)
-    result = flatten(V, F, energy="distances", rings=8, record=1)
+    result = flatten(V, F, energy="distances", rings=8, record_every=1)
     alone = keep_distances(V, F, plain.uv, rings=8)
     assert certify(F, result.uv).bijective
     sample = surface_distances(V, F, rings=8)

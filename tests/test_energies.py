@@ -139,8 +139,8 @@ def test_mips_does_not_see_scale():
 
 @pytest.mark.parametrize("energy", ISOTROPIC, ids=name_of)
 def test_what_is_said_about_collapse_is_so(energy):
-    flipped = energy.density(inverted_deformation(10))
-    assert np.all(np.isposinf(flipped)) if energy.barrier else np.all(np.isfinite(flipped))
+    inverted = energy.density(inverted_deformation(10))
+    assert np.all(np.isposinf(inverted)) if energy.barrier else np.all(np.isfinite(inverted))
     thin = Deformation.of(np.full(1, 1 + 0j), np.full(1, 1 - 1e-9 + 0j))
     assert (energy.density(thin)[0] > 1e6) == energy.barrier
 
@@ -185,15 +185,15 @@ def test_an_energy_with_first_derivatives_only():
 
 def test_wrong_derivatives_are_found():
     class Wrong(MIPS):
-        def slopes(self, d):
-            a, b = super().slopes(d)
+        def density_gradient(self, d):
+            a, b = super().density_gradient(d)
             return a, 1.01 * b
 
     assert not check_energy(Wrong()).passed
 
     class Bent(MIPS):
-        def bends(self, d):
-            aa, ab, bb = super().bends(d)
+        def density_hessian(self, d):
+            aa, ab, bb = super().density_hessian(d)
             return aa, -ab, bb
 
     found = check_energy(Bent())

@@ -96,7 +96,7 @@ def test_the_last_of_several_times_moves_the_boundary(gmsh, tmp_path, version, b
     path, out, report = tmp_path / "square.msh", tmp_path / "moved.msh", tmp_path / "report.json"
     gmsh(gmsh_files.square, path, version, binary, gaps=True)
     assert main(["morph", str(path), "-o", str(out), "--field", "displacement", "--json", str(report)]) == 0
-    assert json.loads(report.read_text())["flipped"] == []
+    assert json.loads(report.read_text())["inverted"] == []
     before, after = gmsh(gmsh_files.content, path), gmsh(gmsh_files.content, out)
     assert after[1] == before[1]
     upper = before[0][:, 1] == 1

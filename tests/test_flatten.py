@@ -228,10 +228,10 @@ class TestOptions:
             def density(self, d: Deformation):
                 return np.where(d.det > 0, 2 * (d.a + d.b - 1 - np.log(np.abs(d.det))), np.inf)
 
-            def slopes(self, d: Deformation):
+            def density_gradient(self, d: Deformation):
                 return 2 - 2 / d.det, 2 + 2 / d.det
 
-            def bends(self, d: Deformation):
+            def density_hessian(self, d: Deformation):
                 return 2 / d.det**2, -2 / d.det**2, 2 / d.det**2
 
         V, F = cat(8)
@@ -242,7 +242,7 @@ class TestOptions:
     def test_iterations_callback_and_record(self):
         V, F = cat(8)
         seen = Told()
-        result = flatten(V, F, max_iterations=3, callback=seen.append, record=2)
+        result = flatten(V, F, max_iterations=3, callback=seen.append, record_every=2)
         assert result.status is Status.STILL_FALLING
         assert result.certificate.bijective
         assert seen == result.history

@@ -146,7 +146,7 @@ def test_touching_up_opens_what_is_nearly_closed():
 def cut_starfish(arms, rings, gain):
     """A closed surface with limbs cut open: both sides of each seam are at the same places at rest."""
     V, F = starfish(arms, rings)
-    cut = SeamedMesh(V, F).cut(find_cuts(V, F, gain=gain)).opened()
+    cut = SeamedMesh(V, F).cut(find_cuts(V, F, min_gain=gain)).opened()
     return cut.V / np.abs(cut.V).max(), cut.F
 
 

@@ -237,7 +237,7 @@ def test_ctrl_c_gives_the_best_map_so_far(at):
 @pytest.mark.parametrize(
     ("ended", "told"),
     [
-        (Status.SETTLED, Status.INJECTIVE),
+        (Status.STALLED, Status.INJECTIVE),
         (Status.OUT_OF_ITERATIONS, Status.INJECTIVE),
         (Status.INTERRUPTED, Status.INTERRUPTED),
         (Status.ROUNDED, Status.ROUNDED),
@@ -287,7 +287,7 @@ def test_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(pin_problems, "SMALLEST", 100)
     monkeypatch.setattr(pin_problems, "LARGEST", 400)
-    monkeypatch.setitem(pin_problems.WEAKEST, "overwound", 2.0)
+    monkeypatch.setitem(pin_problems.WEAKEST, "multiply_wound", 2.0)
     names = pins.names(7, list(pin_problems.FAMILIES))
     assert [name.partition(":")[0] for name in names] == list(pin_problems.FAMILIES)
     for name in names:

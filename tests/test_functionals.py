@@ -152,7 +152,7 @@ class TestValues:
         signed = iterate.dw.area.sum()
         unsigned = np.abs(iterate.dw.area).sum()
         assert iterate.value + signed >= unsigned >= signed
-        assert iterate.flipped > 0
+        assert iterate.inverted > 0
 
     def test_are_frame_and_similarity_invariant(self, name, V, F):
         """Turning each triangle's corners turns its frame: ξ turns by twice the angle and nothing else happens."""
@@ -240,7 +240,7 @@ class TestTheorems:
         mu = inverse_field(problem.domain.mesh("equilateral"), problem.frame.inward(result.uv))
         end = Objective(problem, functional).evaluate(TANH.invert(mu))
         assert end.value < 1e-10 * max(start.value, 1)
-        assert end.flipped == 0
+        assert end.inverted == 0
 
     def test_sufficiency(self, name, V, F):
         """Theorem 6.4 the other way: where the Neumann data do not fit, V₃ exceeds twice the inverted area."""

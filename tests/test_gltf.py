@@ -271,6 +271,10 @@ def test_what_is_too_large_for_single_precision(tmp_path):
     assert not (tmp_path / "out.glb").exists()
 
 
+def placed(tree, **node):
+    tree.update(nodes=[{"mesh": 0, **node}], scenes=[{"nodes": [0]}])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -298,6 +302,17 @@ def test_what_is_too_large_for_single_precision(tmp_path):
         (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=0), "3 numbers a vertex"),
         (lambda tree: tree["meshes"][0]["primitives"][0].update(targets=[{"POSITION": 7}]), "damaged"),
         (lambda tree: tree.update(images=[3]), "images are no list"),
+        (
+            lambda tree: tree["accessors"][0].update(type="MAT9"),
+            "type of accessor 0 must be one of SCALAR, ",
+        ),
+        (lambda tree: placed(tree, matrix=[1]), "matrix of node 0 must have 16 numbers, not 1$"),
+        (lambda tree: placed(tree, rotation=[0, 0, 1]), "rotation of node 0 must have 4 numbers, not 3$"),
+        (lambda tree: placed(tree, scale=2), "scale of node 0 must have 3 numbers, not 2$"),
+        (
+            lambda tree: placed(tree, translation=[0, 0, "x"]),
+            r"translation of node 0 .*, not \[0, 0, 'x'\]$",
+        ),
     ],
 )
 def test_what_is_damaged_is_named(change, message, tmp_path):

@@ -91,7 +91,7 @@ def test_a_moved_target_is_not_analysed_again_and_starts_near_its_solution(count
     assert last.iterations > 0
     counted.clear()
     for angle in np.linspace(3.1, 5.0, 20):
-        problem = problem.moved(bent(angle))
+        problem = problem.with_target(bent(angle))
         last = solve(problem, start=last.uv)
         assert last.injective
     assert counted["analyse", fine] == 0
@@ -150,7 +150,7 @@ class TestAllocations:
 
         def iterate():
             for here in VectorAdam(iterations=3, schedule=((0, 0.1),)).iterates(objective, start):
-                assert here.flipped >= 0
+                assert here.inverted >= 0
 
         iterate()
         # SuperLU's factor is seen: SciPy hands out a copy of it, from which the signs of the pivots are read.
@@ -168,7 +168,8 @@ class TestAllocations:
 
     def test_of_a_certificate(self):
         V, F, _, _ = posed(80, "C")
-        assert peak(certify, F, V[:, :2].copy())[0] / len(F) < 190
+        # 24 of these bytes are the copy of F that nobody else can change.
+        assert peak(certify, F, V[:, :2].copy())[0] / len(F) < 214
 
     @pytest.mark.slow
     def test_grow_in_proportion(self):

@@ -38,7 +38,7 @@ def folded():
     outline = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3.0]])
     problem = Problem(V, F, loop, arc_length(V[loop], outline))
     uv = quasi_harmonic_map(problem)
-    assert certify(F, uv).flipped.size
+    assert certify(F, uv).inverted.size
     return problem, uv
 
 
@@ -80,7 +80,7 @@ class TestObjective:
         V, F, uv, fixed = bowl()
         objective = objective_of(V, F, uv, fixed, ENERGIES[name](V, F))
         xi = random_xi(F, 1.0)
-        assert objective.evaluate(xi).flipped > 3
+        assert objective.evaluate(xi).inverted > 3
 
         def along(x, d):
             return np.sum(np.conj(objective.evaluate(x).gradient) * d).real
@@ -200,7 +200,7 @@ class TestHarmonise:
         assert result.injective
         assert result.certificate.bijective
         np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
-        assert result.history[0].flipped > 0
+        assert result.history[0].inverted > 0
 
     def test_as_the_paper_has_it(self):
         """One round of η = 1e-4, and nothing to keep triangles from collapsing."""
@@ -309,7 +309,9 @@ class TestHarmonise:
     def test_what_cannot_be_improved(self, monkeypatch):
         """Where all that is found is inverted, the given map comes back, and the status says so."""
         V, F, uv, fixed = bowl()
-        monkeypatch.setattr("quasiharmonic.solver.search.harmonic_descent.flipped_triangles", lambda F, w: np.arange(3))
+        monkeypatch.setattr(
+            "quasiharmonic.solver.search.harmonic_descent.inverted_triangles", lambda F, w: np.arange(3)
+        )
         monkeypatch.setattr("quasiharmonic.solver.search.harmonic_descent.RIGHTING", 1)
         result = harmonise(V, F, uv, fixed=fixed, energy="arap", max_iterations=5)
         assert result.injective

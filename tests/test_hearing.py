@@ -12,19 +12,19 @@ from quasiharmonic import Problem, boundary_loops, flatten, injective_map, polis
 from quasiharmonic.surfaces import cat
 from quasiharmonic.targets import arc_length, letter
 from quasiharmonic.util import progress as hearing
-from quasiharmonic.util.progress import heard, still_at_it
+from quasiharmonic.util.progress import heartbeat, reports_progress
 from shared.solvable import star_problem
 from shared.told import Told
 
 
-@heard
+@reports_progress
 def working(told, *, callback=None):
     """Tell some steps, each followed by work of two parts."""
     for step in told:
         if callback is not None:
             callback(step)
-        still_at_it()
-        still_at_it()
+        heartbeat()
+        heartbeat()
     return told
 
 
@@ -38,7 +38,7 @@ def test_the_last_step_is_told_again(impatient):
     assert working([1, 2], callback=seen.append) == [1, 2]
     assert seen == [1, 1, 1, 2, 2, 2]
     assert working([3]) == [3]
-    still_at_it()
+    heartbeat()
     assert seen[-1] == 2
 
 
@@ -59,7 +59,7 @@ def test_what_a_callback_raises_comes_out(impatient):
     with pytest.raises(KeyboardInterrupt):
         working([1, 2], callback=stop)
     assert seen == [1, 1]
-    still_at_it()
+    heartbeat()
     assert seen == [1, 1]
 
 
@@ -71,13 +71,13 @@ def test_one_who_has_stopped_it_is_not_asked_again(impatient):
         if len(seen) == 2:
             raise KeyboardInterrupt
 
-    @heard
+    @reports_progress
     def interrupted(*, callback):
         try:
             callback(1)
-            still_at_it()
+            heartbeat()
         except KeyboardInterrupt:
-            still_at_it()
+            heartbeat()
             return "the best so far"
 
     assert interrupted(callback=stop) == "the best so far"

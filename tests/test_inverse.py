@@ -274,7 +274,7 @@ def test_bad_input_is_named():
     V, F = disk(3)
     folded = V.copy()
     folded[0] = [0.9, 0]
-    with pytest.raises(ValueError, match=r"no inverse\. Not injective: of 54 triangles, \d are flipped"):
+    with pytest.raises(ValueError, match=r"no inverse\. Not injective: of 54 triangles, \d are inverted"):
         InverseMap(V, F, folded, overlapping=True)
     with pytest.raises(ValueError, match="V must have as many rows as uv, 37, not 36"):
         InverseMap(V[:-1], F, V)

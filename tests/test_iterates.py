@@ -89,7 +89,7 @@ def hasty():
 SHARED = {
     "one objective": lambda make, problem, one: one,
     "two objectives of one problem": lambda make, problem, one: make(problem),
-    "a moved problem": lambda make, problem, one: make(problem.moved(problem.target)),
+    "a moved problem": lambda make, problem, one: make(problem.with_target(problem.target)),
 }
 
 

@@ -10,8 +10,8 @@ import pytest
 from quasiharmonic import Problem, Status, boundary_loops, certify, injective_map, io
 from quasiharmonic.solver.construction import constructing, cutting
 from quasiharmonic.solver.methods import Newton, RandomRestarts, VectorAdam
-from quasiharmonic.solver.refine import solve_refining as climbing
-from quasiharmonic.solver.refine.solve_refining import climb
+from quasiharmonic.solver.refine import attempts as climbing
+from quasiharmonic.solver.refine.attempts import solve_refining
 from quasiharmonic.solver.search.strategy import soonest, speed, without_restarts
 from quasiharmonic.surfaces import disk
 from shared.commands import run
@@ -33,7 +33,7 @@ def test_the_mesh_as_given_comes_first():
     assert result.certificate.bijective
     assert result.refined is None
     assert result.added == 0
-    assert [(rung.name, rung.injective) for rung in result.rungs] == [("as given", True)]
+    assert [(rung.name, rung.injective) for rung in result.refinement_attempts] == [("as given", True)]
     assert np.array_equal(result.uv, injective_map(V, F, loop, V[loop] * [2, 1]).uv)
 
 
@@ -43,7 +43,7 @@ def test_the_construction_is_asked_before_the_whole_search():
     result = injective_map(*star_problem(depth=0.15, n=60), refine=True, strategy=haste)
     assert result.certificate.bijective
     assert result.refined is None
-    assert [(rung.name, rung.injective, rung.added) for rung in result.rungs] == [
+    assert [(rung.name, rung.injective, rung.added) for rung in result.refinement_attempts] == [
         ("as given", False, 0),
         ("constructed", True, 0),
     ]
@@ -59,14 +59,14 @@ def test_vertices_are_added_where_there_is_no_map_without():
     assert certify(result.refined.F, result.uv).bijective
     assert np.array_equal(result.refined.V[: len(V)], V)
     assert np.array_equal(result.uv[fixed], target)
-    assert result.added == len(result.uv) - len(V) == result.rungs[-1].added == 1
-    assert not result.rungs[0].injective
-    assert result.rungs[-1].injective
+    assert result.added == len(result.uv) - len(V) == result.refinement_attempts[-1].added == 1
+    assert not result.refinement_attempts[0].injective
+    assert result.refinement_attempts[-1].injective
     told = result.to_dict()
     json.dumps(told)
     assert told["added_vertices"] == result.added
-    assert [rung["name"] for rung in told["rungs"]] == [rung.name for rung in result.rungs]
-    assert "rungs" not in injective_map(V, F, fixed, target).to_dict()
+    assert [rung["name"] for rung in told["refinement_attempts"]] == [rung.name for rung in result.refinement_attempts]
+    assert "refinement_attempts" not in injective_map(V, F, fixed, target).to_dict()
 
 
 def test_a_polish_is_of_the_refined_mesh():
@@ -75,13 +75,13 @@ def test_a_polish_is_of_the_refined_mesh():
     assert result.status in (Status.POLISHED, Status.EXHAUSTED)
     assert result.certificate.bijective
     assert len(result.refined.V) == len(result.uv) > len(V)
-    assert len(result.rungs) > 1
+    assert len(result.refinement_attempts) > 1
 
 
 @pytest.mark.slow
 def test_holes_and_pins_that_the_mesh_has_elsewhere():
     problem = with_holes(np.random.default_rng(0), 2, 2, size=7)
-    result = climb(problem, max_iterations=30)
+    result = solve_refining(problem, max_iterations=30)
     assert result.certificate.bijective
     assert np.array_equal(result.uv[problem.fixed], problem.target)
 
@@ -98,7 +98,7 @@ def without_room():
 @pytest.mark.slow
 def test_doubles_without_room_are_told(without_room):
     result = without_room[-1]
-    assert result.status is Status.NO_ROOM
+    assert result.status is Status.PRECISION_LIMIT
     assert not result.injective
     assert set(result.crowded.tolist()) <= {0, 1, 2}
     assert result.crowded.size
@@ -115,8 +115,8 @@ def test_cutting_without_end_is_told(monkeypatch):
 
     monkeypatch.setattr(constructing, "Cutting", cut)
     problem = with_holes(np.random.default_rng(0), 2, 2, size=7)
-    result = climb(problem, max_iterations=1)
-    assert result.status is Status.ENTANGLED
+    result = solve_refining(problem, max_iterations=1)
+    assert result.status is Status.TOO_MANY_SPLITS
     assert not result.certificate.bijective
     assert (result.added, result.crowded.size) == (0, 0)
     assert np.array_equal(result.uv[problem.fixed], problem.target)
@@ -167,7 +167,7 @@ def test_no_restarts_while_a_constructed_map_is_in_hand(monkeypatch):
 
     searching = climbing.solve
     monkeypatch.setattr(climbing, "solve", solve)
-    result = climb(problem)
+    result = solve_refining(problem)
     assert result.certificate.bijective
     (triangles, first, whole), *others = searches
     assert triangles == len(problem.F)
@@ -200,7 +200,7 @@ class TestCtrlCWithAMapInHand:
         assert certify(result.F, result.uv, loops=problem.domain.loops).bijective
         assert len(result.uv) == problem.n + result.added
         assert np.array_equal(result.uv[problem.fixed], problem.target)
-        assert [(rung.name, rung.added) for rung in result.rungs[-1:]] == [("constructed", result.added)]
+        assert [(rung.name, rung.added) for rung in result.refinement_attempts[-1:]] == [("constructed", result.added)]
 
     def test_after_the_construction(self):
         problem, first = onto_polygon(1, "grid"), []
@@ -212,7 +212,7 @@ class TestCtrlCWithAMapInHand:
             if len(first) == 2 and step.iteration == 2:
                 raise KeyboardInterrupt
 
-        result = climb(problem, strategy=self.haste, max_iterations=40, callback=stop)
+        result = solve_refining(problem, strategy=self.haste, max_iterations=40, callback=stop)
         self.check(problem, result)
         assert first[0] in result.history
         assert first[1] in result.history
@@ -221,7 +221,7 @@ class TestCtrlCWithAMapInHand:
     def test_while_vertices_are_taken_out(self, monkeypatch):
         monkeypatch.setattr(constructing, "thinned", interrupting)
         problem = onto_polygon(1, "grid")
-        self.check(problem, climb(problem, strategy=self.haste, max_iterations=40))
+        self.check(problem, solve_refining(problem, strategy=self.haste, max_iterations=40))
 
     def test_while_a_found_map_is_thinned(self, monkeypatch):
         monkeypatch.setattr(climbing, "thinned", interrupting)
@@ -236,7 +236,7 @@ class TestCtrlCWithAMapInHand:
 def test_an_energy_is_named_for_what_slides():
     V, F, fixed, target = chevron()
     with pytest.raises(ValueError, match="name an energy"):
-        climb(Problem(V, F, fixed, target), slide=True)
+        solve_refining(Problem(V, F, fixed, target), slide=True)
 
 
 def test_the_command_climbs_the_same_ladder(tmp_path, capsys):
@@ -250,7 +250,9 @@ def test_the_command_climbs_the_same_ladder(tmp_path, capsys):
     report = json.loads((tmp_path / "report.json").read_text())
     expected = injective_map(V, F, fixed, target, refine=True)
     assert report["added_vertices"] == expected.added
-    assert [rung["name"] for rung in report["rungs"]] == [rung.name for rung in expected.rungs]
+    assert [rung["name"] for rung in report["refinement_attempts"]] == [
+        rung.name for rung in expected.refinement_attempts
+    ]
     assert "new vertices are at the end of the list" in capsys.readouterr().out
     written = io.read_mesh(out)
     assert len(written.V) == len(V) + expected.added
@@ -263,7 +265,7 @@ def test_the_command_names_where_there_is_no_room(without_room, tmp_path, capsys
     V, F, target, result = without_room
     uv = np.vstack([target, [1, 1]])
     given = []
-    monkeypatch.setattr(climbing, "climb", lambda problem, **_: given.append(problem) or result)
+    monkeypatch.setattr(climbing, "solve_refining", lambda problem, **_: given.append(problem) or result)
     io.write_obj(tmp_path / "in.obj", io.MeshData(np.column_stack([V, np.zeros(4)]), F).with_map(uv))
     assert run("map", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--refine") == 1
     assert "no room" in capsys.readouterr().out

@@ -77,7 +77,7 @@ class TestAgreement:
             alone = solve(given) if isinstance(given, Problem) else injective_map(*given)
             assert result.status is alone.status
             assert [stage.name for stage in result.stages] == [stage.name for stage in alone.stages]
-            assert [step.flipped for step in result.history] == [step.flipped for step in alone.history]
+            assert [step.inverted for step in result.history] == [step.inverted for step in alone.history]
             # At a map whose vertices have been placed the energy is zero but for rounding.
             np.testing.assert_allclose(
                 [step.energy for step in result.history], [step.energy for step in alone.history], rtol=1e-6, atol=1e-25
@@ -110,14 +110,14 @@ class TestAgreement:
         stars = [star_problem(depth=0.15, points=6, n=150, seed=seed) for seed in range(5)]
         V, F, fixed, target = stars[0]
         turned = [(V, F, fixed, target * [1, 0.5 + k / 10]) for k in range(5)]
-        for problems in (ellipses(2) + stars, [Problem(V, F, fixed, target).moved(one[3]) for one in turned]):
+        for problems in (ellipses(2) + stars, [Problem(V, F, fixed, target).with_target(one[3]) for one in turned]):
             posed = [given if isinstance(given, Problem) else Problem(*given) for given in problems]
             descent = VectorAdam(iterations=30, placing=True)
             found = first_stage(posed, descent, Patterns("auto"), 1000, lambda: None)
             assert max(len(one.history) for one in found) > 4
             for problem, one in zip(posed, found, strict=True):
                 alone = solve(problem, strategy=[descent])
-                assert [step.flipped for step in one.history] == [step.flipped for step in alone.history]
+                assert [step.inverted for step in one.history] == [step.inverted for step in alone.history]
                 np.testing.assert_allclose(
                     [step.energy for step in one.history],
                     [step.energy for step in alone.history],
@@ -146,7 +146,7 @@ class TestAgreement:
             alone = injective_map(*given, strategy=strategy)
             assert len(result.stages) == 2
             assert result.stages[0].iterations == 2
-            assert [step.flipped for step in result.history] == [step.flipped for step in alone.history]
+            assert [step.inverted for step in result.history] == [step.inverted for step in alone.history]
             assert result.injective == alone.injective
         assert any(result.injective for result in results)
 
@@ -274,7 +274,7 @@ class TestTrouble:
 
 
 def test_verdicts_on_many_maps_are_those_on_each(rng):
-    """Good maps and bad ones: flipped, flat, not finite, boundaries that cross, touch and repeat, holes, islands."""
+    """Good maps and bad ones: inverted, flat, not finite, boundaries that cross, touch and repeat, holes, islands."""
     maps = []
     for seed in range(60):
         V, F = random_delaunay(30, seed=seed)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic.energies.measures import MEASURES, distortion
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.surfaces import grid, random_delaunay
 from shared.meshes import bend, lift, surfaces
 
@@ -49,7 +49,7 @@ def test_singular_values_are_those_of_the_jacobian(name, V, F):
     assert np.sum(found.share * found.area_ratio) == pytest.approx(1)
     assert found.share.sum() == pytest.approx(1)
     assert not found.flat.size
-    assert not found.flipped.size
+    assert not found.inverted.size
 
 
 def test_similarities_distort_nothing():
@@ -80,7 +80,7 @@ def test_inverted_and_collapsed_images():
         found = distortion(V, [[0, 1, 2]], image)
         assert found.sigma1 == pytest.approx(1)
         assert found.sigma2 == pytest.approx(sigma2)
-        assert found.flipped.tolist() == [0]
+        assert found.inverted.tolist() == [0]
         for name in ("mips", "conformal", "isometric", "symmetric_dirichlet"):
             assert np.isposinf(getattr(found, name)).all()
         assert found.area_ratio == pytest.approx(sigma2)
@@ -101,9 +101,9 @@ def test_the_sign_is_the_certificates(rng):
     x = rng.random(len(V))
     uv = np.stack([x, 0.1 * x], axis=1)
     found = distortion(V, F, uv)
-    assert np.array_equal(found.flipped, flipped_triangles(F, uv))
-    assert np.array_equal(np.flatnonzero(found.sigma2 <= 0), found.flipped)
-    assert 0 < found.flipped.size < len(F)
+    assert np.array_equal(found.inverted, inverted_triangles(F, uv))
+    assert np.array_equal(np.flatnonzero(found.sigma2 <= 0), found.inverted)
+    assert 0 < found.inverted.size < len(F)
 
 
 def test_flat_rest_triangles_are_undefined_and_left_out():
@@ -111,7 +111,7 @@ def test_flat_rest_triangles_are_undefined_and_left_out():
     uv = np.array([[0, 0], [1, 0], [0, 1], [2, 0.5]])
     found = distortion(V, [[0, 1, 2], [0, 1, 3]], uv)
     assert found.flat.tolist() == [1]
-    assert found.flipped.size == 0
+    assert found.inverted.size == 0
     for name, values in found.per_triangle().items():
         assert np.isnan(values).tolist() == [False, True], name
     assert np.isnan(found.beltrami[1])
@@ -147,7 +147,7 @@ def test_reports_are_json_whatever_the_map():
         assert json.loads(json.dumps(report, allow_nan=False)) == report
         assert set(MEASURES) < set(report)
     assert report["mips"]["maximum"] is None
-    assert report["flipped"] == len(F)
+    assert report["inverted"] == len(F)
 
 
 def test_any_dtype():

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from quasiharmonic import MovingMesh, Rails, boundary_loops, certify
+from quasiharmonic import BoundaryCurves, MovingMesh, boundary_loops, certify
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.energies.newton import sliding
@@ -159,8 +159,8 @@ def test_a_matrix_used_again_is_as_good_as_a_new_one(ring):
     points, F, walls, hole = ring
     domain = Domain(points, F, np.concatenate([hole, walls]))
 
-    def descent(mesh, system=None, held=hole):
-        track = sliding.lay_boundary(Rails.around([walls], points, held=held), domain, mesh)
+    def descent(mesh, system=None, fixed=hole):
+        track = sliding.lay_boundary(BoundaryCurves.around([walls], points, fixed=fixed), domain, mesh)
         # At another scale, so that what is kept has to follow.
         energy, exponent = at_own_scale(Domain(3 * points, F, walls), track.uv, SymmetricDirichlet())
         return sliding.SlidingDescent(energy, track, domain.fixed, domain.loops, exponent, "auto", system)
@@ -177,7 +177,7 @@ def test_a_matrix_used_again_is_as_good_as_a_new_one(ring):
         one.step(1e-4)
     assert np.abs(again.positions(again.w) - bent).max() > 1e-3
     np.testing.assert_array_equal(again.positions(again.w), new.positions(new.w))
-    assert descent(bent, first.system, held=walls[::2]).system is not first.system
+    assert descent(bent, first.system, fixed=walls[::2]).system is not first.system
 
 
 def test_a_mesh_in_place_of_points_and_triangles(ring, tmp_path):
@@ -188,7 +188,7 @@ def test_a_mesh_in_place_of_points_and_triangles(ring, tmp_path):
     write_obj(tmp_path / "ring.obj", MeshData(np.column_stack([points, np.zeros(len(points))]), F))
     for mesh in (skfem, SimpleNamespace(points=points, cells=[SimpleNamespace(type="triangle", data=F)])):
         np.testing.assert_array_equal(MovingMesh(mesh, hole).advance(there), expected)
-        np.testing.assert_array_equal(MovingMesh(mesh, moved=hole, settle=1).F, F)
+        np.testing.assert_array_equal(MovingMesh(mesh, moved_vertices=hole, settle=1).F, F)
     np.testing.assert_allclose(MovingMesh(tmp_path / "ring.obj", hole).advance(there), expected, atol=1e-12)
     with pytest.raises(TypeError, match="both"):
         MovingMesh(skfem, F, hole)
@@ -220,7 +220,7 @@ def test_units_do_not_matter(ring, exponent):
         ({"points": [[0, 0], [1, 0], [np.nan, 1]]}, "points"),
         ({"points": [[0, 0], [1, 0], [2, 0]]}, "without area"),
         ({"moved": [7]}, "moved"),
-        ({"moved": [[0]]}, r"moved must have shape \(k,\), not \(1, 1\)"),
+        ({"moved": [[0]]}, r"moved_vertices must have shape \(k,\), not \(1, 1\)"),
         (
             {"points": [[0, 0], [1, 0], [0, 1], [0.1, 0.1]], "F": [[0, 1, 2], [1, 3, 2]]},
             "folded over at edge \\(1, 2\\)",

@@ -10,7 +10,7 @@ import problems
 from quasiharmonic import Problem, boundary_loops, injective_maps, quasi_harmonic_map, solve
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.solver.methods import VectorAdam
-from quasiharmonic.solver.methods.relocation import Tries, placed, placed_each, roomiest
+from quasiharmonic.solver.methods.relocation import RetrySchedule, placed, placed_each, roomiest
 from quasiharmonic.solver.search.strategy import paper, speed
 from quasiharmonic.surfaces import random_delaunay
 
@@ -135,13 +135,13 @@ def test_however_many_are_placed_at_once_and_whatever_is_around_them(rng):
 
 
 def test_tries_are_made_when_fewer_are_left_and_ever_more_rarely():
-    tries = Tries()
+    tries = RetrySchedule()
     assert not tries.due(0)
     counts = [200, 13, 12, 12, 10, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8]
-    assert [k for k, flipped in enumerate(counts) if tries.due(flipped)] == [2, 5, 13]
+    assert [k for k, inverted in enumerate(counts) if tries.due(inverted)] == [2, 5, 13]
     # The first map is tried with more.
-    assert Tries().due(100)
-    assert not Tries().due(101)
+    assert RetrySchedule().due(100)
+    assert not RetrySchedule().due(101)
 
 
 class TestWithin:
@@ -164,7 +164,7 @@ class TestWithin:
     def test_many_together_are_as_each(self):
         for problem, together in zip(self.made(), injective_maps(self.made()), strict=True):
             alone = solve(problem)
-            assert [step.flipped for step in together.history] == [step.flipped for step in alone.history]
+            assert [step.inverted for step in together.history] == [step.inverted for step in alone.history]
             np.testing.assert_allclose(together.uv, alone.uv, atol=1e-9)
             np.testing.assert_allclose(together.mu, alone.mu, atol=1e-6)
             np.testing.assert_allclose(together.history[-1].energy, alone.history[-1].energy, atol=1e-12)

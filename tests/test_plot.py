@@ -13,7 +13,7 @@ import pytest
 from matplotlib.image import imread
 from PIL import Image
 
-from quasiharmonic import flipped_triangles, surfaces
+from quasiharmonic import inverted_triangles, surfaces
 from quasiharmonic import io as files
 from quasiharmonic.energies.measures import MEASURES
 from quasiharmonic.plot import (
@@ -70,12 +70,12 @@ def test_map_is_red_only_where_it_is_inverted(planar):
 
 def test_inverted_triangles_can_be_given(planar):
     V, F, _ = planar
-    one = red(pixels(plot_map(V, F, V, flipped=[17]).figure))
+    one = red(pixels(plot_map(V, F, V, inverted=[17]).figure))
     mask = np.zeros(len(F), dtype=bool)
     mask[17] = True
     assert one.any()
-    assert np.array_equal(one, red(pixels(plot_map(V, F, V, flipped=mask).figure)))
-    assert not red(pixels(plot_map(V, F, planar[2], flipped=[]).figure)).any()
+    assert np.array_equal(one, red(pixels(plot_map(V, F, V, inverted=mask).figure)))
+    assert not red(pixels(plot_map(V, F, planar[2], inverted=[]).figure)).any()
 
 
 def test_triangles_too_small_to_see_are_marked():
@@ -124,7 +124,7 @@ def test_saved_figure_has_three_panels_or_two(planar, tmp_path):
 
 def test_given_flips_are_those_of_the_map_not_of_the_guess(planar, tmp_path):
     V, F, folded = planar
-    save_map_figure(tmp_path / "map.png", V, F, V, folded, flipped=[3], fixed=[0])
+    save_map_figure(tmp_path / "map.png", V, F, V, folded, inverted=[3], fixed=[0])
     columns = red(imread(tmp_path / "map.png")).any(axis=0)
     assert columns[400:800].sum() > 20
     assert columns[800:].any()
@@ -393,7 +393,7 @@ def test_window(planar, tmp_path, monkeypatch):
     # Inverted triangles are meshes of their own, red; all is in the picture.
     parts = [polyscope.get_surface_mesh(name).n_faces() for name in ("map", "map: inverted")]
     assert sum(parts) == len(F)
-    assert parts[1] == len(flipped_triangles(F, folded)) > 0
+    assert parts[1] == len(inverted_triangles(F, folded)) > 0
     assert polyscope.get_surface_mesh("surface: inverted").get_color() == pytest.approx(RED)
     camera, target = interactive.view_of(np.array([[0, 0, 0], [20, 2, 0]]), 2.0, np.pi / 2)
     assert target.tolist() == [10, 1, 0]

@@ -29,7 +29,7 @@ def test_a_pace_has_every_step_and_the_seconds_until_then(first):
 
 
 def test_near_is_the_first_step_within_two_per_cent():
-    pace = polish_pace.Pace([0.1, 0.2, 0.3, 0.4], [9.0, 2.05, 2.04, 2.0], 0.5, {})
+    pace = polish_pace.AdamState([0.1, 0.2, 0.3, 0.4], [9.0, 2.05, 2.04, 2.0], 0.5, {})
     assert pace.near(2.0) == (0.3, 2)
     assert pace.near(1.0) is None
 

@@ -244,18 +244,22 @@ def test_an_energy_of_ones_own():
 
 @pytest.mark.parametrize(
     ("spoilt", "words"),
-    [("density", "the energy is"), ("slopes", "the first derivative is"), ("bends", "the second derivative is")],
+    [
+        ("density", "the energy is"),
+        ("density_gradient", "the first derivative is"),
+        ("density_hessian", "the second derivative is"),
+    ],
 )
 def test_an_energy_of_ones_own_that_is_no_number_is_named(spoilt, words):
     class Spoilt(MIPS):
         def density(self, d):
             return self.at_some("density", super().density(d))
 
-        def slopes(self, d):
-            return tuple(self.at_some("slopes", part) for part in super().slopes(d))
+        def density_gradient(self, d):
+            return tuple(self.at_some("density_gradient", part) for part in super().density_gradient(d))
 
-        def bends(self, d):
-            return tuple(self.at_some("bends", part) for part in super().bends(d))
+        def density_hessian(self, d):
+            return tuple(self.at_some("density_hessian", part) for part in super().density_hessian(d))
 
         def at_some(self, what, values):
             values = np.array(values)
@@ -290,7 +294,7 @@ def test_steps_are_reported_as_they_happen():
     result = polish(V, F, uv, fixed=fixed, callback=seen.append)
     assert seen == result.history
     assert [step.iteration for step in seen] == list(range(len(seen)))
-    assert {step.flipped for step in seen} == {0}
+    assert {step.inverted for step in seen} == {0}
 
 
 def test_interruption_keeps_the_best_map():

@@ -115,13 +115,13 @@ def test_any_dtype_and_layout_is_accepted_and_nothing_modified(dtype, index):
 
 def test_moved_shares_the_factorisation_and_checks_the_target():
     problem = posed()
-    moved = problem.moved(2 * TARGET)
+    moved = problem.with_target(2 * TARGET)
     assert moved.domain.laplacian() is problem.domain.laplacian()
     assert moved.domain.mesh("rest") is problem.domain.mesh("rest")
     np.testing.assert_array_equal(moved.target, 2 * TARGET)
     np.testing.assert_array_equal(problem.target, TARGET)
     with pytest.raises(ValueError, match="target is not finite"):
-        problem.moved(np.full_like(TARGET, np.nan))
+        problem.with_target(np.full_like(TARGET, np.nan))
 
 
 @pytest.mark.parametrize("scale", [5e-324, 1e-300, 1e-150, 1.0, 1e150, 1e300, 1.7e308])

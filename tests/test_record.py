@@ -23,13 +23,13 @@ def turned_ring():
 @pytest.mark.parametrize("k", [1, 3, 7])
 def test_every_kth_map_is_kept(k):
     V, F, fixed, target = turned_ring()
-    result = injective_map(V, F, fixed, target, record=k)
+    result = injective_map(V, F, fixed, target, record_every=k)
     assert result.iterations > 20
     assert [s.iteration for s in result.path] == list(range(0, result.iterations + 1, k))
     for snapshot in result.path:
         step = result.history[snapshot.iteration]
         assert step.iteration == snapshot.iteration
-        assert np.count_nonzero(signed_areas(F, snapshot.uv) <= 0) == step.flipped
+        assert np.count_nonzero(signed_areas(F, snapshot.uv) <= 0) == step.inverted
         np.testing.assert_array_equal(snapshot.uv[fixed], target)
     if k == 1:
         np.testing.assert_array_equal(result.path[-1].uv, result.uv)
@@ -40,7 +40,7 @@ def test_every_kth_map_is_kept(k):
 @pytest.mark.slow
 def test_recording_changes_nothing_and_is_off_by_default():
     problem = Problem(*turned_ring())
-    plain, recorded = solve(problem), solve(problem, record=2)
+    plain, recorded = solve(problem), solve(problem, record_every=2)
     assert plain.path == []
     np.testing.assert_array_equal(plain.uv, recorded.uv)
     assert plain.history == recorded.history
@@ -48,10 +48,10 @@ def test_recording_changes_nothing_and_is_off_by_default():
 
 def test_counts_on_through_the_stages():
     stages = [VectorAdam(iterations=4), Newton(iterations=6, resume=True)]
-    result = solve(Problem(*turned_ring()), strategy=stages, record=1)
+    result = solve(Problem(*turned_ring()), strategy=stages, record_every=1)
     assert [s.iteration for s in result.path] == [s.iteration for s in result.history]
 
 
 def test_a_negative_interval_is_refused():
     with pytest.raises(ValueError, match="record"):
-        solve(Problem(*turned_ring()), record=-1)
+        solve(Problem(*turned_ring()), record_every=-1)

@@ -184,7 +184,7 @@ def test_problems_are_refined_until_nothing_is_named():
 
 def test_rounds_are_limited():
     problem, _ = next(case for case in OBSTRUCTED.values() if refine_problem(case[0]).rounds > 1)
-    result = refine_problem(problem, most_rounds=1)
+    result = refine_problem(problem, max_rounds=1)
     assert result.rounds == 1
     assert len(result.diagnosis.split)
-    assert refine_problem(problem, most_rounds=0).problem is problem
+    assert refine_problem(problem, max_rounds=0).problem is problem

@@ -42,7 +42,7 @@ def test_a_field_without_folds_is_handed_back():
     mended = nearest_invertible(field)
     assert np.array_equal(mended.field, field)
     assert (mended.folds, mended.patches, mended.distance) == (0, 0, 0)
-    assert not mended.moved.any()
+    assert not mended.moved_mask.any()
     assert mended.certificate.bijective
     assert "does not fold" in mended.summary()
 
@@ -58,9 +58,9 @@ def test_one_fold_is_mended_and_the_rest_is_untouched():
     assert fold_free(mended.field.astype(np.float32)).all()
     assert mended.certificate.bijective
     assert mended.patches == 1
-    assert np.array_equal(mended.field[~mended.moved], field[~mended.moved])
+    assert np.array_equal(mended.field[~mended.moved_mask], field[~mended.moved_mask])
     away = np.hypot(*(pixels(50, 60) - (30, 25)).transpose(2, 0, 1)) > 12
-    assert not mended.moved[away].any()
+    assert not mended.moved_mask[away].any()
     apart = np.sqrt(((mended.field - field) ** 2).sum(axis=2).mean())
     assert mended.distance == pytest.approx(apart, rel=1e-12)
     # A Gaussian as narrow as leaves no fold is much further away.
@@ -121,16 +121,16 @@ def test_pixels_that_are_held_stay():
     border = np.ones((24, 24), dtype=bool)
     border[1:-1, 1:-1] = False
     field[border] = 0
-    mended = nearest_invertible(field, held=border)
-    assert not mended.moved[border].any()
+    mended = nearest_invertible(field, fixed=border)
+    assert not mended.moved_mask[border].any()
     assert fold_free(mended.field).all()
     assert mended.distance > nearest_invertible(field).distance
-    with pytest.raises(ValueError, match=r"all held; the first of each is pixels \("):
-        nearest_invertible(field, held=np.ones((24, 24), dtype=bool))
+    with pytest.raises(ValueError, match=r"all fixed; the first of each is pixels \("):
+        nearest_invertible(field, fixed=np.ones((24, 24), dtype=bool))
     swapped = np.zeros((5, 7, 2))
     swapped[2, 2, 0], swapped[2, 4, 0] = 2, -2
-    with pytest.raises(RuntimeError, match=r"keeps what is held; what folds still has pixels \(1, 2\), "):
-        nearest_invertible(swapped, held=np.hypot(swapped[..., 0], swapped[..., 1]) > 0)
+    with pytest.raises(RuntimeError, match=r"keeps what is fixed; what folds still has pixels \(1, 2\), "):
+        nearest_invertible(swapped, fixed=np.hypot(swapped[..., 0], swapped[..., 1]) > 0)
 
 
 def test_units_do_not_matter():
@@ -145,7 +145,7 @@ def test_units_do_not_matter():
 def test_noise_far_away_is_mended_as_doubles_have_it():
     field = np.random.default_rng(3).normal(size=(14, 15, 2)) * 0.3 + 1e6
     assert not fold_free(field, spacing=0.1).all()
-    mended = nearest_invertible(field, spacing=0.1, least=0)
+    mended = nearest_invertible(field, spacing=0.1, min_jacobian=0)
     assert fold_free(mended.field, spacing=0.1).all()
     with pytest.raises(RuntimeError, match="rounding folds the field"):
         nearest_invertible(field + 1e16, spacing=0.1)
@@ -157,8 +157,8 @@ def test_one_pixel_far_away_leaves_the_rest_alone(far):
     field[11, 9] = far, -0.3 * far
     mended = nearest_invertible(field)
     assert mended.certificate.bijective
-    y, x = np.nonzero(mended.moved)
-    assert mended.moved[11, 9]
+    y, x = np.nonzero(mended.moved_mask)
+    assert mended.moved_mask[11, 9]
     assert mended.distance == pytest.approx(far * np.hypot(1, 0.3) / np.sqrt(24 * 26), rel=1e-6)
     assert max(np.abs(y - 11).max(), np.abs(x - 9).max()) < 6
 
@@ -242,9 +242,9 @@ def test_wrong_fields(function, field, options, message):
 
 
 def test_wrong_options():
-    with pytest.raises(ValueError, match="least must be at least 0 and less than 1, not 1"):
-        nearest_invertible(WRONG, least=1)
-    with pytest.raises(ValueError, match=r"least must be at least 0 and less than 1, not '0\.5'"):
-        nearest_invertible(WRONG, least="0.5")
-    with pytest.raises(ValueError, match=r"held must be an array of bool of shape \(5, 6\)"):
-        nearest_invertible(WRONG, held=[0, 1])
+    with pytest.raises(ValueError, match="min_jacobian must be at least 0 and less than 1, not 1"):
+        nearest_invertible(WRONG, min_jacobian=1)
+    with pytest.raises(ValueError, match=r"min_jacobian must be at least 0 and less than 1, not '0\.5'"):
+        nearest_invertible(WRONG, min_jacobian="0.5")
+    with pytest.raises(ValueError, match=r"fixed must be an array of bool of shape \(5, 6\)"):
+        nearest_invertible(WRONG, fixed=[0, 1])

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic import distortion, flipped_triangles, io, repair
+from quasiharmonic import distortion, inverted_triangles, io, repair
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.commands import run
 from shared.meshes import bend, boundary_of, lift, signed_areas
@@ -46,7 +46,7 @@ class TestRepair:
         V, F = random_delaunay(400, seed=2)
         uv = bend(V)
         start, pushed = damaged(uv, inner_rows(F), count, scale)
-        flips = flipped_triangles(F, start)
+        flips = inverted_triangles(F, start)
         assert flips.size
         result = repair(lift(V), F, start)
         (island,) = result.islands
@@ -54,9 +54,9 @@ class TestRepair:
         assert island.bijective
         assert exact_signs(result.uv, F).min() == 1
         assert np.array_equal(island.inverted_before, flips)
-        assert np.array_equal(result.moved, np.flatnonzero((result.uv != start).any(axis=1)))
+        assert np.array_equal(result.moved_vertices, np.flatnonzero((result.uv != start).any(axis=1)))
         # Hardly any vertex that was left alone has to make room.
-        assert len(np.setdiff1d(result.moved, pushed)) <= count // 20
+        assert len(np.setdiff1d(result.moved_vertices, pushed)) <= count // 20
         assert np.array_equal(result.FT, F)
 
     def test_no_vertex_has_moved_in_vain(self):
@@ -65,9 +65,9 @@ class TestRepair:
         result = repair(V, F, start)
         assert result.injective
         distances = np.linalg.norm(result.uv - start, axis=1)
-        assert distances[result.moved].min() > 0
+        assert distances[result.moved_vertices].min() > 0
         # Patches are polished: no triangle around what moved is left all but flat.
-        around = np.isin(F, result.moved).any(axis=1)
+        around = np.isin(F, result.moved_vertices).any(axis=1)
         assert signed_areas(F, result.uv)[around].min() > 1e-3 * np.median(signed_areas(F, V))
 
     def test_inputs_are_left_alone_and_results_repeat(self):
@@ -86,7 +86,7 @@ class TestRepair:
         assert np.array_equal(result.uv, uv)
         assert np.array_equal(result.FT, FT)
         assert result.injective
-        assert result.moved.size == 0
+        assert result.moved_vertices.size == 0
         assert result.summary() == "3 islands: 0 triangles inverted before, 0 now; 0 vertices moved"
 
     def test_islands_one_by_one(self):
@@ -94,14 +94,14 @@ class TestRepair:
         start, pushed = damaged(uv, inner_rows(FT, strip == 1), 10, 0.1)
         result = repair(V, F, start, FT=FT)
         assert result.injective
-        assert [len(island.moved) > 0 for island in result.islands] == [False, True, False]
+        assert [len(island.moved_vertices) > 0 for island in result.islands] == [False, True, False]
         assert exact_signs(result.uv, result.FT).min() == 1
         changed = np.flatnonzero((result.uv != start).any(axis=1))
         assert len(result.uv) == len(start)
         assert len(np.setdiff1d(changed, pushed)) <= 1
         assert np.array_equal(result.FT, FT)
         # Rows of places and vertices of the mesh are counted apart.
-        assert np.array_equal(result.islands[1].moved, np.unique(F[np.isin(FT, changed)]))
+        assert np.array_equal(result.islands[1].moved_vertices, np.unique(F[np.isin(FT, changed)]))
 
     def test_whole_islands_when_asked(self):
         V, F, uv, FT, strip = strips()
@@ -165,7 +165,7 @@ class TestRepair:
         start[lost] = [[np.nan, 0], [1e67, -1e67], [np.inf, np.nan]]
         result = repair(V, F, start)
         assert result.injective
-        assert np.array_equal(result.moved, lost)
+        assert np.array_equal(result.moved_vertices, lost)
 
     def test_holes(self):
         V, F = annulus(12)
@@ -181,7 +181,7 @@ class TestRepair:
         angle, radius = -2.4 * np.pi * V[:, 0], 2 + V[:, 1]
         wound = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
         start, _ = damaged(wound, inner_rows(F), 6, 0.4)
-        assert flipped_triangles(F, start).size
+        assert inverted_triangles(F, start).size
         result = repair(V, F, start)
         assert result.injective
         assert not result.islands[0].bijective
@@ -229,7 +229,7 @@ class TestBeyondRepair:
         assert [island.injective for island in result.islands] == [True, True, True, False]
         last = result.islands[-1]
         assert last.inverted.tolist() == [len(F) - 1]
-        assert last.moved.size == 0
+        assert last.moved_vertices.size == 0
         assert last.diagnosis.forbids_injective
         (obstruction,) = (o for o in last.diagnosis.obstructions if o.triangles.size)
         assert obstruction.triangles.tolist() == [len(F) - 1]
@@ -263,7 +263,7 @@ class TestBeyondRepair:
         uv[rows] *= [-1, 1]
         result = repair(V, F, uv, FT=FT, unmirror=True)
         assert result.injective
-        assert not flipped_triangles(result.FT, result.uv).size
+        assert not inverted_triangles(result.FT, result.uv).size
         assert np.array_equal(result.uv[FT[strip != 2]], uv[FT[strip != 2]])
         # In the same box.
         for pick in (np.min, np.max):
@@ -328,14 +328,14 @@ class TestCommand:
         before, after = uv_file.read_text().splitlines(), out.read_text().splitlines()
         changed = [(a, b) for a, b in zip(before, after, strict=True) if a != b]
         facts = json.loads(report.read_text())
-        assert 0 < len(changed) == facts["moved"]
+        assert 0 < len(changed) == facts["moved_vertices"]
         assert all(a.startswith("vt ") and b.startswith("vt ") for a, b in changed)
         mesh, written = io.read_obj(uv_file), io.read_obj(out)
         assert exact_signs(mesh.vt, mesh.FT).min() == -1
         assert exact_signs(written.vt, written.FT).min() == 1
         assert facts["injective"] is True
         assert facts["inverted"] == 0
-        assert [len(island["moved"]) > 0 for island in facts["islands"]] == [True, False, True]
+        assert [len(island["moved_vertices"]) > 0 for island in facts["islands"]] == [True, False, True]
         said = capsys.readouterr()
         assert f"wrote {out}: 3 islands: {facts['inverted_before']} triangles inverted before, 0 now" in said.out
         assert said.err == ""
@@ -346,7 +346,7 @@ class TestCommand:
         assert run("check", uv_file, "--json", report) == 1
         mesh = io.read_obj(uv_file)
         wrong = np.flatnonzero(exact_signs(mesh.vt, mesh.FT) <= 0)
-        assert json.loads(report.read_text())["flipped"] == wrong.tolist()
+        assert json.loads(report.read_text())["inverted"] == wrong.tolist()
         assert run("repair", uv_file, "-o", out) == 0
         capsys.readouterr()
         assert run("check", out) == 0

@@ -41,7 +41,7 @@ V = np.column_stack([PLANE, PLANE[:, 0] * PLANE[:, 1]])
 BEAN = PLANE[LOOP] * (1 + 0.4 * PLANE[LOOP, :1])
 PROBLEM = Problem(V, F, LOOP, BEAN)
 RESULT = solve(PROBLEM, polish="mips")
-CROSSED = PROBLEM.moved(np.concatenate([BEAN[:6][::-1], BEAN[6:]]))
+CROSSED = PROBLEM.with_target(np.concatenate([BEAN[:6][::-1], BEAN[6:]]))
 DIAGNOSIS = diagnose(CROSSED)
 FAILED = certify(F, np.where(np.arange(len(V))[:, None] == 0, 3.0, RESULT.uv))
 SHOWN = [PROBLEM, RESULT, RESULT.certificate, distortion(V, F, RESULT), DIAGNOSIS, FAILED]
@@ -108,7 +108,7 @@ def test_what_notebooks_ask_for():
     assert "injective and bijective, 96 triangles" in repr(RESULT)
     assert repr(DIAGNOSIS).startswith("<Diagnosis: no injective map: 1 × ")
     assert repr(diagnose(PROBLEM)) == "<Diagnosis: no known obstruction>"
-    assert repr(FAILED) == f"<Certificate: not injective, {len(FAILED.flipped)} of 96 triangles not positive>"
+    assert repr(FAILED) == f"<Certificate: not injective, {len(FAILED.inverted)} of 96 triangles not positive>"
     assert repr(certify(F, RESULT, boundary=False)) == "<Certificate: injective, 96 triangles>"
 
 
@@ -200,7 +200,7 @@ def test_convergence_has_every_iteration():
     positive = wanted > 0
     np.testing.assert_array_equal(drawn[positive, 1], wanted[positive])
     assert drawn[-1, 0] == RESULT.iterations
-    assert np.concatenate([line.get_ydata() for line in flips.lines]).tolist() == [s.flipped for s in RESULT.history]
+    assert np.concatenate([line.get_ydata() for line in flips.lines]).tolist() == [s.inverted for s in RESULT.history]
 
 
 def test_convergence_of_what_never_was_finite():

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic import Rails, Status, boundary_loops, morph, surfaces
+from quasiharmonic import BoundaryCurves, Status, boundary_loops, morph, surfaces
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.mesh.elements import rim
 from shared.meshes import boundary_of
@@ -275,7 +275,7 @@ def test_what_cannot_be_righted_is_tried_in_silence():
 def test_middle_nodes_slide_too(flap, slide):
     points, F = second_order(*flap[:2])
     body = rim(F)[np.abs(points[rim(F)]).max(axis=1) < 0.9]
-    square = Rails([[(-1, -1), (1, -1), (1, 1), (-1, 1)]])
+    square = BoundaryCurves([[(-1, -1), (1, -1), (1, 1), (-1, 1)]])
     morphed = morph(points, F, body, turned(points[body], 45), slide=square if slide == "rails" else True)
     held = morph(points, F, body, turned(points[body], 45))
     assert morphed.valid

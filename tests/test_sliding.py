@@ -15,8 +15,8 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.sliding import SlidingDescent
-from quasiharmonic.geometry.curves import Curve, Rails
-from quasiharmonic.geometry.curves.deviation import Straying
+from quasiharmonic.geometry.curves import BoundaryCurves, Curve
+from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.targets import boundary_to, filled, outline, outline_curves
 from quasiharmonic.targets.outlines.letters import glyph_paths
@@ -92,7 +92,7 @@ def off_the_glyph(points, character):
 def test_a_letter_is_better_with_its_boundary_sliding(character):
     V, F, fixed, target, curves = lettered(f"letter:{character}")
     held = injective_map(V, F, fixed, target, polish="symmetric-dirichlet")
-    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=Rails(curves))
+    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
     assert result.status is Status.POLISHED
     assert certify(F, result.uv).bijective
     polishing = [step.energy for step in result.history[-result.stages[-1].iterations - 1 :]]
@@ -122,7 +122,7 @@ def test_a_letter_is_better_with_its_boundary_sliding(character):
 def test_a_word_slides_along_the_curves_of_its_letters():
     pytest.importorskip("shapely")
     V, F, fixed, target, curves = lettered("word:OC")
-    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=Rails(curves))
+    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
     outer = max(curves, key=lambda curve: curve.length)
@@ -142,7 +142,7 @@ def test_a_word_slides_along_the_curves_of_its_letters():
 def test_a_boundary_on_a_circle_turns_back():
     V, F, uv, loop = turned()
     held = polish(V, F, uv, fixed=loop)
-    result = polish(V, F, uv, fixed=loop, slide=Rails([Curve.circle()]), tolerance=1e-10)
+    result = polish(V, F, uv, fixed=loop, slide=BoundaryCurves([Curve.circle()]), tolerance=1e-10)
     assert held.history[-1].energy > 0.1
     # The polygon that the boundary is has grown a little since the start, whose scale it is.
     assert result.history[-1].energy < 1e-6
@@ -153,7 +153,9 @@ def test_a_boundary_on_a_circle_turns_back():
     assert np.ptp(np.angle(turn[np.hypot(*V.T) > 0])) < 1e-3
 
 
-@pytest.mark.parametrize("slide", [True, Rails([SQUARE]), Rails([Curve.polyline([*SQUARE, SQUARE[0]])])])
+@pytest.mark.parametrize(
+    "slide", [True, BoundaryCurves([SQUARE]), BoundaryCurves([Curve.polyline([*SQUARE, SQUARE[0]])])]
+)
 def test_sides_of_a_square(slide):
     V, F, uv, loop = sheared()
     before = uv.copy()
@@ -175,7 +177,7 @@ def test_kinks_are_passed():
     share = share + 0.1 * np.sin(2 * np.pi * share)
     target = polygon.position(share * polygon.length)
     held = injective_map(V, F, loop, target, polish="symmetric-dirichlet")
-    result = injective_map(V, F, loop, target, polish="symmetric-dirichlet", slide=Rails([polygon]))
+    result = injective_map(V, F, loop, target, polish="symmetric-dirichlet", slide=BoundaryCurves([polygon]))
     assert result.status is Status.POLISHED
     assert result.history[-1].energy < 0.1 * held.history[-1].energy
     assert polygon.nearest(result.uv[loop])[1].max() <= np.spacing(1.0)
@@ -192,8 +194,8 @@ def test_kinks_are_stopped_at():
     V[loop] = polygon.position(s)
     V[loop[::2]] *= 1.08
     uv = V.copy()
-    uv[loop] = polygon.position(polygon.moved(s, 0.06 * np.sin(3 * s) + 0.02))
-    result = polish(V, F, uv, fixed=loop, slide=Rails([polygon]))
+    uv[loop] = polygon.position(polygon.advance(s, 0.06 * np.sin(3 * s) + 0.02))
+    result = polish(V, F, uv, fixed=loop, slide=BoundaryCurves([polygon]))
     assert result.status is Status.POLISHED
     at = {tuple(p) for p in result.uv[loop].tolist()}
     assert sum(tuple(p) in at for p in polygon.position(polygon.corners(1.0)).tolist()) == 18
@@ -202,7 +204,7 @@ def test_kinks_are_stopped_at():
 def test_an_edge_does_not_cut_off_a_bend():
     """Few vertices on a curved letter: without bounds the last two jump across, for less energy."""
     V, F, fixed, target, curves = lettered("letter:S")
-    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=Rails(curves))
+    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
     (curve,) = curves
 
     def strays(uv):
@@ -223,7 +225,7 @@ def test_holes_slide_on_their_own():
     angle = np.angle(ring)
     uv = points_of(ring * np.exp(1j * (0.3 * np.sin(angle) + 0.8 * size)))
     fixed = np.concatenate([outer, inner])
-    circles = Rails([Curve.circle(), Curve.circle(0.5)])
+    circles = BoundaryCurves([Curve.circle(), Curve.circle(0.5)])
     result = polish(V, F, uv, fixed=fixed, slide=circles)
     assert result.history[-1].energy < polish(V, F, uv, fixed=fixed).history[-1].energy
     assert np.abs(np.hypot(*result.uv[outer].T) - 1).max() < 3e-16
@@ -233,7 +235,7 @@ def test_holes_slide_on_their_own():
 
 def test_nothing_can_slide_where_all_are_corners():
     V, F, _, loop = sheared(2)
-    corners = Rails([V[loop]], corner_angle=0)
+    corners = BoundaryCurves([V[loop]], corner_angle=0)
     result = polish(V, F, V, fixed=loop, slide=corners)
     np.testing.assert_array_equal(result.uv[loop], V[loop])
 
@@ -241,7 +243,7 @@ def test_nothing_can_slide_where_all_are_corners():
 def test_some_are_held_and_some_are_told():
     V, F, uv, loop = sheared()
     lower, right, upper, left = (np.flatnonzero(V[:, axis] == v) for axis, v in ((1, 0), (0, 1), (1, 1), (0, 0)))
-    rails = Rails([Curve.polyline([(0, 0), (1, 0)]), Curve.polyline([(1, 1), (0, 1)])], held=upper[2:4])
+    rails = BoundaryCurves([Curve.polyline([(0, 0), (1, 0)]), Curve.polyline([(1, 1), (0, 1)])], fixed=upper[2:4])
     result = polish(V, F, uv, fixed=loop, slide=rails, max_iterations=5)
     stays = np.union1d(np.union1d(left, right), upper[2:4])
     np.testing.assert_array_equal(result.uv[stays], uv[stays])
@@ -254,7 +256,7 @@ def test_some_are_held_and_some_are_told():
     on = {int(v): int(uv[v, 1] < 0) for v in loop}
     start = uv.copy()
     near = loop[np.argmin(np.abs(start[loop, 1]) + (start[loop, 0] < 0))]
-    result = polish(V, F, start, fixed=loop, slide=Rails(half, on=on, tolerance=0.05))
+    result = polish(V, F, start, fixed=loop, slide=BoundaryCurves(half, on=on, tolerance=0.05))
     assert all((result.uv[v, 1] < 1e-12) == bool(k) or abs(result.uv[v, 1]) < 1e-12 for v, k in on.items())
     assert np.abs(np.hypot(*result.uv[loop].T) - 1).max() <= np.spacing(1.0)
     assert near in loop
@@ -271,7 +273,7 @@ def _half_circles():
 
 def laid(straight=False):
     V, F, uv, loop = sheared(6) if straight else turned(5)
-    rails = Rails([SQUARE]) if straight else Rails([Curve.circle()])
+    rails = BoundaryCurves([SQUARE]) if straight else BoundaryCurves([Curve.circle()])
     track = rails.lay([loop], uv)
     energy = DeformationEnergy(V, F, SymmetricDirichlet())
     return track, SlidingDescent(energy, track, loop, [loop], 1, "auto")
@@ -287,13 +289,13 @@ def test_first_and_second_derivatives_along_curves(straight, rng):
         """The map after a step in the unknowns, in units."""
         w = descent.w.copy()
         w[system.free] += step
-        s = track.moved(track.s, step[system.at].real * unit)
+        s = track.advance(track.s, step[system.at].real * unit)
         w[track.vertices] = z_of(track.position(s)) / unit
         return w, s
 
     def merit(step):
         w, s = go(step)
-        return energy.value(w) + descent.weight * descent.straying.value(s)
+        return energy.value(w) + descent.weight * descent.deviation_barrier.value(s)
 
     def random_step():
         step = rng.standard_normal(system.free.size) + 1j * rng.standard_normal(system.free.size)
@@ -340,24 +342,24 @@ def test_the_barrier_of_straying(rng):
     V, _, fixed, target, curves = lettered("letter:S")
     places = np.zeros((len(V), 2))
     places[fixed] = target
-    track = Rails(curves).lay([fixed], places)
-    straying = Straying(track, [fixed])
-    assert len(straying.pairs) > 0.9 * fixed.size
-    assert 0 < straying.value(track.s) < 0.2
-    slope, bend = straying.derivatives(track.s)
+    track = BoundaryCurves(curves).lay([fixed], places)
+    deviation_barrier = DeviationBarrier(track, [fixed])
+    assert len(deviation_barrier.pairs) > 0.9 * fixed.size
+    assert 0 < deviation_barrier.value(track.s) < 0.2
+    slope, bend = deviation_barrier.derivatives(track.s)
     total = np.zeros(track.s.size)
     for end in (0, 1):
-        number = straying.pairs[:, end]
+        number = deviation_barrier.pairs[:, end]
         np.add.at(total, number[number >= 0], slope[number >= 0, end])
     gap = curves[0].length / fixed.size
     for _ in range(3):
         d, h = rng.standard_normal(track.s.size) * gap, 1e-3
-        change = [straying.value(track.moved(track.s, t * d)) for t in (h, -h)]
+        change = [deviation_barrier.value(track.advance(track.s, t * d)) for t in (h, -h)]
         assert (change[0] - change[1]) / (2 * h) == pytest.approx(float(total @ d), rel=2e-2)
     assert np.linalg.eigvalsh(bend).min() > -1e-12 * bend.max()
     # All the way to the next: the edge between two that part strays too far.
     far = np.where(np.arange(track.s.size) < track.s.size // 2, -4.0, 4.0) * gap
-    assert straying.value(track.moved(track.s, far)) == np.inf
+    assert deviation_barrier.value(track.advance(track.s, far)) == np.inf
 
 
 # Moved meshes
@@ -371,7 +373,7 @@ def channel(n=14):
     return V, F, walls, body, turn
 
 
-@pytest.mark.parametrize("slide", [True, Rails([np.array(SQUARE) * 2.0 - 1])])
+@pytest.mark.parametrize("slide", [True, BoundaryCurves([np.array(SQUARE) * 2.0 - 1])])
 def test_a_turned_body_takes_the_walls_along(slide):
     V, F, walls, body, turn = channel()
     held = morph(V, F, body, turn)
@@ -399,7 +401,7 @@ def test_moved_vertices_slide_where_they_are_told():
     V, F, _, body, turn = channel()
     square = points_of(z_of(np.array(SQUARE) * 1.2 - 0.6) * np.exp(0.5j))
     on = dict.fromkeys(body.tolist(), 1)
-    rails = Rails([np.array(SQUARE) * 2.0 - 1, square], on=on)
+    rails = BoundaryCurves([np.array(SQUARE) * 2.0 - 1, square], on=on)
     morphed = morph(V, F, body, turn, slide=rails)
     only_walls = morph(V, F, body, turn, slide=True)
     assert morphed.result.history[-1].energy < only_walls.result.history[-1].energy
@@ -411,11 +413,11 @@ def test_vertices_of_no_triangle_are_counted_all_the_same():
     V, F, walls, body, turn = channel(8)
     V, F = np.concatenate([[(9, 9)], V]), F + 1
     on = dict.fromkeys((walls + 1).tolist(), 0)
-    morphed = morph(V, F, body + 1, turn, slide=Rails([np.array(SQUARE) * 2.0 - 1], on=on))
+    morphed = morph(V, F, body + 1, turn, slide=BoundaryCurves([np.array(SQUARE) * 2.0 - 1], on=on))
     assert morphed.valid
     np.testing.assert_array_equal(morphed.points[0], (9, 9))
     with pytest.raises(ValueError, match="vertex 0 of the rails in no triangle"):
-        morph(V, F, body + 1, turn, slide=Rails([SQUARE], held=[0]))
+        morph(V, F, body + 1, turn, slide=BoundaryCurves([SQUARE], fixed=[0]))
 
 
 # What is refused
@@ -424,23 +426,26 @@ def test_vertices_of_no_triangle_are_counted_all_the_same():
 @pytest.mark.parametrize(
     ("rails", "message"),
     [
-        (lambda loop: Rails([SQUARE], on={int(loop[3]): 1}), "on refers to curve 1, but there are only curves 0 … 0"),
-        (lambda loop: Rails([SQUARE], on={int(loop[3]): 0.5}), "on must hold integer"),
-        (lambda loop: Rails([]), "no curve to slide along"),
-        (lambda loop: Rails([SQUARE], corner_angle=200), "corner_angle is between 0 and 180"),
-        (lambda loop: Rails([SQUARE], tolerance=np.nan), "tolerance is between 0 and 1"),
-        (lambda loop: Rails([[(0, 0), (1, np.nan), (1, 1)]]), "not finite at row 1"),
-        (lambda loop: Rails([SQUARE], held=[0.5]), "held must hold integer"),
-        (lambda loop: Rails([SQUARE], held=[10**6]), "held refers to vertex 1000000"),
-        (lambda loop: Rails([SQUARE], on={10**6: 0}), "on refers to vertex 1000000"),
-        (lambda loop: Rails([SQUARE], on={60: 0}), "vertex 60 told a curve, but not on the boundary"),
-        (lambda loop: Rails([np.array(SQUARE) + 7]), "no boundary vertex is within"),
         (
-            lambda loop: Rails([Curve.polyline([(0, 0), (1, 0)])], on={int(v): 0 for v in loop}),
+            lambda loop: BoundaryCurves([SQUARE], on={int(loop[3]): 1}),
+            "on refers to curve 1, but there are only curves 0 … 0",
+        ),
+        (lambda loop: BoundaryCurves([SQUARE], on={int(loop[3]): 0.5}), "on must hold integer"),
+        (lambda loop: BoundaryCurves([]), "no curve to slide along"),
+        (lambda loop: BoundaryCurves([SQUARE], corner_angle=200), "corner_angle is between 0 and 180"),
+        (lambda loop: BoundaryCurves([SQUARE], tolerance=np.nan), "tolerance is between 0 and 1"),
+        (lambda loop: BoundaryCurves([[(0, 0), (1, np.nan), (1, 1)]]), "not finite at row 1"),
+        (lambda loop: BoundaryCurves([SQUARE], fixed=[0.5]), "fixed must hold integer"),
+        (lambda loop: BoundaryCurves([SQUARE], fixed=[10**6]), "fixed refers to vertex 1000000"),
+        (lambda loop: BoundaryCurves([SQUARE], on={10**6: 0}), "on refers to vertex 1000000"),
+        (lambda loop: BoundaryCurves([SQUARE], on={60: 0}), "vertex 60 told a curve, but not on the boundary"),
+        (lambda loop: BoundaryCurves([np.array(SQUARE) + 7]), "no boundary vertex is within"),
+        (
+            lambda loop: BoundaryCurves([Curve.polyline([(0, 0), (1, 0)])], on={int(v): 0 for v in loop}),
             "told to be on curve 0, but off it by 1 at most",
         ),
-        (lambda loop: 3, "slide must be True or Rails, not 3"),
-        (lambda loop: "letter:G", "slide must be True or Rails, not 'letter:G'"),
+        (lambda loop: 3, "slide must be True or BoundaryCurves, not 3"),
+        (lambda loop: "letter:G", "slide must be True or BoundaryCurves, not 'letter:G'"),
     ],
 )
 def test_rails_that_cannot_be(rails, message):
@@ -457,9 +462,9 @@ def test_order_violated():
     swapped[[a, b]] = V[[b, a]]
     met[a] = met[b]
     with pytest.raises(ValueError, match="follow each other around the surface but not along curve 0"):
-        Rails([SQUARE]).lay([loop], swapped)
+        BoundaryCurves([SQUARE]).lay([loop], swapped)
     with pytest.raises(ValueError, match=f"boundary vertices {a} and {b} are at one place of curve 0"):
-        Rails([SQUARE]).lay([loop], met)
+        BoundaryCurves([SQUARE]).lay([loop], met)
 
 
 def test_a_start_that_is_nowhere_near():
@@ -476,13 +481,13 @@ def test_a_start_that_is_nowhere_near():
     thin[inner, 1] = -2.5e-4
     if certify(F, thin).injective:
         with pytest.raises(ValueError, match="with the boundary on the curves"):
-            polish(V, F, thin, fixed=loop, slide=Rails([SQUARE]))
+            polish(V, F, thin, fixed=loop, slide=BoundaryCurves([SQUARE]))
 
 
 def test_sliding_needs_an_energy():
     V, F, fixed, target, curves = lettered("letter:H")
     with pytest.raises(ValueError, match="name an energy"):
-        injective_map(V, F, fixed, target, slide=Rails(curves))
+        injective_map(V, F, fixed, target, slide=BoundaryCurves(curves))
 
 
 def test_a_map_that_overlaps_itself_may_slide():
@@ -503,7 +508,7 @@ def test_a_map_that_overlaps_itself_may_slide():
         (loop,) = boundary_loops(F, len(V))
     assert certify(F, uv).injective
     assert not certify(F, uv).bijective
-    rails = Rails([Curve.polygon(uv[loop])], on=dict.fromkeys(loop.tolist(), 0))
+    rails = BoundaryCurves([Curve.polygon(uv[loop])], on=dict.fromkeys(loop.tolist(), 0))
     result = polish(V, F, uv, fixed=loop, slide=rails, max_iterations=5)
     assert result.injective
     assert result.history[-1].energy < result.history[0].energy
@@ -640,4 +645,4 @@ def test_morph_slides(tmp_path):
 )
 def test_rails_of_what_is_none(arguments, words):
     with pytest.raises(ValueError, match=words):
-        Rails(**arguments)
+        BoundaryCurves(**arguments)

@@ -81,7 +81,7 @@ def test_a_step_has_its_length_and_direction_and_curvature(rng):
     h = 1e-4
 
     def z(step):
-        return complex_of(curve.position(curve.moved(s, np.full(s.size, step))))
+        return complex_of(curve.position(curve.advance(s, np.full(s.size, step))))
 
     tangent, curvature = curve.frame(s, np.ones(s.size, dtype=bool))
     assert np.abs(np.abs(tangent) - 1).max() < 1e-14
@@ -103,11 +103,11 @@ def test_two_directions_at_a_joint():
 def test_going_around_and_stopping():
     square = Curve.polygon([(0, 0), (2, 0), (2, 2), (0, 2)])
     s, step = np.array([0.0, 1.5, 7.5, 2.0, 2.0]), np.array([-3.0, 0.4, 1.0, 0.0, 2.5])
-    assert square.moved(s, step) == pytest.approx([5, 1.9, 0.5, 2, 4.5])
-    assert square.moved(s, step, stop=True).tolist() == [6, 1.9, 0, 2, 4]
+    assert square.advance(s, step) == pytest.approx([5, 1.9, 0.5, 2, 4.5])
+    assert square.advance(s, step, stop=True).tolist() == [6, 1.9, 0, 2, 4]
     line = Curve.polyline([(0, 0), (1, 0), (1, 1)])
-    assert line.moved(np.array([0.5, 0.5, 1.5]), np.array([-3.0, 1.0, 1.0])).tolist() == [0, 1.5, 2]
-    assert line.moved(np.array([0.5, 0.5, 1.5]), np.array([-3.0, 1.0, 1.0]), stop=True).tolist() == [0, 1, 2]
+    assert line.advance(np.array([0.5, 0.5, 1.5]), np.array([-3.0, 1.0, 1.0])).tolist() == [0, 1.5, 2]
+    assert line.advance(np.array([0.5, 0.5, 1.5]), np.array([-3.0, 1.0, 1.0]), stop=True).tolist() == [0, 1, 2]
 
 
 def test_handles_drawn_back_have_a_direction():

@@ -71,7 +71,7 @@ def test_a_map_that_follows_is_the_harmonic_map_of_the_last_tensors():
     followed = Follower(problem, uv, one.result.certificate).to(target)
     mesh = problem.domain.mesh("equilateral")
     d = mesh.derivatives(problem.frame.inward(uv))
-    expected = quasi_harmonic_map(problem.moved(target), d.q / d.p)
+    expected = quasi_harmonic_map(problem.with_target(target), d.q / d.p)
     assert followed.reached
     assert np.allclose(followed.uv, expected, atol=1e-9)
 

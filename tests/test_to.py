@@ -455,7 +455,7 @@ def test_holes_are_turned_for_the_least_energy():
         ]
 
     def energy(places):
-        uv = quasi_harmonic_map(problem.moved(np.concatenate([places[i] for i in range(3)])))
+        uv = quasi_harmonic_map(problem.with_target(np.concatenate([places[i] for i in range(3)])))
         sides = uv[F] - uv[np.roll(F, -1, axis=1)]
         return float((sides**2).sum())
 
@@ -567,7 +567,7 @@ def test_cut_open_tetrahedron():
 
 def test_cut_open_more_than_it_takes():
     V, F = surfaces.starfish(3, 12)
-    copies = [len(cut_open(V, F, gain=gain).V) for gain in (np.inf, 0.1)]
+    copies = [len(cut_open(V, F, min_gain=gain).V) for gain in (np.inf, 0.1)]
     assert len(V) < copies[0] < copies[1]
     V, F = surfaces.disk(3)
     assert np.array_equal(cut_open(V, F).F, F)

@@ -78,7 +78,7 @@ def test_narrow_pictures_leave_a_way(shape):
     along = np.where(size > 100, 0.2, 0.1)
     warped = warp_by_landmarks(np.zeros(shape, np.uint8), [0.5 * size], [(0.5 + along) * size])
     assert warped.result.certificate.bijective
-    assert warped.moved[-1] == pytest.approx((0.5 + along) * size)
+    assert warped.positions[-1] == pytest.approx((0.5 + along) * size)
 
 
 @pytest.mark.slow
@@ -90,13 +90,13 @@ def test_landmarks_on_the_border_take_it_along():
     warped = warp_by_landmarks(image, before, after)
     assert warped.result.certificate.bijective
     for start, end in zip(before, after, strict=True):
-        assert warped.moved[(warped.points == start).all(axis=1)].tolist() == [end]
+        assert warped.positions[(warped.points == start).all(axis=1)].tolist() == [end]
     left = warped.points[:, 0] == 0
-    assert np.array_equal(warped.moved[left], warped.points[left])
+    assert np.array_equal(warped.positions[left], warped.points[left])
     # Straight from the corner, which stays, to the landmark.
     lower = (warped.points[:, 1] == 63) & (warped.points[:, 0] <= 31.5)
-    assert warped.moved[lower, 1] == pytest.approx(63 - 23 * warped.points[lower, 0] / 31.5)
-    assert warped.moved[lower, 0] == pytest.approx(warped.points[lower, 0])
+    assert warped.positions[lower, 1] == pytest.approx(63 - 23 * warped.points[lower, 0] / 31.5)
+    assert warped.positions[lower, 0] == pytest.approx(warped.points[lower, 0])
     assert (warped.image[50:, 24:40] == 0).all()
     assert (warped.image[:, 0] == image[:, 0]).all()
     with pytest.raises(ValueError, match="crosses itself"):
@@ -122,7 +122,7 @@ def test_points_without_a_place_are_named():
     points = np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]])
     lost = points.copy()
     lost[2, 1] = np.nan
-    for before, after, message in ((lost, points, "points is not finite at vertex 2"), (points, lost, "moved is not")):
+    for before, after, message in ((lost, points, "points is not finite at vertex 2"), (points, lost, "positions is")):
         with pytest.raises(ValueError, match=message):
             warp_along(np.zeros((4, 4)), before, [[0, 1, 2], [0, 2, 3]], after)
 
@@ -139,7 +139,7 @@ def test_a_warp_that_cannot_be_says_what_to_do():
         ((np.zeros(5), [[1, 1]], [[1, 1]]), "image must have shape"),
         ((np.zeros((9, 9), complex), [[1, 1]], [[1, 1]]), "real numbers"),
         ((np.zeros((9, 9)), [[1, 1, 1]], [[1, 1]]), r"landmarks must have shape \(n, 2\)"),
-        ((np.zeros((9, 9)), [[1, 1]], [[1, 8]]), "moved: point 0 not inside"),
+        ((np.zeros((9, 9)), [[1, 1]], [[1, 8]]), "target: point 0 not inside"),
         ((np.zeros((9, 9)), [[1, np.nan]], [[1, 1]]), "landmarks is not finite at point 0"),
         (
             (np.zeros((9, 9)), [[1, 1], [1, 1]], [[1, 1], [2, 2]]),
@@ -167,7 +167,7 @@ def test_a_map_with_folds_is_refused():
 
 
 def worst_stretch(warped):
-    measured = distortion(warped.points, warped.F, warped.moved)
+    measured = distortion(warped.points, warped.F, warped.positions)
     return np.maximum(measured.sigma1, 1 / measured.sigma2).max()
 
 
@@ -191,7 +191,7 @@ def test_a_slight_warp_is_a_thin_plate_with_a_pin():
     stiff = (k[:, None] ** 2 + k**2) ** 2
     lift = np.einsum("nk,nl,kl->n", modes[:, 0] * force[0], modes[:, 1] * force[1], 1 / stiff)
     lift /= np.einsum("k,l,kl->", force[0] ** 2, force[1] ** 2, 1 / stiff)
-    assert warped.moved - warped.points == pytest.approx(lift[:, None] * by, abs=2e-3)
+    assert warped.positions - warped.points == pytest.approx(lift[:, None] * by, abs=2e-3)
 
 
 def test_soft_landmarks_give_way():
@@ -200,13 +200,13 @@ def test_soft_landmarks_give_way():
     for weight in (1, 100, 1e4, np.inf):
         warped = warp_by_landmarks(np.zeros((61, 81)), before, after, weights=[weight, np.inf], resolution=24)
         assert warped.result.certificate.bijective
-        assert warped.moved[-1].tolist() == after[1]
-        missed.append(np.hypot(*(warped.moved[-2] - after[0])))
+        assert warped.positions[-1].tolist() == after[1]
+        missed.append(np.hypot(*(warped.positions[-2] - after[0])))
     assert missed[0] > 1.5 * missed[1] > 20 * missed[2] > missed[3] == 0
     # Two that want the same place each get near it.
     both = warp_by_landmarks(np.zeros((61, 81)), before, [[40, 30], [40, 30]], weights=[1e3, 1e3], resolution=24)
     assert both.result.certificate.bijective
-    assert np.abs(both.moved[-2:] - (40, 30)).max() < 3
+    assert np.abs(both.positions[-2:] - (40, 30)).max() < 3
 
 
 def test_curves_go_to_curves():
@@ -219,21 +219,21 @@ def test_curves_go_to_curves():
     curves = [(line[[0, -1]], bow), (ring, np.add(ring, (6, 0)))]
     warped = warp_by_landmarks(np.zeros((81, 91)), [[20, 20]], [[25, 22]], curves=curves, resolution=32)
     assert warped.result.certificate.bijective
-    assert warped.moved[(warped.points == (20, 20)).all(axis=1)].tolist() == [[25, 22]]
+    assert warped.positions[(warped.points == (20, 20)).all(axis=1)].tolist() == [[25, 22]]
     on_line = (warped.points[:, 1] == 40) & (np.abs(warped.points[:, 0] - 45) <= 25)
     assert np.count_nonzero(on_line) > 15
     # Equal parts of the one go to equal parts of the other.
     arc = np.append(0, np.cumsum(np.hypot(*np.diff(bow, axis=0).T)))
     part = (warped.points[on_line, 0] - 20) / 50 * arc[-1]
     expected = np.stack([np.interp(part, arc, bow[:, axis]) for axis in (0, 1)], axis=1)
-    assert warped.moved[on_line] == pytest.approx(expected, abs=0.05)
+    assert warped.positions[on_line] == pytest.approx(expected, abs=0.05)
 
 
 def test_one_landmark_or_two_are_enough():
     for before, after in (([[30, 20]], [[38, 25]]), ([[30, 20], [12, 30]], [[38, 25], [12, 22]])):
         warped = warp_by_landmarks(np.zeros((41, 51)), before, after, resolution=16)
         assert warped.result.certificate.bijective
-        assert warped.moved[-len(after) :].tolist() == after
+        assert warped.positions[-len(after) :].tolist() == after
 
 
 def test_the_plate_has_the_gradient_it_says():

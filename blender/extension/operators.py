@@ -51,7 +51,7 @@ class UvWorking(Working):
     def take(self, context: bpy.types.Context, mapped: SeamedMesh, remark: str = "") -> None:
         """Write a map, and say what it is as Blender has it."""
         verdict = atlas.certify(surface.write(context.active_object.data, self.surface, mapped))
-        lost = np.setdiff1d(verdict.flipped, atlas.certify(mapped).flipped)
+        lost = np.setdiff1d(verdict.inverted, atlas.certify(mapped).inverted)
         if lost.size:
             remark = f"{counted('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
         kind = "INFO" if verdict.injective else "WARNING"
@@ -67,7 +67,7 @@ class ChosenWorking(UvWorking):
 
 
 class QHM_OT_check(UvWorking):
-    """Select the faces whose UVs are flipped or without area, or lie on others; decided exactly."""
+    """Select the faces whose UVs are inverted or without area, or lie on others; decided exactly."""
 
     bl_idname = "uv.qhm_check"
     bl_label = "Check UVs"
@@ -76,7 +76,7 @@ class QHM_OT_check(UvWorking):
         """Judge."""
         mesh = self.read_map(context)
 
-        def work(heard: Callable[[Step], None]) -> tuple[AtlasVerdict, IntArray, IntArray]:
+        def work(reports_progress: Callable[[Step], None]) -> tuple[AtlasVerdict, IntArray, IntArray]:
             verdict = atlas.certify(mesh)
             return verdict, _lying(mesh, verdict), _bent(mesh, self.surface.polygons, verdict)
 
@@ -86,10 +86,10 @@ class QHM_OT_check(UvWorking):
         """Select and tell."""
         verdict, lying, bent = result
         face = self.surface.polygons.of_triangle
-        flipped = np.unique(face[verdict.flipped])
-        chosen = np.union1d(flipped, face[lying])
+        inverted = np.unique(face[verdict.inverted])
+        chosen = np.union1d(inverted, face[lying])
         surface.select_faces(context, self.surface, chosen)
-        text = f"{counted('face', 'faces', len(chosen))} selected, of which {len(flipped)} flipped. {_told(verdict)}"
+        text = f"{counted('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. {_told(verdict)}"
         if len(bent):
             text += (
                 f" {counted('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
@@ -99,7 +99,7 @@ class QHM_OT_check(UvWorking):
 
 
 class QHM_OT_repair(ChosenWorking):
-    """Right flipped faces; borders stay, and so does every UV that need not move."""
+    """Right inverted faces; borders stay, and so does every UV that need not move."""
 
     bl_idname = "uv.qhm_repair"
     bl_label = "Repair UVs"
@@ -111,7 +111,9 @@ class QHM_OT_repair(ChosenWorking):
         """Repair."""
         mesh = self.read_map(context, whole=self.whole)
         unmirror = self.unmirror
-        return lambda heard: repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, unmirror=unmirror, callback=heard)
+        return lambda reports_progress: repair(
+            mesh.V, mesh.F, mesh.uv, FT=mesh.FT, unmirror=unmirror, callback=reports_progress
+        )
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Write and tell."""
@@ -139,7 +141,7 @@ class QHM_OT_flatten(UvWorking):
         seams = surface.marked_seams(context.active_object.data)
         cut, pack, energy = self.cut, self.pack, self.energy
 
-        def work(heard: Callable[[Step], None]) -> SeamedMesh:
+        def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
             here = mesh
             if len(seams):
                 here = seaming.cut_along(mesh, seams, polygons=polygons)
@@ -149,7 +151,7 @@ class QHM_OT_flatten(UvWorking):
             if cut:
                 here = seaming.cut_apart(here, polygons=polygons)
             _require_borders(here)
-            mapped = atlas.flatten(here, energy=energy, callback=heard)
+            mapped = atlas.flatten(here, energy=energy, callback=reports_progress)
             if mapped.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             return atlas.pack(mapped.mesh) if pack else mapped.mesh
@@ -176,8 +178,8 @@ class QHM_OT_reduce(ChosenWorking):
         mesh = self.read_map(context, whole=self.whole)
         free, energy = self.free, self.energy
 
-        def work(heard: Callable[[Step], None]) -> SeamedMesh:
-            mapped = atlas.polish(mesh, free=free, energy=energy, callback=heard)
+        def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
+            mapped = atlas.polish(mesh, free=free, energy=energy, callback=reports_progress)
             if mapped.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             return mapped.mesh
@@ -216,17 +218,19 @@ class QHM_OT_fit(ChosenWorking):
         contours = self._contours(context)
         corners = AskedCorners("auto") if self.to == "RECTANGLE" else None
 
-        def find(island: Island, heard: Callable[[Step], None]) -> MapResult:
+        def find(island: Island, reports_progress: Callable[[Step], None]) -> MapResult:
             problem = laid_along(island.V, island.F, contours, corners=corners).problem
-            result = solve(problem, callback=heard)
+            result = solve(problem, callback=reports_progress)
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             if not result.injective:
                 reason = result.status.value if result.diagnosis is None else result.diagnosis.summary()
                 raise Refused(f"no map without flips was found. {reason}")
-            return polished(problem, result, energy="blend", max_iterations=20, callback=heard)
+            return polished(problem, result, energy="blend", max_iterations=20, callback=reports_progress)
 
-        return lambda heard: each_island(mesh, lambda island: find(island, heard), reflect=False).mesh
+        return lambda reports_progress: (
+            each_island(mesh, lambda island: find(island, reports_progress), reflect=False).mesh
+        )
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Write and tell."""
@@ -255,7 +259,7 @@ def _told(verdict: AtlasVerdict) -> str:
 
 
 def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
-    """Triangles that share area with others, among islands without flipped ones; ascending."""
+    """Triangles that share area with others, among islands without inverted ones; ascending."""
     concerned = set(verdict.overlapping.ravel().tolist())
     concerned |= {k for k, one in enumerate(verdict.islands) if one.injective and not one.bijective}
     if not concerned:
@@ -267,11 +271,11 @@ def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
 
 
 def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
-    """Faces that are not convex in the plane though none of their triangles is flipped; ascending."""
+    """Faces that are not convex in the plane though none of their triangles is inverted; ascending."""
     mirrored = polygons.of_triangle[_mirrored(verdict)]
     front, back = (not_convex(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
     bent = np.union1d(np.setdiff1d(front, mirrored), np.intersect1d(back, mirrored))
-    return np.setdiff1d(bent, polygons.of_triangle[verdict.flipped])
+    return np.setdiff1d(bent, polygons.of_triangle[verdict.inverted])
 
 
 def _mirrored(verdict: AtlasVerdict) -> IntArray:

@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 
 from quasiharmonic.apps.atlas.verdict import is_mirrored
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -35,7 +35,7 @@ def in_single_precision(mesh: SeamedMesh) -> SeamedMesh:
     Returns
     -------
     SeamedMesh
-        What rounding has flipped after all is for `quasiharmonic.atlas.certify` to say.
+        What rounding has inverted after all is for `quasiharmonic.atlas.certify` to say.
     """
     return mesh.with_places([_rounded(island.F, island.uv) for island in mesh.islands])
 
@@ -44,10 +44,10 @@ def _rounded(F: IntArray, uv: FloatArray) -> FloatArray:
     """The places of an island (m, 2), as float64 that are numbers of single precision."""
     mirrored = is_mirrored(F, uv)
     F = F[:, ::-1] if mirrored else F
-    before = flipped_triangles(F, uv)
+    before = inverted_triangles(F, uv)
     near = uv.astype(np.float32).astype(np.float64)
     for _ in range(_ROUNDS):
-        wrong = np.setdiff1d(flipped_triangles(F, near), before)
+        wrong = np.setdiff1d(inverted_triangles(F, near), before)
         if not 0 < wrong.size <= _MOST:
             break
         moved = [_settled(F, near, vertex) for vertex in np.unique(F[wrong]).tolist()]

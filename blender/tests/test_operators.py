@@ -139,7 +139,7 @@ def test_check_selects_the_flipped_faces(said):
     assert bpy.ops.uv.qhm_check() == {"FINISHED"}
     assert scenes.selected(thing) == expected
     assert expected
-    assert f"{len(expected)} faces selected, of which {len(expected)} flipped" in said()
+    assert f"{len(expected)} faces selected, of which {len(expected)} inverted" in said()
     assert scenes.everything_else(thing) == kept
     assert np.array_equal(scenes.places(thing), before)
 

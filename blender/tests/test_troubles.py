@@ -117,9 +117,9 @@ def test_a_job_ends_at_its_next_step(extension):
     job = importlib.import_module(f"{extension}.job")
     told, go_on = threading.Event(), threading.Event()
 
-    def work(heard):
+    def work(reports_progress):
         while True:
-            heard(SimpleNamespace(energy=1.0))
+            reports_progress(SimpleNamespace(energy=1.0))
             told.set()
             go_on.wait(10)
 
@@ -171,11 +171,11 @@ def test_progress_and_escape(extension, escape):
     job = importlib.import_module(f"{extension}.job")
     stepped, go_on = threading.Event(), threading.Event()
 
-    def work(heard):
-        heard(SimpleNamespace(energy=0.25))
+    def work(reports_progress):
+        reports_progress(SimpleNamespace(energy=0.25))
         stepped.set()
         go_on.wait(10)
-        heard(SimpleNamespace(energy=0.125))
+        reports_progress(SimpleNamespace(energy=0.125))
         return "result"
 
     window = Looking(job, work)
@@ -202,7 +202,7 @@ def test_what_single_precision_cannot_hold_is_said(said):
     faces += [[1 + i, 81 + i, 81 + j, 1 + j] for i, j in zip(k, ahead, strict=True)]
     thing = scenes.add_mesh(V, faces)
     assert bpy.ops.uv.qhm_flatten() == {"FINISHED"}
-    wrong = scenes.verdict(thing).flipped
+    wrong = scenes.verdict(thing).inverted
     assert wrong.size
     text = said()
     assert "Warning: Flatten" in text

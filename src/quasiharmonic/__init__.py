@@ -15,7 +15,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from quasiharmonic.apps.air_mesh.airmesh import AirMesh, Moment
+    from quasiharmonic.apps.air_mesh.airmesh import AirMesh, AirMeshState
     from quasiharmonic.apps.animation.animated import animate
     from quasiharmonic.apps.animation.frames import Animation, FrameStep
     from quasiharmonic.apps.displacement_fields.inverse import InverseField, inverse_field
@@ -29,23 +29,23 @@ if TYPE_CHECKING:
     from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
     from quasiharmonic.apps.inverse.inverse import InverseMap, SurfacePoints
     from quasiharmonic.apps.inverse.transfer import SurfaceMap
-    from quasiharmonic.apps.mesh_motion.morphed import Morphed
+    from quasiharmonic.apps.mesh_motion.morphed import MorphResult
     from quasiharmonic.apps.mesh_motion.morphing import morph
     from quasiharmonic.apps.mesh_motion.moving import MovingMesh
-    from quasiharmonic.apps.repair.cutting import Opened, cut_open
-    from quasiharmonic.apps.repair.repairing import Repaired, RepairedIsland, repair
-    from quasiharmonic.apps.warping.warping import Warped, warp_along, warp_by_landmarks
+    from quasiharmonic.apps.repair.cutting import CutMesh, cut_open
+    from quasiharmonic.apps.repair.repairing import RepairedIsland, RepairResult, repair
+    from quasiharmonic.apps.warping.warping import WarpResult, warp_along, warp_by_landmarks
     from quasiharmonic.energies.energies import Energy
     from quasiharmonic.energies.measures import Distortion, distortion
     from quasiharmonic.energies.polishing import polish
-    from quasiharmonic.geometry.curves import Rails
+    from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.geometry.mesh.refinement import Refined
     from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
     from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
-    from quasiharmonic.problem.verdict import certify, flipped_triangles, is_injective
+    from quasiharmonic.problem.verdict import certify, inverted_triangles, is_injective
     from quasiharmonic.solver.methods import Descent
     from quasiharmonic.solver.refine.mapping import injective_map
     from quasiharmonic.solver.refine.refining import RefinedProblem, refine, refine_problem
@@ -73,15 +73,15 @@ _HOME = {
     "MapResult": "problem.result",
     # Not in `__all__`: it needs an extra, and ``from quasiharmonic import *`` must work without.
     "MapWidget": "ui.notebook.widget",
-    "Moment": "apps.air_mesh.airmesh",
-    "Morphed": "apps.mesh_motion.morphed",
+    "AirMeshState": "apps.air_mesh.airmesh",
+    "MorphResult": "apps.mesh_motion.morphed",
     "MovingMesh": "apps.mesh_motion.moving",
-    "Opened": "apps.repair.cutting",
+    "CutMesh": "apps.repair.cutting",
     "Problem": "problem",
-    "Rails": "geometry.curves",
+    "BoundaryCurves": "geometry.curves",
     "Refined": "geometry.mesh.refinement",
     "RefinedProblem": "solver.refine.refining",
-    "Repaired": "apps.repair.repairing",
+    "RepairResult": "apps.repair.repairing",
     "RepairedIsland": "apps.repair.repairing",
     "Snapshot": "problem.result",
     "Stage": "problem.result",
@@ -89,7 +89,7 @@ _HOME = {
     "Step": "problem.result",
     "SurfaceMap": "apps.inverse.transfer",
     "SurfacePoints": "apps.inverse.inverse",
-    "Warped": "apps.warping.warping",
+    "WarpResult": "apps.warping.warping",
     "animate": "apps.animation.animated",
     "boundary_loops": "geometry.mesh.topology",
     "certify": "problem.verdict",
@@ -99,7 +99,7 @@ _HOME = {
     "find_cuts": "targets.cuts.find",
     "flatten": "apps.flattening.flattened",
     "flatten_derivative": "apps.gradients.flattened",
-    "flipped_triangles": "problem.verdict",
+    "inverted_triangles": "problem.verdict",
     "harmonise": "solver.search.harmonising",
     "injective_map": "solver.refine.mapping",
     "injective_maps": "solver.search.many",
@@ -123,8 +123,11 @@ _HOME = {
 
 __all__ = [
     "AirMesh",
+    "AirMeshState",
     "Animation",
+    "BoundaryCurves",
     "Certificate",
+    "CutMesh",
     "Derivative",
     "Descent",
     "Diagnosis",
@@ -135,15 +138,12 @@ __all__ = [
     "InverseMap",
     "InvertibleField",
     "MapResult",
-    "Moment",
-    "Morphed",
+    "MorphResult",
     "MovingMesh",
-    "Opened",
     "Problem",
-    "Rails",
     "Refined",
     "RefinedProblem",
-    "Repaired",
+    "RepairResult",
     "RepairedIsland",
     "Snapshot",
     "Stage",
@@ -151,7 +151,7 @@ __all__ = [
     "Step",
     "SurfaceMap",
     "SurfacePoints",
-    "Warped",
+    "WarpResult",
     "animate",
     "boundary_loops",
     "certify",
@@ -161,11 +161,11 @@ __all__ = [
     "find_cuts",
     "flatten",
     "flatten_derivative",
-    "flipped_triangles",
     "harmonise",
     "injective_map",
     "injective_maps",
     "inverse_field",
+    "inverted_triangles",
     "is_injective",
     "keep_distances",
     "morph",

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from quasiharmonic import Rails, certify, flatten, flatten_derivative, injective_map, polish, polish_derivative
+from quasiharmonic import BoundaryCurves, certify, flatten, flatten_derivative, injective_map, polish, polish_derivative
 from quasiharmonic.apps.gradients import Doubt
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Isotropic, SymmetricDirichlet
@@ -30,10 +30,10 @@ class NeoHookean(Isotropic):
     def density(self, d):
         return np.where(d.det > 0, 2 * (d.a + d.b - 1 - np.log(np.abs(d.det))), np.inf)
 
-    def slopes(self, d):
+    def density_gradient(self, d):
         return 2 - 2 / d.det, 2 + 2 / d.det
 
-    def bends(self, d):
+    def density_hessian(self, d):
         return 2 / d.det**2, -2 / d.det**2, 2 / d.det**2
 
 
@@ -124,7 +124,7 @@ def test_sliding_along_straight_sides():
     surface = np.column_stack([V + 0.01 * np.sin(5 * V[:, ::-1]), 0.3 * np.cos(3 * V[:, 0])])
     boundary = np.flatnonzero(((V.min(axis=0) == V) | (V.max(axis=0) == V)).any(axis=1))
     fixed = np.append(boundary, [18, 29])
-    rails = Rails([[V.min(axis=0), (1, 0), V.max(axis=0), (0, V[:, 1].max())]])
+    rails = BoundaryCurves([[V.min(axis=0), (1, 0), V.max(axis=0), (0, V[:, 1].max())]])
     uv = polish(surface, F, V, fixed=fixed, slide=rails).uv
 
     def make(rest, pins):
@@ -150,7 +150,7 @@ def test_sliding_along_straight_sides():
 def test_sliding_along_a_circle(dome):
     """The barrier that keeps edges near the circle has a hundredth of the energy's weight, taken as staying that."""
     surface, F, fixed, uv = dome
-    rails = Rails([Curve.circle()])
+    rails = BoundaryCurves([Curve.circle()])
     uv = polish(surface, F, uv, fixed=fixed, slide=rails).uv
     here = polish_derivative(surface, F, uv, fixed=fixed, slide=rails)
     assert here.reliable
@@ -167,7 +167,7 @@ def test_sliding_along_an_ellipse_comes_to_rest(dome, width):
     surface, F, fixed, _ = dome
     V, _ = disk(6)
     found = injective_map(surface, F, fixed, V[fixed] * [width, 0.8], polish="symmetric-dirichlet")
-    rails = Rails([Curve.circle().transformed([[width, 0], [0, 0.8]])])
+    rails = BoundaryCurves([Curve.circle().transformed([[width, 0], [0, 0.8]])])
     uv = polish(surface, F, found.uv, fixed=fixed, slide=rails).uv
     assert Doubt.NOT_AT_REST not in polish_derivative(surface, F, uv, fixed=fixed, slide=rails).doubts
 
@@ -224,7 +224,7 @@ def test_where_a_map_is_about_to_leap():
         short, long = (0.5 * (short + long), long) if found else (short, 0.5 * (short + long))
     disc, G = disk(4)
     rim = np.arange(len(disc) - 24, len(disc))
-    turning = polish_derivative(disc, G, disc, fixed=rim, slide=Rails([Curve.circle()]))
+    turning = polish_derivative(disc, G, disc, fixed=rim, slide=BoundaryCurves([Curve.circle()]))
     assert Doubt.NEAR_SINGULAR in turning.doubts
 
 
@@ -244,13 +244,15 @@ class Creased(Isotropic):
     def density(self, d):
         return np.where(d.det > 0, SymmetricDirichlet().density(d) + np.abs(np.log(np.abs(d.det))), np.inf)
 
-    def slopes(self, d):
-        a, b = SymmetricDirichlet().slopes(d)
+    def density_gradient(self, d):
+        a, b = SymmetricDirichlet().density_gradient(d)
         return a + np.sign(d.det - 1) / d.det, b - np.sign(d.det - 1) / d.det
 
-    def bends(self, d):
+    def density_hessian(self, d):
         crease = -np.sign(d.det - 1) / d.det**2
-        return tuple(bend + way * crease for bend, way in zip(SymmetricDirichlet().bends(d), (1, -1, 1), strict=True))
+        return tuple(
+            bend + way * crease for bend, way in zip(SymmetricDirichlet().density_hessian(d), (1, -1, 1), strict=True)
+        )
 
 
 def test_a_map_that_comes_to_no_rest_is_doubtful():

@@ -18,10 +18,10 @@ def maps():
     """A planar mesh, two maps of it that are not its positions, and the triangles that each inverts."""
     V, F = disk(4)
     uv = V * (1 + 0.3 * V[:, :1]) / 3
-    flipped = uv.copy()
+    inverted = uv.copy()
     inner = int(np.argmin((V**2).sum(axis=1)))
-    flipped[inner] = uv[F[(inner == F).any(axis=1)]].max(axis=(0, 1)) + 1
-    return MeshData(V, F), [uv, flipped]
+    inverted[inner] = uv[F[(inner == F).any(axis=1)]].max(axis=(0, 1)) + 1
+    return MeshData(V, F), [uv, inverted]
 
 
 def single(uv):
@@ -45,9 +45,9 @@ def try_format(read, write, path):
         np.testing.assert_array_equal(again.F, mesh.F)
         np.testing.assert_array_equal(map_of(again).view(np.int64), kept.view(np.int64))
         expected, found = certify(mesh.F, kept), certify(again.F, map_of(again))
-        np.testing.assert_array_equal(found.flipped, expected.flipped)
-    assert expected.flipped.size
-    assert not certify(mesh.F, uvs[0]).flipped.size
+        np.testing.assert_array_equal(found.inverted, expected.inverted)
+    assert expected.inverted.size
+    assert not certify(mesh.F, uvs[0]).inverted.size
 
     whole = path.read_bytes()
     for bad in (uv[:-1], np.full_like(uv, np.nan)):

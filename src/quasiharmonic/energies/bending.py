@@ -176,8 +176,8 @@ class BendingDescent(NewtonDescent):
         bent = self._unit * self.plate.gradient(self._unit * self.w)
         return super().gradient() + bent[self.system.free]
 
-    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """As `NewtonDescent.tried`, of the energy with the plate."""
+    def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
+        """As `NewtonDescent.evaluate_trial`, of the energy with the plate."""
         deformation = self.energy.deform(w)
         value = self.energy.value_of(deformation) + self.plate.value(self._unit * w)
         accepted = value < bound and is_injective(self.energy.F, self.positions(w))
@@ -239,7 +239,7 @@ def bend_map(
         name="bending",
         iterations=len(history) - len(result.history),
         seconds=seconds,
-        flipped=(0, 0),
+        inverted=(0, 0),
         energy=descent.energies,
         kept=descent.value < descent.first,
     )

@@ -114,7 +114,7 @@ class DeformationEnergy:
 
     def gradient_of(self, d: Deformation, n: int) -> ComplexArray:
         """The derivative by ``n`` positions for a deformation at hand."""
-        mixture = mixture_of(self.energy, "slopes", "gradient")
+        mixture = mixture_of(self.energy, "density_gradient", "gradient")
         if mixture is None:
             slopes = (np.broadcast_to(by, d.p.shape) for by in self.energy.gradient(d))
             by_p, by_q = (np.ascontiguousarray(by, dtype=np.complex128) for by in slopes)
@@ -135,7 +135,7 @@ class DeformationEnergy:
         negative : float
             What negative eigenvalues are multiplied by; see `Energy.curvature`.
         """
-        mixture = mixture_of(self.energy, "slopes", "bends", "curvature")
+        mixture = mixture_of(self.energy, "density_gradient", "density_hessian", "curvature")
         if mixture is None:
             return self.energy.curvature(d, negative=negative).scaled(self.share)
         return curvature_of_mixture(mixture, d, self.share, negative)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -36,7 +36,7 @@ from quasiharmonic.util.arrays import (
     real_array,
     whole_number,
 )
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # The farthest vertices are looked for up to so many mean edges for each ring.
 _REACH = 1.3
@@ -167,7 +167,7 @@ class SurfaceDistances:
         return DistanceError(scale, scale * ratio - 1, self.sampling)
 
 
-@takes_mesh
+@accepts_mesh
 def surface_distances(
     V: ArrayLike,
     F: ArrayLike,
@@ -284,7 +284,7 @@ def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArr
     kept = []
     begin = 0
     while begin < row.size:
-        still_at_it()
+        heartbeat()
         end = int(np.searchsorted(row, row[min(begin + _AT_ONCE, row.size) - 1], side="right"))
         part = row[begin:end]
         order = np.argsort(key[begin:end])

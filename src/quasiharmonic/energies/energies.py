@@ -198,9 +198,9 @@ class Isotropic(Energy):
     ...     barrier = True
     ...     def density(self, d):
     ...         return np.where(d.det > 0, 2 * (d.a + d.b - 1 - np.log(np.abs(d.det))), np.inf)
-    ...     def slopes(self, d):
+    ...     def density_gradient(self, d):
     ...         return 2 - 2 / d.det, 2 + 2 / d.det
-    ...     def bends(self, d):
+    ...     def density_hessian(self, d):
     ...         return 2 / d.det**2, -2 / d.det**2, 2 / d.det**2
     >>> from quasiharmonic.energies.derivatives import check_energy
     >>> check_energy(NeoHookean()).passed
@@ -208,22 +208,22 @@ class Isotropic(Energy):
     """
 
     @abstractmethod
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``φ_a, φ_b``."""
 
     @abstractmethod
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``φ_aa, φ_ab, φ_bb``."""
 
     def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
         """Derivatives by p and q."""
-        slope_a, slope_b = self.slopes(d)
+        slope_a, slope_b = self.density_gradient(d)
         return 2 * slope_a * d.p, 2 * slope_b * d.q
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative as a quadratic form in (dp, dq)."""
-        slope_a, slope_b = self.slopes(d)
-        aa, ab, bb = self.bends(d)
+        slope_a, slope_b = self.density_gradient(d)
+        aa, ab, bb = self.density_hessian(d)
         turn_p, turn_q = 2 * slope_a, 2 * slope_b
         along_p, along_q = turn_p + 4 * d.a * aa, turn_q + 4 * d.b * bb
         turn_p, turn_q = damped(turn_p, negative), damped(turn_q, negative)
@@ -272,12 +272,12 @@ class MIPS(Isotropic):
         """``4 b / D``."""
         return _where_positive(d.det, 4 * d.b / _positive(d.det))
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``−4b/D², 4a/D²``."""
         scale = 4 / _positive(d.det) ** 2
         return -scale * d.b, scale * d.a
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``8b/D³, −4(a + b)/D³, 8a/D³``."""
         scale = 8 / _positive(d.det) ** 3
         return scale * d.b, -0.5 * scale * (d.a + d.b), scale * d.a
@@ -293,13 +293,13 @@ class SymmetricDirichlet(Isotropic):
         det = _positive(d.det)
         return _where_positive(d.det, 2 * (det - 1) ** 2 / det + 4 * d.b * (1 + det**-2))
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 − 2/D² − 8b/D³`` and ``2 + 6/D² + 8b/D³``."""
         det = _positive(d.det)
         shear = 8 * d.b / det**3
         return 2 - 2 / det**2 - shear, 2 + 6 / det**2 + shear
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``4/D³ + 24b/D⁴, −12/D³ − 24b/D⁴, 20/D³ + 24b/D⁴``."""
         det = _positive(d.det)
         cubic = 4 / det**3
@@ -318,11 +318,11 @@ class ARAP(Isotropic):
         """``2 (√a − 1)² + 2b``."""
         return 2 * (np.sqrt(d.a) - 1) ** 2 + 2 * d.b
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 − 2/√a, 2``; at p = 0, where there is a kink, the pull to either side is left out."""
         return 2 - 2 * inverse(np.sqrt(d.a)), np.full(d.b.shape, 2.0)
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``a^(−3/2), 0, 0``."""
         zero = np.zeros(d.b.shape)
         return inverse(np.sqrt(d.a)) ** 3, zero, zero
@@ -339,13 +339,13 @@ class UnsignedARAP(Isotropic):
         """``2 (√c − 1)² + 2e``, c the larger of a and b, e the smaller."""
         return 2 * (np.sqrt(np.maximum(d.a, d.b)) - 1) ** 2 + 2 * np.minimum(d.a, d.b)
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 − 2/√c`` and 2; where a = b there is a ridge, and its side without inversion counts."""
         upright = d.a >= d.b
         slope = 2 - 2 * inverse(np.sqrt(np.maximum(d.a, d.b)))
         return np.where(upright, slope, 2.0), np.where(upright, 2.0, slope)
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``c^(−3/2)`` for the larger one, and zeros."""
         upright = d.a >= d.b
         bend = inverse(np.sqrt(np.maximum(d.a, d.b))) ** 3
@@ -359,12 +359,12 @@ class AreaPreserving(Isotropic):
         """``(D − 1)²``."""
         return (d.det - 1) ** 2
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 (D − 1), −2 (D − 1)``."""
         slope = 2 * (d.det - 1)
         return slope, -slope
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``2, −2, 2``."""
         two = np.full(d.det.shape, 2.0)
         return two, -two, two
@@ -380,12 +380,12 @@ class AreaBarrier(Isotropic):
         det = _positive(d.det)
         return _where_positive(d.det, (det - 1) ** 2 / det)
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``1 − 1/D²`` and its negative."""
         slope = 1 - _positive(d.det) ** -2.0
         return slope, -slope
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``2/D³, −2/D³, 2/D³``."""
         bend = 2 * _positive(d.det) ** -3.0
         return bend, -bend, bend
@@ -408,14 +408,14 @@ class Combination(Isotropic):
         """The sum of the densities."""
         return np.sum([factor * energy.density(d) for factor, energy in self.terms], axis=0)
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """The sums of the first derivatives."""
-        a, b = np.sum([factor * np.stack(energy.slopes(d)) for factor, energy in self.terms], axis=0)
+        a, b = np.sum([factor * np.stack(energy.density_gradient(d)) for factor, energy in self.terms], axis=0)
         return a, b
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The sums of the second derivatives."""
-        aa, ab, bb = np.sum([factor * np.stack(energy.bends(d)) for factor, energy in self.terms], axis=0)
+        aa, ab, bb = np.sum([factor * np.stack(energy.density_hessian(d)) for factor, energy in self.terms], axis=0)
         return aa, ab, bb
 
 

@@ -12,7 +12,7 @@ from quasiharmonic.energies.distances import DistanceError, surface_distances
 from quasiharmonic.energies.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.shapes import rest_shapes
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
@@ -114,7 +114,7 @@ class Distortion(Displayable):
         the triangle; `shear` is its modulus.
     flat : (k,) int64
         Triangles without area in the rest mesh.
-    flipped : (l,) int64
+    inverted : (l,) int64
         Triangles whose image is inverted or has no area, flat ones excepted.
     V, F, uv : arrays
         The surface and the map that were measured.
@@ -135,7 +135,7 @@ class Distortion(Displayable):
     shear: FloatArray
     beltrami: ComplexArray
     flat: IntArray
-    flipped: IntArray
+    inverted: IntArray
     V: FloatArray
     F: IntArray
     uv: FloatArray
@@ -196,15 +196,15 @@ class Distortion(Displayable):
             if not np.isnan(values).all():
                 one = self.summary(name)
                 lines.append(f"{name:>19} {one.median:>10.4g} {one.p95:>10.4g} {one.maximum:>10.4g}")
-        for found, what in ((self.flipped, "inverted or without area"), (self.flat, "without area in the rest mesh")):
+        for found, what in ((self.inverted, "inverted or without area"), (self.flat, "without area in the rest mesh")):
             if found.size:
                 lines.append(f"{len(found):,} of {len(self.F):,} triangles {what}")
         return "\n".join(lines)
 
     def short_repr(self) -> str:
         triangles = counted("triangle", "triangles", len(self.F))
-        if self.flipped.size:
-            return f"{triangles}, {self.flipped.size:,} inverted or without area"
+        if self.inverted.size:
+            return f"{triangles}, {self.inverted.size:,} inverted or without area"
         if np.isnan(self.isometric).all():
             return f"{triangles}, all without area in the rest mesh"
         one = self.summary("isometric")
@@ -224,13 +224,13 @@ class Distortion(Displayable):
         return {
             "scale": self.scale if np.isfinite(self.scale) else None,
             "flat": int(self.flat.size),
-            "flipped": int(self.flipped.size),
+            "inverted": int(self.inverted.size),
             **summaries,
             **({} if self.distances is None else {"distances": self.distances.to_dict()}),
         }
 
 
-@takes_mesh
+@accepts_mesh
 def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None = None) -> Distortion:
     """Measure what a map does to every triangle of a surface; and, if asked for, to distances farther apart.
 
@@ -358,7 +358,7 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
         shear=np.abs(beltrami) + undefined,
         beltrami=beltrami + undefined,
         flat=shapes.flat,
-        flipped=np.flatnonzero(defined & (sign <= 0)),
+        inverted=np.flatnonzero(defined & (sign <= 0)),
         V=V,
         F=F,
         uv=uv,

@@ -22,9 +22,9 @@ from quasiharmonic.energies.energies import (
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent, in_units
 from quasiharmonic.energies.newton.progressive_reference import descend
 from quasiharmonic.energies.newton.sliding import SlidingDescent, lay_boundary
-from quasiharmonic.geometry.curves.boundary_curves import Rails
-from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status, Step
 from quasiharmonic.util.arrays import (
@@ -37,7 +37,7 @@ from quasiharmonic.util.arrays import (
     not_negative,
     whole_number,
 )
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 #: What a polish can lower, by name. ARAP gets a tenth of the area barrier: alone it lets triangles collapse.
 ENERGIES: dict[str, Energy] = {
@@ -48,8 +48,8 @@ ENERGIES: dict[str, Energy] = {
 }
 
 
-@takes_mesh
-@heard
+@accepts_mesh
+@reports_progress
 def polish(
     V: ArrayLike,
     F: ArrayLike,
@@ -62,7 +62,7 @@ def polish(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
 ) -> MapResult:
     """Lower the distortion of an injective map; every step on the way is injective, certified exactly.
 
@@ -100,11 +100,11 @@ def polish(
     callback : callable, optional
         Called with a `Step` at the start and after every step, and with the last one again at least every half second
         in between, but not within a single factorisation; its ``energy`` is the mean energy.
-    slide : bool or Rails
+    slide : bool or BoundaryCurves
         Let boundary vertices glide along the outline, in their order, its corners held: along the curves of
-        `quasiharmonic.geometry.curves.Rails`, or with True along the polygon that the boundary is in ``uv``, whose
-        corners are where it turns by 20° or more. Vertices that slide are on their curve up to one rounding; a map that
-        is bijective stays so. The scale is that of the start, whatever little the polygon's area changes.
+        `quasiharmonic.geometry.curves.BoundaryCurves`, or with True along the polygon that the boundary is in ``uv``,
+        whose corners are where it turns by 20° or more. Vertices that slide are on their curve up to one rounding; a
+        map that is bijective stays so. The scale is that of the start, whatever little the polygon's area changes.
 
     Returns
     -------
@@ -117,10 +117,10 @@ def polish(
     ------
     ValueError
         When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
-        the message names the triangles. When the boundary is not on the curves that it is to slide along (see `Rails`),
-        or triangles are inverted once it is on them. When the energy is not known, not a barrier or without second
-        derivatives, or another option has no such value. When there is no step to take as an energy of one's own, or a
-        derivative of it, is NaN: the message names which, and the triangles.
+        the message names the triangles. When the boundary is not on the curves that it is to slide along (see
+        `BoundaryCurves`), or triangles are inverted once it is on them. When the energy is not known, not a barrier or
+        without second derivatives, or another option has no such value. When there is no step to take as an energy of
+        one's own, or a derivative of it, is NaN: the message names which, and the triangles.
 
     Examples
     --------
@@ -152,7 +152,7 @@ def polish(
     return replace(result, seconds=time.perf_counter() - began)
 
 
-@heard
+@reports_progress
 def polish_map(
     domain: Domain,
     uv: ArrayLike,
@@ -163,7 +163,7 @@ def polish_map(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     triangles: IntArray | None = None,
 ) -> MapResult:
     """Polish a map of a `Domain` at hand; the rest as `polish` has it.
@@ -215,7 +215,7 @@ def polish_map(
         name=f"polish, {name}",
         iterations=max(len(history) - 1, 0),
         seconds=seconds,
-        flipped=(0, 0),
+        inverted=(0, 0),
         energy=descent.energies,
         kept=descent.value < descent.first,
     )
@@ -240,7 +240,7 @@ def polished(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     triangles: IntArray | None = None,
 ) -> MapResult:
     """Polish the injective map of a result, as `polish_map` does; stages and history are continued."""
@@ -261,7 +261,7 @@ def polished(
         history=result.history + further.history,
         path=result.path,
         refined=result.refined,
-        rungs=result.rungs,
+        refinement_attempts=result.refinement_attempts,
         seconds=result.seconds + further.seconds,
     )
 
@@ -316,9 +316,9 @@ def at_own_scale(
 def injective_array(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:
     """A map as float64, checked to be injective; ``why`` ends the message of one that is not."""
     array = map_array("uv", uv, domain.n)
-    flipped = flipped_triangles(domain.F, array)
-    if flipped.size:
+    inverted = inverted_triangles(domain.F, array)
+    if inverted.size:
         raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; {why}"
+            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or without area; {why}"
         )
     return array

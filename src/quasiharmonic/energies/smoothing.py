@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from quasiharmonic.energies.polishing import polished
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
@@ -22,7 +22,7 @@ def smoothed(
     *,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
 ) -> MapResult:
     """Lower the distortion of an injective map a little, if it is of moderate size.
 

@@ -18,7 +18,7 @@ from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.linsolve.guard import ResidualTest
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.kernels import compiled
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 Pattern = NDArray[np.int32]
 
@@ -68,7 +68,7 @@ class LinearSolver(ABC):
         self._ready = False
         self._closed = False
         if self.n:
-            still_at_it()
+            heartbeat()
             self._test = ResidualTest(self._indptr, self._indices, self._values)
             self._analyse()
 
@@ -95,7 +95,7 @@ class LinearSolver(ABC):
         values = np.asarray(values)
         if values.shape != (self.nnz,):
             raise ValueError(f"values has shape {values.shape}; the analysed pattern has {self.nnz} entries")
-        still_at_it()
+        heartbeat()
         with self._lock:
             self._require_open()
             self._ready = False
@@ -131,7 +131,7 @@ class LinearSolver(ABC):
         given = np.asarray(rhs, dtype=np.float64)
         if given.ndim not in (1, 2) or given.shape[0] != self.n:
             raise ValueError(f"right-hand side has shape {given.shape}; expected ({self.n},) or ({self.n}, k)")
-        still_at_it()
+        heartbeat()
         b = np.asfortranarray(given.reshape(self.n, -1) if given.size else np.zeros((self.n, 0)))
         with self._lock:
             self._require_open()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.accepts_mesh import made_of_mesh
+from quasiharmonic.io.adapters.accepts_mesh import init_accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.frame import Frame
@@ -77,7 +77,7 @@ class Problem(ReadOnly, Displayable):
     def __init__(
         self, V: MeshLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None
     ) -> None: ...
-    @made_of_mesh
+    @init_accepts_mesh
     def __init__(
         self,
         V: ArrayLike,
@@ -126,7 +126,7 @@ class Problem(ReadOnly, Displayable):
     def _read_only(self) -> tuple[FloatArray]:
         return (self.target,)
 
-    def moved(self, target: ArrayLike) -> Problem:
+    def with_target(self, target: ArrayLike) -> Problem:
         """The same problem with its fixed vertices elsewhere.
 
         Parameters

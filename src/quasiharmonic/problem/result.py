@@ -25,7 +25,7 @@ class Status(Enum):
     """What happened, and what to do next; the value is a sentence for the user."""
 
     INJECTIVE = "Every triangle is strictly positive, decided exactly."
-    SETTLED = (
+    STALLED = (
         "Some triangles stay inverted and the energy has settled at a positive value: "
         "no map was found, and perhaps this mesh and this target admit none. No known obstruction forbids one."
     )
@@ -68,11 +68,11 @@ class Status(Enum):
         "Every triangle is strictly positive, decided exactly, but this is the map that was given: no injective map of "
         "less distortion was found. A smaller eta may help."
     )
-    NO_ROOM = (
+    PRECISION_LIMIT = (
         "A finer mesh has a map, but doubles have no room for it at the vertices named: the target is too narrow there "
         "for the spacing of the numbers. Move it nearer to the origin, or widen it."
     )
-    ENTANGLED = (
+    TOO_MANY_SPLITS = (
         "A finer mesh has a map, but cutting it as the target is took too many vertices: pins and holes lie in another "
         "order than in the mesh. Hold fewer, or where the mesh has them; this is the best map of the mesh as given."
     )
@@ -93,7 +93,7 @@ class Stage:
     iterations : int
         Evaluations of the objective; the very first one of all, the start, is not counted.
     seconds : float
-    flipped : tuple of int
+    inverted : tuple of int
         Triangles not strictly positive before and after.
     energy : tuple of float
         V₃ over the target's area before and after (dimensionless); for a polish, the mean energy.
@@ -104,12 +104,12 @@ class Stage:
     name: str
     iterations: int
     seconds: float
-    flipped: tuple[int, int]
+    inverted: tuple[int, int]
     energy: tuple[float, float]
     kept: bool = True
 
     def __str__(self) -> str:
-        before, after = (f"{flips:,}" for flips in self.flipped)
+        before, after = (f"{flips:,}" for flips in self.inverted)
         kept = "" if self.kept else ", discarded"
         return f"{self.name}: {self.iterations} iterations, {self.seconds:.3g} s, {before} → {after} inverted{kept}"
 
@@ -119,7 +119,7 @@ class Stage:
             "name": self.name,
             "iterations": self.iterations,
             "seconds": self.seconds,
-            "flipped": list(self.flipped),
+            "inverted": list(self.inverted),
             # JSON has no infinity: before the first stage there is no energy.
             "energy": [e if isfinite(e) else None for e in self.energy],
             "kept": self.kept,
@@ -133,7 +133,7 @@ class Step:
     Attributes
     ----------
     iteration : int
-    flipped : int
+    inverted : int
         Triangles whose area, in floating point, is not positive.
     energy : float
         V₃ over the target's area: dimensionless, 0 only at injective maps, and the smaller the nearer. In a
@@ -141,7 +141,7 @@ class Step:
     """
 
     iteration: int
-    flipped: int
+    inverted: int
     energy: float
 
 
@@ -160,7 +160,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True)
-class Rung:
+class RefinementAttempt:
     """One rung of the ladder that `injective_map` climbs with ``refine``.
 
     Attributes
@@ -220,10 +220,10 @@ class MapResult(ReadOnly, Displayable):
     refined : Refined or None
         Where edges were split (``refine``): the mesh that this is a map of, and how it came from the one given. Old
         vertices keep their numbers.
-    rungs : list of Rung
+    refinement_attempts : list of Rung
         What was tried, in order, where edges might be split.
     crowded : (c,) int64
-        With ``NO_ROOM`` the fixed vertices next to what stays inverted.
+        With ``PRECISION_LIMIT`` the fixed vertices next to what stays inverted.
     """
 
     uv: NDArray[np.float64]
@@ -239,7 +239,7 @@ class MapResult(ReadOnly, Displayable):
     path: list[Snapshot] = field(default_factory=list)
     V: NDArray[np.float64] | None = None
     refined: Refined | None = None
-    rungs: list[Rung] = field(default_factory=list)
+    refinement_attempts: list[RefinementAttempt] = field(default_factory=list)
     crowded: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
@@ -318,13 +318,13 @@ class MapResult(ReadOnly, Displayable):
             "stages": [stage.to_dict() for stage in self.stages],
             "certificate": self.certificate.to_dict(),
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            **(self._refinement() if self.rungs else {}),
+            **(self._refinement() if self.refinement_attempts else {}),
         }
 
     def _refinement(self) -> dict[str, Any]:
         """What the report says where edges might be split."""
         return {
             "added_vertices": self.added,
-            "rungs": [rung.to_dict() for rung in self.rungs],
+            "refinement_attempts": [rung.to_dict() for rung in self.refinement_attempts],
             "crowded": self.crowded.tolist(),
         }

@@ -49,7 +49,7 @@ def certify(
 
     See Also
     --------
-    is_injective, flipped_triangles : the triangles alone, as an inner loop wants them.
+    is_injective, inverted_triangles : the triangles alone, as an inner loop wants them.
 
     Examples
     --------
@@ -57,7 +57,7 @@ def certify(
     >>> certify(F, [[0, 0], [1, 0], [1, 1], [0, 1]]).bijective
     True
     >>> print(certify(F, [[0, 0], [1, 0], [1, 1], [0.9, 0.5]]).summary())
-    Not injective: of 2 triangles, 1 is flipped (1).
+    Not injective: of 2 triangles, 1 is inverted (1).
     """
     return certificate.certify(mesh_triangles(F), uv, boundary=boundary, loops=loops)
 
@@ -65,7 +65,7 @@ def certify(
 def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     """Whether there are triangles and every one is strictly positive, decided exactly.
 
-    The predicate to the locator `flipped_triangles`.
+    The predicate to the locator `inverted_triangles`.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     return certificate.is_injective(mesh_triangles(F), uv)
 
 
-def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
+def inverted_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
     """Find the triangles that keep a map from being injective, exactly.
 
     Parameters
@@ -105,4 +105,4 @@ def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
     ValueError
         When shapes are wrong or an index is out of range, as in `certify`.
     """
-    return certificate.flipped_triangles(mesh_triangles(F), uv)
+    return certificate.inverted_triangles(mesh_triangles(F), uv)

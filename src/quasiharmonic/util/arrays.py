@@ -67,6 +67,8 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     array = _array(name, values)
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
+    if array.dtype.kind in "fO" and (integers := _integers(values, array)) is not None:
+        array = _in_range(name, integers)
     if array.dtype.kind not in "iu":
         advice = ""
         if array.dtype.kind == "b" and array.ndim == 1:
@@ -77,6 +79,25 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
     return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
+
+
+def _integers(values: ArrayLike, array: NDArray[Any]) -> NDArray[np.object_] | None:
+    """Integers that NumPy converts to floats or objects, as too large ones are; None when not all are integers."""
+    if array.dtype.kind == "f" and not isinstance(values, list | tuple):
+        return None
+    objects = np.array(values, dtype=object)
+    if objects.shape != array.shape:
+        return None
+    are_integers = all(isinstance(value, Integral) and not isinstance(value, bool) for value in objects.flat)
+    return objects if are_integers else None
+
+
+def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
+    """Integers of any size as int64; a ValueError that names the first one that does not fit."""
+    for value in integers.flat:
+        if not -(2**63) <= int(value) < 2**63:
+            raise ValueError(f"{name} refers to vertex {kind_of(value)}, which no mesh has")
+    return integers.astype(np.int64)
 
 
 class _Unchangeable(np.ndarray):
@@ -302,6 +323,9 @@ def kind_of(value: object) -> str:
     """Name what was given, for messages: ``a Trimesh``, ``None``, ``'letter:R'``."""
     if isinstance(value, PathLike):
         value = fspath(value)
+    if isinstance(value, Integral) and abs(int(value)) >= 10**80:
+        # Python refuses to write integers of thousands of digits.
+        return f"about {'-' if value < 0 else ''}1e{int(int(value).bit_length() * np.log10(2))}"
     if value is None or isinstance(value, str | bytes | Number):
         text = str(value) if isinstance(value, Number) else repr(value)
         return text if len(text) <= 80 else f"{text[:77]}…"

@@ -1,7 +1,7 @@
 """The caller's callback, heard while work takes long that has no steps of its own to tell.
 
-Whoever takes a callback is `heard`, and calls it at every step. What may take long in between, wherever it is, says now
-and then that it is `still_at_it`; if nothing has been told for a while, the last step is told once more.
+Whoever takes a callback is `reports_progress`, and calls it at every step. What may take long in between, wherever it
+is, says now and then that it is `heartbeat`; if nothing has been told for a while, the last step is told once more.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Hearing:
 _HEARING: ContextVar[_Hearing | None] = ContextVar("hearing", default=None)
 
 
-def heard(function: Callable[P, R]) -> Callable[P, R]:
+def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
     """Have the argument ``callback`` of a function called with its last step again, whenever it has none for long."""
 
     @wraps(function)
@@ -72,7 +72,7 @@ def heard(function: Callable[P, R]) -> Callable[P, R]:
     return hearing
 
 
-def still_at_it() -> None:
+def heartbeat() -> None:
     """Say that work goes on, from wherever it may take long: a tenth of a second apart at most.
 
     Whatever the callback raises comes out of here.

@@ -45,7 +45,7 @@ _SHORTEST = 1 / 64
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class AirMeshState:
     """Shapes, frame and air at one time.
 
     Attributes
@@ -128,14 +128,14 @@ class AirMesh:
             raise ValueError(f"gap must be positive, not {gap}")
         self._loops = boundary_loops(self._F, len(self._rest))
         around = _loops_of(frame)
-        self._sizes = [loop.size // 2 for loop in around]
-        if min(self._sizes, default=3) < 3:
+        self._sizes = [len(loop) for loop in around]
+        if min(self._sizes) < 3:
             raise ValueError(f"loops of the frame have at least 3 points, not {self._sizes}")
         self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(around)]))
         if not self.moment.certificate.bijective:
             raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")
 
-    def advance(self, frame: Sequence[ArrayLike], *, max_iterations: int = 300) -> Moment:
+    def advance(self, frame: Sequence[ArrayLike], *, max_iterations: int = 300) -> AirMeshState:
         """Move the frame and let the shapes come to rest.
 
         Edges of air between points of the frame can forbid a move that is not forbidden in itself. So what cannot
@@ -182,7 +182,7 @@ class AirMesh:
             raise
         return self.moment
 
-    def _step(self, frame: FloatArray, max_iterations: int) -> Moment | None:
+    def _step(self, frame: FloatArray, max_iterations: int) -> AirMeshState | None:
         """The present with the frame elsewhere, at rest; None where that cannot be."""
         try:
             moved = self._moved(frame, max_iterations)
@@ -203,7 +203,7 @@ class AirMesh:
         result = injective_map(then.points, everything, fixed, frame, max_iterations=max_iterations)
         return result.uv if result.injective else None
 
-    def _at_rest(self, points: FloatArray) -> Moment:
+    def _at_rest(self, points: FloatArray) -> AirMeshState:
         """Let shapes come to rest from a valid state, with fresh air before and after."""
         n = len(self._rest)
         fixed = np.arange(n, len(points))
@@ -229,7 +229,7 @@ class AirMesh:
                 break
             last = elastic
         air = self._triangulated(points)
-        return Moment(points, self._F, air, certify(np.concatenate([self._F, air]), points), elastic)
+        return AirMeshState(points, self._F, air, certify(np.concatenate([self._F, air]), points), elastic)
 
     def _elastic(self, points: FloatArray) -> float:
         return DeformationEnergy(self._rest, self._F, _ELASTIC).value(in_units(points[: len(self._rest)], 0))
@@ -237,9 +237,9 @@ class AirMesh:
     def _stacked(self, frame: Sequence[ArrayLike]) -> FloatArray:
         """The frame's points, loop by loop, checked."""
         loops = _loops_of(frame)
-        if [loop.shape for loop in loops] != [(size, 2) for size in self._sizes] or not loops:
-            shapes = [loop.shape for loop in loops]
-            raise ValueError(f"the frame must have loops of {self._sizes} points, not of shapes {shapes}")
+        sizes = [len(loop) for loop in loops]
+        if sizes != self._sizes:
+            raise ValueError(f"the frame must have loops of {self._sizes} points, as at the start, not of {sizes}")
         for k, loop in enumerate(loops):
             check_finite(f"loop {k} of the frame", "point", "points", loop)
         return np.concatenate(loops)
@@ -250,12 +250,20 @@ class AirMesh:
 
 
 def _loops_of(frame: Iterable[ArrayLike]) -> list[FloatArray]:
-    """Each loop of a frame as an array of real numbers, a copy, of any shape."""
+    """The loops of a frame, one or more, each as an array (k, 2) of real numbers, a copy."""
     if isinstance(frame, str | bytes) or not isinstance(frame, Iterable):
         raise ValueError(
             f"frame must be a list of loops (k, 2), the container's and those of obstacles, not {kind_of(frame)}"
         )
-    return [real_array(f"loop {k} of the frame", loop) for k, loop in enumerate(frame)]
+    loops = [real_array(f"loop {k} of the frame", loop) for k, loop in enumerate(frame)]
+    if not loops:
+        raise ValueError("frame has no loops, but the first must be the container's")
+    if all(loop.shape == (2,) for loop in loops):
+        raise ValueError("frame must be a list of loops (k, 2), not a single loop: hand over [frame]")
+    for k, loop in enumerate(loops):
+        if loop.ndim != 2 or loop.shape[1] != 2:
+            raise ValueError(f"loop {k} of the frame must have shape (k, 2), not {loop.shape}")
+    return loops
 
 
 def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[int]) -> IntArray:

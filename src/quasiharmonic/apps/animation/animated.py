@@ -22,20 +22,20 @@ from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, check_callback, kind_of, true_or_false, whole_number
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 # How many times as far as the boundary vertices may move, unless the caller says so.
 _LIMIT = 3.0
 
 
-@heard
+@reports_progress
 def animate(
     problem: Problem,
     targets: Iterable[ArrayLike],
     *,
     polish: str | Energy | None = None,
-    limit: float | None = None,
-    bridge: bool = False,
+    max_motion_ratio: float | None = None,
+    fill_gaps: bool = False,
     start: ArrayLike | None = None,
     max_iterations: int = 2000,
     linear_solver: str = "auto",
@@ -52,10 +52,10 @@ def animate(
     polish : str or Energy, optional
         Lower this distortion energy in every frame, as `quasiharmonic.polish` has it, without leaps from one local
         minimum to another.
-    limit : float, optional
+    max_motion_ratio : float, optional
         For ``polish``: as many times as far as the boundary moves at most, a vertex may; 3 by default. 1 at the least,
         where no more is possible in general; the result says what was reached.
-    bridge : bool
+    fill_gaps : bool
         Where a target allows no map, or none is found, have the boundary halfway between the frames around it, or
         however many there are to go past. Frames at the ends stay without.
     start : (n, 2) array, optional
@@ -79,7 +79,7 @@ def animate(
         When ``problem`` is no `Problem`, or there is no going through ``targets``.
     ValueError
         When a target has another size, or what is no finite number (the message names the frame), when an option has no
-        such value, or ``limit`` is given and nothing to polish with.
+        such value, or ``max_motion_ratio`` is given and nothing to polish with.
 
     Examples
     --------
@@ -100,28 +100,31 @@ def animate(
     energy = None if polish is None else energy_named(polish)
     if not isinstance(problem, Problem):
         raise TypeError(f"animate takes a Problem, not {kind_of(problem)}")
-    if limit is not None and (not isinstance(limit, Real) or not limit >= 1):
-        raise ValueError(f"limit must be a number of at least 1, not {limit!r}: the boundary itself moves as far")
-    if limit is not None and energy is None:
-        raise ValueError("limit is for frames that are polished: name an energy for that too")
+    if max_motion_ratio is not None and (not isinstance(max_motion_ratio, Real) or not max_motion_ratio >= 1):
+        raise ValueError(
+            f"max_motion_ratio must be a number of at least 1, not {max_motion_ratio!r}: "
+            "the boundary itself moves as far"
+        )
+    if max_motion_ratio is not None and energy is None:
+        raise ValueError("max_motion_ratio is for frames that are polished: name an energy for that too")
     whole_number("max_iterations", max_iterations, least=1)
-    true_or_false("bridge", bridge)
+    true_or_false("fill_gaps", fill_gaps)
     check_callback(callback)
     places = checked_targets(targets, len(problem.fixed))
     following = Following(problem, places, max_iterations, linear_solver, callback)
     frames = following.follow(start)
     asked, bridged = places[: len(frames)], np.zeros(len(frames), dtype=bool)
-    if bridge and not following.interrupted:
-        asked, bridged = following.bridge()
+    if fill_gaps and not following.interrupted:
+        asked, bridged = following.fill_gaps()
     interrupted = following.interrupted
     if energy is None:
         return Animation(frames, asked, bridged, np.full(len(frames), np.nan), interrupted=interrupted)
-    limit = _LIMIT if limit is None else float(limit)
+    max_motion_ratio = _LIMIT if max_motion_ratio is None else float(max_motion_ratio)
     energies = np.full(len(frames), np.nan)
     if not interrupted:
-        smoothing = Smoothing(problem.domain, energy, limit, linear_solver)
+        smoothing = Smoothing(problem.domain, energy, max_motion_ratio, linear_solver)
         energies, interrupted = _smoothed(smoothing, following, asked, callback)
-    return Animation(frames, asked, bridged, energies, limit, interrupted)
+    return Animation(frames, asked, bridged, energies, max_motion_ratio, interrupted)
 
 
 def _smoothed(

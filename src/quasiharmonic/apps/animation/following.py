@@ -99,7 +99,7 @@ class Following:
         KeyboardInterrupt
             When the search is interrupted.
         """
-        problem = self._problem.moved(target)
+        problem = self._problem.with_target(target)
         if start is not None:
             near = self._nearby(problem, start)
             if near.injective:
@@ -116,11 +116,11 @@ class Following:
         if times == 0:
             return None
         between = target / 2 + last / 2
-        here = self._nearby(self._problem.moved(between), start)
+        here = self._nearby(self._problem.with_target(between), start)
         middle = here if here.injective else self._by_halves(between, start, last, times - 1)
         if middle is None:
             return None
-        end = self._nearby(self._problem.moved(target), middle.uv)
+        end = self._nearby(self._problem.with_target(target), middle.uv)
         return end if end.injective else self._by_halves(target, middle.uv, between, times - 1)
 
     def _nearby(self, problem: Problem, start: ArrayLike) -> MapResult:
@@ -141,7 +141,7 @@ class Following:
             raise KeyboardInterrupt
         return result
 
-    def bridge(self) -> tuple[FloatArray, BoolArray]:
+    def fill_gaps(self) -> tuple[FloatArray, BoolArray]:
         """Give frames without a map a target between those around them; the targets, and which have changed."""
         targets = self._targets.copy()
         found = np.array([frame.injective for frame in self.frames])

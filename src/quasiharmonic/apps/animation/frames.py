@@ -50,7 +50,7 @@ class Animation:
         Frames whose target allows no map or none was found, and which lie between their neighbours instead.
     energies : (t,) float64
         The mean energy of each polished frame; NaN of all others.
-    limit : float or None
+    max_motion_ratio : float or None
         How many times as far as the boundary a vertex was to move at most; None where the frames were not polished.
     interrupted : bool
         Whether Ctrl-C ended the work before all was done that was asked for.
@@ -60,7 +60,7 @@ class Animation:
     targets: FloatArray
     bridged: BoolArray
     energies: FloatArray
-    limit: float | None = None
+    max_motion_ratio: float | None = None
     interrupted: bool = False
 
     def __repr__(self) -> str:

@@ -44,7 +44,7 @@ class Smoothing:
     ----------
     domain : Domain
     energy : Energy
-    limit : float
+    max_motion_ratio : float
         As many times as far as the boundary a vertex may move at most.
     linear_solver : str
 
@@ -57,9 +57,9 @@ class Smoothing:
         Their mean energies.
     """
 
-    def __init__(self, domain: Domain, energy: Energy, limit: float, linear_solver: str) -> None:
+    def __init__(self, domain: Domain, energy: Energy, max_motion_ratio: float, linear_solver: str) -> None:
         self.domain = domain
-        self._energy, self._limit, self._linear_solver = energy, limit, linear_solver
+        self._energy, self._limit, self._linear_solver = energy, max_motion_ratio, linear_solver
         self._system: NewtonSystem | None = None
         # From a frame to the next: what the boundary moves, and what any vertex does over that.
         self._lengths: list[float] = []

@@ -21,8 +21,8 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 _FURTHEST_LAST = (
     Status.INTERRUPTED,
     Status.IMPOSSIBLE,
-    Status.ENTANGLED,
-    Status.NO_ROOM,
+    Status.TOO_MANY_SPLITS,
+    Status.PRECISION_LIMIT,
     Status.OUT_OF_ITERATIONS,
     Status.COLLAPSED,
     Status.STILL_FALLING,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.skyline import Laid, laid
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
@@ -78,17 +78,17 @@ def packed(
     # In units of about the map's size, a power of two, so that no square overflows.
     largest = np.abs(np.concatenate(islands)).max()
     islands = [np.ldexp(points, -int(np.frexp(largest)[1])) for points in islands]
-    before = flipped_triangles(every, np.concatenate(islands))
+    before = inverted_triangles(every, np.concatenate(islands))
 
     turned = [_turned(points, _least_box(points)) for points in islands]
-    for i in np.unique(owner[np.setdiff1d(flipped_triangles(every, np.concatenate(turned)), before)]).tolist():
+    for i in np.unique(owner[np.setdiff1d(inverted_triangles(every, np.concatenate(turned)), before)]).tolist():
         turned[i] = islands[i]
     turned = [points - points.min(axis=0) for points in turned]
     scale = _densities(turned, triangles, surface)
     sizes = scale[:, None] * np.array([points.max(axis=0) for points in turned])
     whole, places = _largest_scale(sizes, margin)
     found = [_placed(points, whole * scale[i], places[i], margin / 2 + _SLACK) for i, points in enumerate(turned)]
-    lost = np.setdiff1d(flipped_triangles(every, np.concatenate(found)), before)
+    lost = np.setdiff1d(inverted_triangles(every, np.concatenate(found)), before)
     if lost.size:
         i = int(owner[lost[0]])
         own = lost[owner[lost] == i] - int(np.searchsorted(owner, i))

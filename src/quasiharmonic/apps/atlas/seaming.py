@@ -43,7 +43,7 @@ def cut_apart(
         return mesh
     seams = mesh.seams
     inside = np.empty((0, 2), dtype=np.int64) if polygons is None else polygons.diagonals(mesh.F)
-    found = find_cuts(mesh.V, mesh.F, edges=seams, uncut=inside, gain=0.1 if reach else np.inf)
+    found = find_cuts(mesh.V, mesh.F, edges=seams, forbidden_edges=inside, min_gain=0.1 if reach else np.inf)
     return mesh if len(found) == len(seams) else mesh.cut(found)
 
 

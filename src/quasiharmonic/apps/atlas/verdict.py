@@ -35,14 +35,14 @@ class IslandVerdict:
         as the other side shows it. A single island is never held for mirrored, but for inverted.
     certificate : Certificate
         By the island's own numbers.
-    flipped : (a,) int64
+    inverted : (a,) int64
         Its triangles that are not strictly positive (mirrored: not strictly negative).
     """
 
     triangles: IntArray
     mirrored: bool
     certificate: Certificate
-    flipped: IntArray
+    inverted: IntArray
 
     @property
     def injective(self) -> bool:
@@ -59,7 +59,7 @@ class IslandVerdict:
         where = which_island(self.triangles)
         turned = ", mirrored" if self.mirrored else ""
         if not self.injective:
-            return f"{where}{turned}: not injective, {named('triangle', 'triangles', self.flipped)} not positive"
+            return f"{where}{turned}: not injective, {named('triangle', 'triangles', self.inverted)} not positive"
         return f"{where}{turned}: injective, {'bijective' if self.bijective else 'but it overlaps itself'}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class IslandVerdict:
             "mirrored": self.mirrored,
             "injective": self.injective,
             "bijective": self.bijective,
-            "flipped": self.flipped.tolist(),
+            "inverted": self.inverted.tolist(),
             "reasons": [reason.text for reason in self.certificate.reasons],
         }
 
@@ -101,9 +101,9 @@ class AtlasVerdict:
         return bool(self.islands) and all(island.bijective for island in self.islands)
 
     @property
-    def flipped(self) -> IntArray:
+    def inverted(self) -> IntArray:
         """Triangles that are not as their island is wound, ascending."""
-        return np.sort(np.concatenate([np.empty(0, dtype=np.int64), *(island.flipped for island in self.islands)]))
+        return np.sort(np.concatenate([np.empty(0, dtype=np.int64), *(island.inverted for island in self.islands)]))
 
     @property
     def mirrored(self) -> IntArray:
@@ -158,7 +158,7 @@ def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
     judged = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)
-        wrong = np.sort(np.concatenate([found.flipped, found.degenerate, found.nonfinite]))
+        wrong = np.sort(np.concatenate([found.inverted, found.degenerate, found.nonfinite]))
         judged.append(IslandVerdict(island.triangles, mirrored, found, island.triangles[wrong]))
     return AtlasVerdict(tuple(judged), _overlapping(mesh.islands, judged))
 

@@ -29,7 +29,7 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Isotropic
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # The barrier's width d, and its weights κ, one after the other.
 _WIDTH, _WEIGHTS = 0.05, (1e-3, 1e-5)
@@ -48,9 +48,9 @@ _AT_ONCE = 20_000
 
 @dataclass(frozen=True)
 class ThinBarrier(Isotropic):
-    """A barrier at determinants of ``least`` that is 0 from ``least + width`` on."""
+    """A barrier at determinants of ``min_jacobian`` that is 0 from ``min_jacobian + width`` on."""
 
-    least: float
+    min_jacobian: float
     width: float
 
     barrier = True
@@ -60,40 +60,40 @@ class ThinBarrier(Isotropic):
         s = self._place(d)
         return np.where(s > 0, -((s - 1) ** 2) * np.log(np.where(s > 0, s, 1)), np.inf)
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """By a, and by b the negative: φ is a function of det = a − b."""
         s = self._inside(d)
         slope = -(2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) / self.width
         return slope, -slope
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """By a twice, by both, by b twice."""
         s = self._inside(d)
         bend = -(2 * np.log(s) + 4 * (s - 1) / s - ((s - 1) / s) ** 2) / self.width**2
         return bend, -bend, bend
 
     def _place(self, d: Deformation) -> FloatArray:
-        return np.minimum((d.det - self.least) / self.width, 1)
+        return np.minimum((d.det - self.min_jacobian) / self.width, 1)
 
     def _inside(self, d: Deformation) -> FloatArray:
         s = self._place(d)
         return np.where(s > 0, s, 1)
 
 
-def approach(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, least: float) -> None:
+def approach(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float) -> None:
     """Bring the free pixels as near to a given field as they get.
 
     Parameters
     ----------
     grid : Grid
     w : (h, w) complex128
-        A map in the grid's unit whose determinants are above ``least`` at all corners of cells with free pixels.
+        A map in the grid's unit whose determinants are above ``min_jacobian`` at all corners of cells with free pixels.
         Changed in place.
     given : (h, w) complex128
         The map to be near to.
     patch : (h, w) int64
         Each free pixel's patch, from 1 on; 0 where pixels stay.
-    least : float
+    min_jacobian : float
         δ, what determinants stay above.
     """
     size = np.bincount(patch.ravel())
@@ -104,19 +104,25 @@ def approach(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, 
         for number in range(int(batch[-1]) + 1):
             todo = np.flatnonzero((batch == number) & (size > 0))
             for weight in _WEIGHTS:
-                _descend(grid, w, given, patch, todo, least, weight)
+                _descend(grid, w, given, patch, todo, min_jacobian, weight)
 
 
 def _descend(
-    grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, todo: IntArray, least: float, weight: float
+    grid: Grid,
+    w: ComplexArray,
+    given: ComplexArray,
+    patch: IntArray,
+    todo: IntArray,
+    min_jacobian: float,
+    weight: float,
 ) -> None:
     """Bring the patches ``todo`` to rest under one weight of the barrier; a matrix of those alone that still move."""
     steps = _STEPS
     while todo.size and steps:
-        batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), least, weight)
+        batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), min_jacobian, weight)
         moving = np.ones(todo.size, dtype=bool)
         while steps and 2 * np.count_nonzero(moving) > todo.size:
-            still_at_it()
+            heartbeat()
             moving &= batch.step(moving)
             steps -= 1
         batch.enter(w)
@@ -127,7 +133,7 @@ class _Batch:
     """Some patches, with one matrix."""
 
     def __init__(
-        self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, least: float, weight: float
+        self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
     ) -> None:
         touched = touched_cells(patch > 0)
         cells = grid.cells(*np.nonzero(touched))
@@ -143,7 +149,9 @@ class _Batch:
         of = np.full(len(pixels), -1, dtype=np.int64)
         of[self.free] = own
         self.of_triangle = np.repeat(of[local.reshape(-1, 4)].max(axis=1), 4)
-        self.energy = DeformationEnergy(grid.points.reshape(-1, 2)[pixels] / grid.unit, F, ThinBarrier(least, _WIDTH))
+        self.energy = DeformationEnergy(
+            grid.points.reshape(-1, 2)[pixels] / grid.unit, F, ThinBarrier(min_jacobian, _WIDTH)
+        )
         self.system = NewtonSystem(F, self.energy.g, len(pixels), np.flatnonzero(label == 0))
         self._count = len(F)
 
@@ -172,12 +180,12 @@ class _Batch:
         found = self.system.descent(gradient, _SHIFTS)
         direction = found[0] if found is not None else self.system.solve_diagonal(-gradient)
         fall = -(gradient.real * direction.real + gradient.imag * direction.imag)
-        promise = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
-        fallen = self._search(direction, promise, value, moving & (promise > 0))
-        return (fallen > _IDLE * value) & (0.5 * promise > np.maximum(_TOLERANCE * value, _NOTHING))
+        expected_decrease = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
+        fallen = self._search(direction, expected_decrease, value, moving & (expected_decrease > 0))
+        return (fallen > _IDLE * value) & (0.5 * expected_decrease > np.maximum(_TOLERANCE * value, _NOTHING))
 
     def _search(
-        self, direction: ComplexArray, promise: FloatArray, before: FloatArray, moving: BoolArray
+        self, direction: ComplexArray, expected_decrease: FloatArray, before: FloatArray, moving: BoolArray
     ) -> FloatArray:
         """Go along a direction, each patch as far as is good; by how much each has fallen."""
         full = np.zeros_like(self.here)
@@ -189,7 +197,7 @@ class _Batch:
         for _ in range(_HALVINGS):
             trial[self.free] = start + t[self.of_pixel] * direction
             value, _ = self._values(trial)
-            too_far = moving & ~(value <= before - _SUFFICIENT * t * promise)
+            too_far = moving & ~(value <= before - _SUFFICIENT * t * expected_decrease)
             if not too_far.any():
                 break
             t[too_far] *= 0.5

@@ -30,13 +30,13 @@ class InvertibleField:
     ----------
     field : (h, w, 2) float64
         Without folds.
-    moved : (h, w) bool
+    moved_mask : (h, w) bool
         Where it is another than the given one; elsewhere it is that to the last bit.
     certificate : Certificate
         Of the pixels' places as a mesh, each cell cut along one diagonal: whether the field is injective, and, looking
         at the border too, whether no place is covered twice.
     folds : int
-        Cells that the given field folds: with a corner whose determinant is not above ``least``.
+        Cells that the given field folds: with a corner whose determinant is not above ``min_jacobian``.
     patches : int
         Parts of the grid, apart from each other, in which it was changed.
     distance : float
@@ -45,7 +45,7 @@ class InvertibleField:
     """
 
     field: FloatArray
-    moved: BoolArray
+    moved_mask: BoolArray
     certificate: Certificate
     folds: int
     patches: int
@@ -56,7 +56,7 @@ class InvertibleField:
         """In a sentence or two."""
         if not self.folds:
             return f"The field does not fold, and is as it was. {self.certificate.summary()}"
-        moved = int(np.count_nonzero(self.moved))
+        moved = int(np.count_nonzero(self.moved_mask))
         return (
             f"{counted('cell', 'cells', self.folds)} folded; {counted('pixel', 'pixels', moved)} moved, "
             f"{self.distance:.3g} away in the root mean square over all. {self.certificate.summary()}"
@@ -67,8 +67,8 @@ def nearest_invertible(
     field: ArrayLike,
     *,
     spacing: ArrayLike = 1.0,
-    least: float = 0.01,
-    held: ArrayLike | None = None,
+    min_jacobian: float = 0.01,
+    fixed: ArrayLike | None = None,
 ) -> InvertibleField:
     """Make a displacement field invertible, and change it as little as that takes.
 
@@ -84,11 +84,11 @@ def nearest_invertible(
         spacing. The pixel at the place p goes to ``p + field``.
     spacing : float or (float, float)
         From a pixel to the next, along x and along y.
-    least : float
-        What the determinants of the derivative are above, all four of each cell; at least 0 and less than 1, and taken
-        to be what rounding does to a determinant where it is less. Cells that have less are folds. What is above by a
-        little survives being stored in single precision.
-    held : (h, w) array of bool, optional
+    min_jacobian : float
+        What the determinants of the derivative are above, all four of each cell; at least 0 and less than 1, and
+        taken to be what rounding does to a determinant where it is less. Cells that have less are folds. What is above
+        by a little survives being stored in single precision.
+    fixed : (h, w) array of bool, optional
         Pixels that keep their displacements; none by default, those of the border neither.
 
     Returns
@@ -102,7 +102,7 @@ def nearest_invertible(
         When an array has the wrong shape, the field is not finite, or another option has no such value. The message
         names the pixels.
     RuntimeError
-        When no field was found, because of pixels that are held, or of displacements so large that nothing is left of
+        When no field was found, because of pixels that are fixed, or of displacements so large that nothing is left of
         a pixel when they are rounded.
 
     Notes
@@ -117,22 +117,22 @@ def nearest_invertible(
     >>> y, x = np.mgrid[:40, :40]
     >>> bump = np.exp(-((x - 20) ** 2 + (y - 20) ** 2) / 18)
     >>> mended = nearest_invertible(np.stack([6 * bump, 0 * bump], axis=-1))
-    >>> mended.certificate.bijective, mended.folds, bool(mended.moved.mean() < 0.1)
+    >>> mended.certificate.bijective, mended.folds, bool(mended.moved_mask.mean() < 0.1)
     (True, 8, True)
     """
     began = time.perf_counter()
     given = checked_field(field)
     grid = checked_grid(given.shape, spacing)
-    if not isinstance(least, Real) or not 0 <= least < 1:
-        raise ValueError(f"least must be at least 0 and less than 1, not {least!r}")
-    kept = _held(held, grid)
+    if not isinstance(min_jacobian, Real) or not 0 <= min_jacobian < 1:
+        raise ValueError(f"min_jacobian must be at least 0 and less than 1, not {min_jacobian!r}")
+    kept = _fixed_mask(fixed, grid)
     w = _map(grid, given)
-    least = max(least, _rounding(w))
-    wrong = folded(grid, w, least)
+    min_jacobian = max(min_jacobian, _rounding(w))
+    wrong = folded(grid, w, min_jacobian)
     mended = given.copy()
     if wrong.any():
-        _check_held(wrong, kept)
-        here = _descended(grid, w, kept, least)
+        _check_fixed(wrong, kept)
+        here = _descended(grid, w, kept, min_jacobian)
         moved = here != w
         places = np.stack([here.real, here.imag], axis=-1) * grid.unit
         mended[moved] = (places - grid.points)[moved]
@@ -144,7 +144,7 @@ def nearest_invertible(
     farthest = float(away.max())
     return InvertibleField(
         field=mended,
-        moved=moved,
+        moved_mask=moved,
         certificate=certificate,
         folds=int(np.count_nonzero(wrong)),
         patches=int(labelled(moved).max()),
@@ -195,38 +195,40 @@ def _rounding(w: ComplexArray) -> float:
     return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
 
 
-def _held(held: ArrayLike | None, grid: Grid) -> BoolArray:
-    if held is None:
+def _fixed_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
+    if fixed is None:
         return np.zeros(grid.shape, dtype=bool)
-    mask = np.asarray(held)
+    mask = np.asarray(fixed)
     if mask.shape != grid.shape or mask.dtype != bool:
-        raise ValueError(f"held must be an array of bool of shape {grid.shape}, not of {mask.dtype} and {mask.shape}")
+        raise ValueError(f"fixed must be an array of bool of shape {grid.shape}, not of {mask.dtype} and {mask.shape}")
     return mask
 
 
-def _check_held(wrong: BoolArray, held: BoolArray) -> None:
+def _check_fixed(wrong: BoolArray, fixed: BoolArray) -> None:
     """Refuse folds that nobody may mend."""
-    stuck = wrong & held[:-1, :-1] & held[1:, :-1] & held[:-1, 1:] & held[1:, 1:]
+    stuck = wrong & fixed[:-1, :-1] & fixed[1:, :-1] & fixed[:-1, 1:] & fixed[1:, 1:]
     if stuck.any():
-        raise ValueError(f"held: cells fold whose four pixels are all held; the first of each is {named_pixels(stuck)}")
+        raise ValueError(
+            f"fixed: cells fold whose four pixels are all fixed; the first of each is {named_pixels(stuck)}"
+        )
 
 
-def _descended(grid: Grid, given: ComplexArray, held: BoolArray, least: float) -> ComplexArray:
+def _descended(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:
     """The nearest map, from one without folds; patches grow until nothing moves at their rims."""
     try:
-        w, patch = filled_in(grid, given, held, least)
+        w, patch = filled_in(grid, given, fixed, min_jacobian)
     except NoRoomError as none:
         raise RuntimeError(
-            "no field without folds was found that keeps what is held; what folds still has "
+            "no field without folds was found that keeps what is fixed; what folds still has "
             f"{named_pixels(none.mask)}. Hold fewer pixels around these"
         ) from none
     moving = patch
     for _ in range(_ROUNDS):
-        approach(grid, w, given, moving, least)
-        _put_back(grid, w, given, least)
-        rim = (w != given) & (moving > 0) & grown(patch == 0, 1, held)
+        approach(grid, w, given, moving, min_jacobian)
+        _put_back(grid, w, given, min_jacobian)
+        rim = (w != given) & (moving > 0) & grown(patch == 0, 1, fixed)
         pressing = np.isin(moving, np.unique(moving[rim])) & rim.any() & (moving > 0)
-        free = (patch > 0) | grown(pressing, _WIDER, held)
+        free = (patch > 0) | grown(pressing, _WIDER, fixed)
         if np.array_equal(free, patch > 0):
             break
         patch = labelled(free)
@@ -234,10 +236,10 @@ def _descended(grid: Grid, given: ComplexArray, held: BoolArray, least: float) -
     return w
 
 
-def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, least: float) -> None:
+def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
     """Put pixels to where they were that are all but there, if nothing folds with that."""
     there = (w != given) & (np.abs(w - given) < _THERE)
     before = w[there]
     w[there] = given[there]
-    if folded(grid, w, least).any():
+    if folded(grid, w, min_jacobian).any():
         w[there] = before

@@ -27,16 +27,16 @@ _EIGHT = np.ones((3, 3), dtype=bool)
 
 
 class NoRoomError(Exception):
-    """Pixels that are held leave no map without folds that could be found; ``mask`` (h, w) says where."""
+    """Pixels that are fixed leave no map without folds that could be found; ``mask`` (h, w) says where."""
 
     def __init__(self, mask: BoolArray) -> None:
-        super().__init__("pixels that are held leave no room")
+        super().__init__("pixels that are fixed leave no room")
         self.mask = mask
 
 
-def folded(grid: Grid, w: ComplexArray, least: float) -> BoolArray:
-    """The cells (h − 1, w − 1) of which a corner's determinant is not above ``least``."""
-    return np.asarray(~(grid.jacobians(w) > least).all(axis=2))
+def folded(grid: Grid, w: ComplexArray, min_jacobian: float) -> BoolArray:
+    """The cells (h − 1, w − 1) of which a corner's determinant is not above ``min_jacobian``."""
+    return np.asarray(~(grid.jacobians(w) > min_jacobian).all(axis=2))
 
 
 def corners_of(cells: BoolArray) -> BoolArray:
@@ -55,15 +55,15 @@ def labelled(free: BoolArray) -> IntArray:
     return np.asarray(label(free, structure=_EIGHT)[0], dtype=np.int64)
 
 
-def grown(pixels: BoolArray, steps: int, held: BoolArray) -> BoolArray:
-    """Pixels and all that are at most some steps away, by rows, columns or both, but for those that are held."""
+def grown(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
+    """Pixels and all that are at most some steps away, by rows, columns or both, but for those that are fixed."""
     from scipy.ndimage import maximum_filter
 
-    around: BoolArray = maximum_filter(pixels, 2 * steps + 1, mode="constant") & ~held
+    around: BoolArray = maximum_filter(pixels, 2 * steps + 1, mode="constant") & ~fixed
     return around
 
 
-def filled_in(grid: Grid, given: ComplexArray, held: BoolArray, least: float) -> tuple[ComplexArray, IntArray]:
+def filled_in(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> tuple[ComplexArray, IntArray]:
     """A map without folds that is the given one but for some patches.
 
     Parameters
@@ -71,9 +71,9 @@ def filled_in(grid: Grid, given: ComplexArray, held: BoolArray, least: float) ->
     grid : Grid
     given : (h, w) complex128
         A map in the grid's unit.
-    held : (h, w) bool
+    fixed : (h, w) bool
         Pixels that stay.
-    least : float
+    min_jacobian : float
         What all determinants are to be above.
 
     Returns
@@ -85,23 +85,23 @@ def filled_in(grid: Grid, given: ComplexArray, held: BoolArray, least: float) ->
     Raises
     ------
     NoRoomError
-        When none was found, which only pixels that are held can do.
+        When none was found, which only pixels that are fixed can do.
     """
     w, steps = given.copy(), _REACH
-    free = grown(corners_of(folded(grid, given, least)), steps, held)
+    free = grown(corners_of(folded(grid, given, min_jacobian)), steps, fixed)
     while not free.all():
         patch = labelled(free)
         _fill(grid, w, given, free)
-        wrong = folded(grid, w, least)
+        wrong = folded(grid, w, min_jacobian)
         if not wrong.any():
             return w, patch
         steps *= _GROWTH
         failed = np.unique(patch[corners_of(wrong)])
-        larger = grown(np.isin(patch, failed[failed > 0]) | corners_of(wrong), steps, held) | free
+        larger = grown(np.isin(patch, failed[failed > 0]) | corners_of(wrong), steps, fixed) | free
         if np.array_equal(larger, free):
             raise NoRoomError(corners_of(wrong))
         free = larger
-    return _smoothed(grid, given, least), labelled(free)
+    return _smoothed(grid, given, min_jacobian), labelled(free)
 
 
 def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
@@ -133,7 +133,7 @@ def _path(count: int) -> dia_array:
     return dia_array((bands, [-1, 0, 1]), shape=(count, count))
 
 
-def _smoothed(grid: Grid, given: ComplexArray, least: float) -> ComplexArray:
+def _smoothed(grid: Grid, given: ComplexArray, min_jacobian: float) -> ComplexArray:
     """The map whose displacements are smoothed by a Gaussian, as little as leaves no fold."""
     from scipy.ndimage import gaussian_filter
 
@@ -141,7 +141,7 @@ def _smoothed(grid: Grid, given: ComplexArray, least: float) -> ComplexArray:
     while deviation < max(grid.shape):
         smooth = [gaussian_filter(part, deviation, mode="nearest") for part in (moved.real, moved.imag)]
         w: ComplexArray = grid.rest + smooth[0] + 1j * smooth[1]
-        if not folded(grid, w, least).any():
+        if not folded(grid, w, min_jacobian).any():
             return w
         deviation *= _SMOOTHER
     return grid.rest + moved.mean()

@@ -15,7 +15,7 @@ from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, QuadraticForm
 from quasiharmonic.energies.newton.line_search import backtrack, extend
-from quasiharmonic.energies.newton.newton_descent import Lowered, NewtonDescent
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent, NewtonObjective
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.energies.newton.rotation_path import Turning, rates
@@ -63,7 +63,7 @@ class GuardedEnergy:
         The factor on each contact's barrier.
     """
 
-    def __init__(self, surface: Lowered) -> None:
+    def __init__(self, surface: NewtonObjective) -> None:
         self.surface = surface
         self.F, self.g = surface.F, surface.g
         self.contacts, self.strangers, self.stiffness = Contacts.none(), Contacts.none(), 0.0
@@ -110,7 +110,7 @@ class FreeDescent(NewtonDescent):
     """
 
     def __init__(
-        self, energy: Lowered, uv: FloatArray, linear_solver: str, fixed: Sequence[int] | IntArray = (0,)
+        self, energy: NewtonObjective, uv: FloatArray, linear_solver: str, fixed: Sequence[int] | IntArray = (0,)
     ) -> None:
         super().__init__(energy, uv, np.asarray(fixed, dtype=np.int64), 0, linear_solver)
         self._linear_solver = linear_solver
@@ -122,7 +122,7 @@ class FreeDescent(NewtonDescent):
         return self.positions(self.w)
 
     @property
-    def surface(self) -> Lowered:
+    def surface(self) -> NewtonObjective:
         """The energy of the surface alone."""
         return self.energy
 
@@ -138,7 +138,7 @@ class FreeDescent(NewtonDescent):
         self.value = self.energy.value_of(self._deformation)
         self._cut, self._idle = True, 0
 
-    def ease(self) -> bool:
+    def relax_barrier(self) -> bool:
         """Make what only guards the map count for less; False if it cannot."""
         return False
 
@@ -146,20 +146,22 @@ class FreeDescent(NewtonDescent):
     def _turning(self) -> Turning | None:
         return Turning.of(self.energy.F, self.energy.g, self.w.size, self.fixed, self._linear_solver)
 
-    def _search(self, direction: ComplexArray, promise: float) -> bool:
+    def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
         """As of `NewtonDescent`; where full steps are many and short, first along a path that turns."""
         last, higher = self._last
-        slow = not self._cut and promise > _SLOW * last and self.value > _LITTLE * higher
-        self._last, self._slow = (promise, self.value), self._slow + 1 if slow else 0
-        return (self._slow >= _SLOW_STEPS and self._turned(direction, promise)) or super()._search(direction, promise)
+        slow = not self._cut and expected_decrease > _SLOW * last and self.value > _LITTLE * higher
+        self._last, self._slow = (expected_decrease, self.value), self._slow + 1 if slow else 0
+        return (self._slow >= _SLOW_STEPS and self._turned(direction, expected_decrease)) or super()._search(
+            direction, expected_decrease
+        )
 
-    def _turned(self, direction: ComplexArray, promise: float) -> bool:
+    def _turned(self, direction: ComplexArray, expected_decrease: float) -> bool:
         """Take a step in full, or more, along a path that turns; False if the energy does not fall enough there."""
         full = np.zeros_like(self.w)
         full[self.system.free] = direction
         rate = rates(self.energy.F, self.energy.g, self.w, full)
         turning = np.median(np.abs(rate.imag)) > _TURNED * np.median(np.abs(rate.real))
-        if not (promise > 0 and turning) or self._turning is None:
+        if not (expected_decrease > 0 and turning) or self._turning is None:
             return False
         path = self._turning.path(self.w, full)
 
@@ -169,9 +171,9 @@ class FreeDescent(NewtonDescent):
             except NotPositiveDefinite:
                 # Rest triangles so thin that the path's own system has no solution to any digit.
                 return np.inf, None
-            return self.tried(there, bound)
+            return self.evaluate_trial(there, bound)
 
-        taken = backtrack(trial, self.value, promise, tries=1)
+        taken = backtrack(trial, self.value, expected_decrease, tries=1)
         if taken is None:
             return False
         _, self.value, (self.w, self._deformation) = extend(trial, taken)
@@ -193,7 +195,7 @@ class GuardedDescent(FreeDescent):
 
     def __init__(
         self,
-        energy: Lowered,
+        energy: NewtonObjective,
         uv: FloatArray,
         linear_solver: str,
         rim: Rim,
@@ -208,7 +210,7 @@ class GuardedDescent(FreeDescent):
         self._known = Contacts.none().corners
 
     @property
-    def surface(self) -> Lowered:
+    def surface(self) -> NewtonObjective:
         """The energy of the surface alone."""
         return self.energy.surface
 
@@ -217,7 +219,7 @@ class GuardedDescent(FreeDescent):
         """The value of the surface's energy alone."""
         return self.energy.surface.value_of(self._deformation.surface)
 
-    def ease(self) -> bool:
+    def relax_barrier(self) -> bool:
         """Lower the weight of the contacts; False at the last."""
         following = next(self._stages, None)
         if following is None:
@@ -248,9 +250,9 @@ class GuardedDescent(FreeDescent):
             stiffness, free = self.energy.stiffness, self.system.free
             self.system.add_blocks(*(stiffness * part[free] for part in self.energy.strangers.blocks(self.w)))
 
-    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
+    def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
         """As of `NewtonDescent`; besides, the boundary does not meet itself, and no gap becomes much narrower."""
-        value, there = super().tried(w, bound)
+        value, there = super().evaluate_trial(w, bound)
         if there is not None:
             near = self._rim.contacts(w)
             # Pairs that only face each other since count by how near they were, or no step might be short enough.
@@ -260,8 +262,8 @@ class GuardedDescent(FreeDescent):
             self._ahead = near
         return value, there
 
-    def _search(self, direction: ComplexArray, promise: float) -> bool:
-        moved = super()._search(direction, promise)
+    def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
+        moved = super()._search(direction, expected_decrease)
         if moved:
             # The last map that was accepted is the one that was gone to.
             self._near = self._ahead
@@ -307,7 +309,7 @@ def descend(descent: FreeDescent, density: Energy, tolerance: float) -> Iterator
         if far and (outcome is not None or not values[-1] < 0.5 * values[-3]):
             far, outcome = False, None
             descent.turn_to(density)
-        elif outcome is not None and descent.ease():
+        elif outcome is not None and descent.relax_barrier():
             outcome = None
         yield outcome
         if outcome is not None:

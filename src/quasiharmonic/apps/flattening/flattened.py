@@ -25,8 +25,8 @@ from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, 
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import energy_named
-from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -39,7 +39,7 @@ from quasiharmonic.util.arrays import (
     vertex_array,
     whole_number,
 )
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 # A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
 _SAMPLED = 10.0
@@ -47,8 +47,8 @@ _SAMPLED = 10.0
 _DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
 
 
-@takes_mesh
-@heard
+@accepts_mesh
+@reports_progress
 def flatten(
     V: ArrayLike,
     F: ArrayLike,
@@ -65,7 +65,7 @@ def flatten(
     tolerance: float = 1e-4,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    record: int = 0,
+    record_every: int = 0,
 ) -> MapResult:
     """Map a surface into the plane bijectively, its boundary going where distortion is least.
 
@@ -111,8 +111,8 @@ def flatten(
         Called with a `Step` at the start and after every step, and with the last one again at least every half second
         in between, but not within a single factorisation; its ``energy`` is the mean of what is being lowered. It may
         raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
-    record : int
-        Keep the map of every ``record``-th step in the result's ``path``, before it is laid out; none of them by
+    record_every : int
+        Keep the map of every ``record_every``-th step in the result's ``path``, before it is laid out; none of them by
         default, and none of several pieces.
 
     Returns
@@ -152,7 +152,7 @@ def flatten(
     if fixed is not None and unit_square:
         raise ValueError("vertices that are held decide the map's size: leave unit_square out")
     whole_number("max_iterations", max_iterations, least=0)
-    whole_number("record", record, least=0)
+    whole_number("record_every", record_every, least=0)
     whole_number("rings", rings, least=1)
     not_negative("gap", gap)
     true_or_false("unit_square", unit_square)
@@ -165,7 +165,7 @@ def flatten(
         )
     density = SymmetricDirichlet() if of_distances else energy_named(energy)
     name = "symmetric-dirichlet" if of_distances else energy if isinstance(energy, str) else type(energy).__name__
-    settings = Settings(density, name, tolerance, max_iterations, linear_solver, callback, record)
+    settings = Settings(density, name, tolerance, max_iterations, linear_solver, callback, record_every)
     V, F = vertex_array(V), triangle_rows(F)
     weights = None if weights is None else positive_weights(weights, len(F))
     given = None if start is None else _injective(start, V, F)
@@ -280,10 +280,10 @@ def _with_distances(piece: Piece, start: FloatArray | None, rings: int, settings
 
 def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
     array = map_array("start", start, len(V))
-    flipped = flipped_triangles(F, array)
-    if flipped.size:
+    inverted = inverted_triangles(F, array)
+    if inverted.size:
         raise ValueError(
-            f"start is not injective: {named('triangle', 'triangles', flipped)} inverted or without area; "
+            f"start is not injective: {named('triangle', 'triangles', inverted)} inverted or without area; "
             "leave it out, or make it injective first (quasiharmonic.repair)"
         )
     return array

@@ -62,7 +62,7 @@ class Settings:
     max_iterations : int
     linear_solver : str
     callback : callable or None
-    record : int
+    record_every : int
     """
 
     density: Energy
@@ -71,7 +71,7 @@ class Settings:
     max_iterations: int
     linear_solver: str
     callback: Callable[[Step], object] | None
-    record: int
+    record_every: int
 
     def __post_init__(self) -> None:
         check_callback(self.callback)
@@ -417,7 +417,7 @@ class Flattening:
     def _report(self, descent: FreeDescent) -> None:
         settings, number = self._settings, len(self._history)
         self._history.append(Step(number, 0, self._measure.value(descent.w)))
-        if settings.record and number % settings.record == 0:
+        if settings.record_every and number % settings.record_every == 0:
             self._path.append(Snapshot(number, in_given_unit(descent.uv, self._piece.exponent)))
         if settings.callback is not None:
             settings.callback(self._history[-1])

@@ -17,7 +17,7 @@ from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.newton_descent import in_units
 from quasiharmonic.energies.polishing import energy_named, injective_array
 from quasiharmonic.geometry.exact.loops import judge_loops
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 
@@ -25,8 +25,8 @@ from quasiharmonic.util.arrays import ComplexArray, IntArray
 _SAME = 1e-6
 
 
-@takes_mesh
-@takes_mesh
+@accepts_mesh
+@accepts_mesh
 def flatten_derivative(
     V: ArrayLike,
     F: ArrayLike,

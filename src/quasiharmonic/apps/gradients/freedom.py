@@ -14,7 +14,7 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.newton.newton_descent import in_units
 from quasiharmonic.energies.newton.sliding import SlidingSystem
 from quasiharmonic.geometry.curves.boundary_curves import Track
-from quasiharmonic.geometry.curves.deviation import Straying
+from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Of the energy, the weight of the barrier that keeps a boundary near its curves: as `energy.sliding` has it.
@@ -89,7 +89,7 @@ class Freedom:
         out[self.sliding] = self.system.tangent * step[self.system.at].real
         return out
 
-    def moved(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
+    def advance(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
         """The map after a step of the unknowns, None where it cannot be taken."""
         return w + self.spread(step)
 
@@ -128,7 +128,7 @@ class OnCurves(Freedom):
         held = np.setdiff1d(fixed, track.vertices)
         super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
         self._track, self._s, self._there = track, track.s, track.s
-        self._straying, self._unit = Straying(track, loops, exactly=True), 2.0**exponent
+        self._straying, self._unit = DeviationBarrier(track, loops, exactly=True), 2.0**exponent
         self._weight = _WEIGHT * energy.value(in_units(track.uv, exponent))
         self._both = (self._straying.pairs >= 0).all(axis=1)
         self.system.couple(self._straying.pairs[self._both])
@@ -164,10 +164,10 @@ class OnCurves(Freedom):
         out[self.system.at] += np.where(self.system.tangent == 0, 0, self._slopes)
         return out
 
-    def moved(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
+    def advance(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
         along = step[self.system.at].real
         along = np.where(along * self._side < 0, 0, along)
-        there = self._track.moved(self._s, self._unit * along)
+        there = self._track.advance(self._s, self._unit * along)
         if not self._track.in_order(there):
             return None
         self._there = there
@@ -200,7 +200,7 @@ class OnCurves(Freedom):
         return colours
 
     def _barrier_bends(self, s: FloatArray) -> FloatArray:
-        """Its second derivatives edge by edge, (e, 2, 2): those of `Straying` leave out what Gauss and Newton do."""
+        """Its second derivatives edge by edge, (e, 2, 2): `DeviationBarrier` leaves out terms, as Gauss-Newton does."""
         pairs = self._straying.pairs
         out = np.zeros((len(pairs), 2, 2))
         lengths = np.array([chain.curve.length for chain in self._track.chains for _ in range(chain.sliding.sum())])
@@ -209,7 +209,7 @@ class OnCurves(Freedom):
             change = np.where(self._colours == colour, step, 0.0)
             if not change.any():
                 continue
-            ahead, behind = (self._by_edges(self._track.moved(s, way * change)) for way in (1, -1))
+            ahead, behind = (self._by_edges(self._track.advance(s, way * change)) for way in (1, -1))
             for end in (0, 1):
                 those = np.flatnonzero((pairs[:, end] >= 0) & (change[pairs[:, end]] > 0))
                 width = 2 * change[pairs[those, end]] / self._unit

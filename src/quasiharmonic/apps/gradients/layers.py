@@ -22,7 +22,7 @@ from quasiharmonic.apps.gradients.flattened import flatten_derivative
 from quasiharmonic.apps.gradients.polished import polish_derivative
 from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
@@ -145,7 +145,7 @@ class PolishedLayer(Layer):
 
     problem: Problem
     polish: str | Energy
-    slide: bool | Rails
+    slide: bool | BoundaryCurves
     start: FloatArray | None
     linear_solver: str
 
@@ -234,7 +234,7 @@ def posed(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
     """A problem with a target and rest positions of a batch's, where there are such."""
     target, V = arrays.get("target", problem.target), arrays.get("rest", problem.V)
     if np.array_equal(V, problem.V):
-        return problem.moved(target)
+        return problem.with_target(target)
     return Problem(V, problem.F, problem.fixed, target, reference=problem.reference)
 
 

@@ -21,7 +21,7 @@ from quasiharmonic.energies.energies import Deformation
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.util.arrays import ComplexArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # Steps at most, and how often one is halved.
 _STEPS, _HALVINGS = 100, 40
@@ -87,7 +87,7 @@ class Minimum:
         """Take steps until there is none to take, and leave the system factored; the strain of the step not taken."""
         last = np.inf
         for left in range(steps, -1, -1):
-            still_at_it()
+            heartbeat()
             gradient = self._at()
             step, self._exact = self._direction(gradient)
             size = self._strain(step)
@@ -135,7 +135,7 @@ class Minimum:
         before = self._energy.value_of(self._deformation) + self._freedom.extra()
         t = 1.0
         for _ in range(_HALVINGS):
-            there = self._freedom.moved(self.w, t * step)
+            there = self._freedom.advance(self.w, t * step)
             if there is not None:
                 value = self._energy.value(there) + self._freedom.extra()
                 if value <= before + _ROUNDING * abs(before) and is_injective(

@@ -15,8 +15,8 @@ from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.newton_descent import in_units
 from quasiharmonic.energies.newton.sliding import lay_boundary
 from quasiharmonic.energies.polishing import at_own_scale, energy_named, injective_array
-from quasiharmonic.geometry.curves.boundary_curves import Rails, Track
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
@@ -24,8 +24,8 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 NOT_FOUND = "there is no derivative of a map that was not found"
 
 
-@takes_mesh
-@takes_mesh
+@accepts_mesh
+@accepts_mesh
 def polish_derivative(
     V: ArrayLike,
     F: ArrayLike,
@@ -35,7 +35,7 @@ def polish_derivative(
     energy: str | Energy = "symmetric-dirichlet",
     weights: ArrayLike | None = None,
     linear_solver: str = "auto",
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
 ) -> Derivative:
     """Bring a polished map to rest to rounding, and differentiate it by held places and rest positions.
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import made_of_mesh
+from quasiharmonic.io.adapters.accepts_mesh import init_accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -126,7 +126,7 @@ class InverseMap(ReadOnly):
     def __init__(self, V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, overlapping: bool = False) -> None: ...
     @overload
     def __init__(self, V: MeshLike, uv: ArrayLike, *, overlapping: bool = False) -> None: ...
-    @made_of_mesh
+    @init_accepts_mesh
     def __init__(self, V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, overlapping: bool = False) -> None:
         true_or_false("overlapping", overlapping)
         certificate = certify(F, uv)

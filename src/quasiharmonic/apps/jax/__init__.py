@@ -27,7 +27,7 @@ from quasiharmonic.apps.gradients.layers import (
 )
 from quasiharmonic.apps.jax.callbacks import applied
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 
@@ -78,7 +78,7 @@ def injective_map(
     target: jax.Array | None = None,
     rest: jax.Array | None = None,
     polish: str | Energy = "symmetric-dirichlet",
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> jax.Array:

@@ -16,7 +16,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, counted
 
 
 @dataclass(frozen=True, eq=False)
-class Morphed:
+class MorphResult:
     """A planar mesh after its boundary has moved.
 
     Attributes

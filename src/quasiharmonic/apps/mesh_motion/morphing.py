@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.mesh_motion.midsides import carried, centred, followed, settled, sides
-from quasiharmonic.apps.mesh_motion.morphed import Morphed, forbidden_elements
+from quasiharmonic.apps.mesh_motion.morphed import MorphResult, forbidden_elements
 from quasiharmonic.apps.mesh_motion.quadrilaterals import made_convex
 from quasiharmonic.apps.mesh_motion.quality import element_quality
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding import moved_onto
 from quasiharmonic.energies.polishing import energy_named, polished
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.curves.curve import Curve
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import (
@@ -32,31 +32,31 @@ from quasiharmonic.geometry.mesh.elements import (
     turned_over,
 )
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import takes_planar_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_planar_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, check_range, index_array, map_array, named
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 
-@takes_planar_mesh
-@heard
+@accepts_planar_mesh
+@reports_progress
 def morph(
     points: ArrayLike,
     F: ArrayLike,
-    moved: ArrayLike,
+    moved_vertices: ArrayLike,
     positions: ArrayLike,
     *,
     energy: str | Energy | None = "symmetric-dirichlet",
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     rest: ArrayLike | None = None,
     start: ArrayLike | None = None,
     tolerance: float = 1e-8,
-) -> Morphed:
+) -> MorphResult:
     """Move some nodes of a planar mesh and place the others such that no element is inverted.
 
     Parameters
@@ -66,7 +66,7 @@ def morph(
     F : (f, 3), (f, 4) or (f, 6) array of int
         Triangles, quadrilaterals, or triangles of six nodes, wound either way, corners first (see
         `quasiharmonic.geometry.mesh.elements`). A quadrilateral whose last two nodes are one is a triangle.
-    moved : (k,) array of int
+    moved_vertices : (k,) array of int
         Nodes that go somewhere else: of the boundary, or inside. Boundary nodes not among them stay, but for mid-side
         nodes, which go along with the side that they are on.
     positions : (k, 2) array
@@ -81,13 +81,13 @@ def morph(
     callback : callable, optional
         Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
         not within a single factorisation.
-    slide : bool or Rails
+    slide : bool or BoundaryCurves
         Let the boundary vertices that are not moved glide along their outline, its corners held, as nodes on the walls
-        of a channel do: along the curves of `quasiharmonic.geometry.curves.Rails`, or with True along the polygon that
-        the boundary is. Moved ones slide only where ``Rails`` tell them a curve of their own.
+        of a channel do: along the curves of `quasiharmonic.geometry.curves.BoundaryCurves`, or with True along the
+        polygon that the boundary is. Moved ones slide only where ``BoundaryCurves`` tell them a curve of their own.
     rest : (n, 2) array, optional
         The mesh against which distortion is measured, ``points`` by default. In a chain of steps it is the first one,
-        so that the chain does not drift (`Morphed.drift`).
+        so that the chain does not drift (`MorphResult.drift`).
     start : (n, 2) array, optional
         A mesh near to the one sought, to begin from. By default that is ``points`` where ``rest`` is another, and else
         the harmonic extension of the displacement.
@@ -97,7 +97,7 @@ def morph(
 
     Returns
     -------
-    Morphed
+    MorphResult
         When no valid mesh was found, ``result.status`` says why, or ``inverted`` which elements are to blame.
 
     Raises
@@ -137,10 +137,10 @@ def morph(
     begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
     F = _counterclockwise(F, first)
     check_spread(F, len(points))
-    fixed, target = _placed(points, F, moved, positions)
+    fixed, target = _placed(points, F, moved_vertices, positions)
     question = _Question(F, first, fixed, nets_of(F))
     settings = _Settings(energy, max_iterations, linear_solver, callback, tolerance)
-    after, result = _answered(question, points, target, begin, (slide, np.asarray(moved)), settings)
+    after, result = _answered(question, points, target, begin, (slide, np.asarray(moved_vertices)), settings)
 
     def one_step() -> FloatArray:
         # Where the boundary has slid to, it is held.
@@ -151,7 +151,7 @@ def morph(
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, forbidden_elements(F, after, fixed))
     before, now = element_quality(F, points), element_quality(F, after)
-    return Morphed(after, F, inverted, forbidden, result, before, now, one_step)
+    return MorphResult(after, F, inverted, forbidden, result, before, now, one_step)
 
 
 class _Question(NamedTuple):
@@ -178,7 +178,7 @@ def _answered(
     points: FloatArray,
     target: FloatArray,
     begin: FloatArray | None,
-    slide: tuple[bool | Rails, IntArray],
+    slide: tuple[bool | BoundaryCurves, IntArray],
     settings: _Settings,
 ) -> tuple[FloatArray, MapResult]:
     """Places of all nodes by the first set of triangles that leaves no element inverted, or the best one.
@@ -192,7 +192,7 @@ def _answered(
         Where the given nodes go.
     begin : (n, 2) float64 or None
         What to begin with.
-    slide : (bool or Rails, (l,) int64)
+    slide : (bool or BoundaryCurves, (l,) int64)
         What the boundary slides along, and which nodes do not.
     settings : _Settings
     """
@@ -234,7 +234,7 @@ def _searched(
     points: FloatArray,
     target: FloatArray,
     begin: FloatArray | None,
-    slide: tuple[bool | Rails, IntArray],
+    slide: tuple[bool | BoundaryCurves, IntArray],
     settings: _Settings,
 ) -> tuple[FloatArray, MapResult]:
     """A map of some triangles, those at quadrilaterals' corners positive, and the mesh with its nodes there."""
@@ -262,7 +262,7 @@ def _searched(
     )
     if corners is not None and result.status is not Status.INTERRUPTED:
         result = made_convex(problem, result, corners, linear_solver=linear_solver)
-    if energy is not None and not flipped_triangles(own if corners is None else corners, result.uv).size:
+    if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
         result = polished(
             problem,
             result,
@@ -313,12 +313,14 @@ def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
     return np.where((turning < 0)[:, None], turned_over(F), F)
 
 
-def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayLike) -> tuple[IntArray, FloatArray]:
+def _placed(
+    points: FloatArray, F: IntArray, moved_vertices: ArrayLike, positions: ArrayLike
+) -> tuple[IntArray, FloatArray]:
     """Return the nodes that are given, those moved and the rest of the boundary, and where they go."""
-    given = index_array("moved", moved)
+    given = index_array("moved_vertices", moved_vertices)
     if given.ndim != 1:
-        raise ValueError(f"moved must have shape (k,), not {given.shape}")
-    check_range("moved", given, len(points))
+        raise ValueError(f"moved_vertices must have shape (k,), not {given.shape}")
+    check_range("moved_vertices", given, len(points))
     target = map_array("positions", positions, len(given), finite=False)
     check_finite("positions", "row", "rows", target)
     idle = given[~np.isin(given, F)]
@@ -334,20 +336,20 @@ def _placed(points: FloatArray, F: IntArray, moved: ArrayLike, positions: ArrayL
     return np.concatenate([given, left]), np.concatenate([target, there[left]])
 
 
-def _curves(slide: bool | Rails, triangles: IntArray, places: FloatArray) -> list[Curve]:
+def _curves(slide: bool | BoundaryCurves, triangles: IntArray, places: FloatArray) -> list[Curve]:
     """What the boundary of some triangles slides along."""
-    if isinstance(slide, Rails):
+    if isinstance(slide, BoundaryCurves):
         return slide.curves
     return [Curve.polygon(places[loop]) for loop in boundary_loops(triangles, len(places))]
 
 
-def _rails(slide: bool | Rails, problem: Problem, used: IntArray, moved: IntArray) -> bool | Rails:
+def _rails(slide: bool | BoundaryCurves, problem: Problem, used: IntArray, moved: IntArray) -> bool | BoundaryCurves:
     """What the boundary slides along, in the numbers of the vertices that triangles use; those moved are held."""
     held = np.searchsorted(used, moved)
-    if isinstance(slide, Rails):
+    if isinstance(slide, BoundaryCurves):
         return slide.among(used).holding(held)
     if slide is not True:
         return slide
     places = np.zeros((problem.n, 2))
     places[problem.fixed] = problem.target
-    return Rails.around(problem.domain.loops, places, held=held)
+    return BoundaryCurves.around(problem.domain.loops, places, fixed=held)

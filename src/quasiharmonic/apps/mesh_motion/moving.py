@@ -17,10 +17,10 @@ from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.energies.newton.boundary_continuation import CarryingDescent
 from quasiharmonic.energies.newton.sliding import SlidingDescent, SlidingSystem, lay_boundary
 from quasiharmonic.energies.polishing import at_own_scale, energy_named
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.elements import check_spread
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import made_of_planar_mesh
+from quasiharmonic.io.adapters.accepts_mesh import init_accepts_planar_mesh
 from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import (
@@ -53,7 +53,7 @@ class MovingMesh:
         The mesh at the start, valid: shapes and sizes of its triangles are what is kept. Every vertex belongs to one.
     F : (f, 3) array of int
         Triangles, wound either way.
-    moved : (k,) array of int
+    moved_vertices : (k,) array of int
         Vertices that will move, of the boundary or inside. Boundary vertices not among them stay.
     energy : str or Energy
         What is kept low; see `quasiharmonic.polish`. The default minds shapes more than sizes.
@@ -94,7 +94,7 @@ class MovingMesh:
         self,
         points: ArrayLike,
         F: ArrayLike,
-        moved: ArrayLike,
+        moved_vertices: ArrayLike,
         *,
         energy: str | Energy = "blend",
         settle: int = 1,
@@ -105,19 +105,19 @@ class MovingMesh:
     def __init__(
         self,
         points: MeshLike,
-        moved: ArrayLike,
+        moved_vertices: ArrayLike,
         *,
         energy: str | Energy = "blend",
         settle: int = 1,
         slide: bool = False,
         linear_solver: str = "auto",
     ) -> None: ...
-    @made_of_planar_mesh
+    @init_accepts_planar_mesh
     def __init__(
         self,
         points: ArrayLike,
         F: ArrayLike,
-        moved: ArrayLike,
+        moved_vertices: ArrayLike,
         *,
         energy: str | Energy = "blend",
         settle: int = 1,
@@ -132,10 +132,10 @@ class MovingMesh:
             raise ValueError(f"{named('triangle', 'triangles', flat)} without area: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         check_spread(F, len(self._points))
-        self._moved = index_array("moved", moved)
+        self._moved = index_array("moved_vertices", moved_vertices)
         if self._moved.ndim != 1:
-            raise ValueError(f"moved must have shape (k,), not {self._moved.shape}")
-        check_range("moved", self._moved, len(self._points))
+            raise ValueError(f"moved_vertices must have shape (k,), not {self._moved.shape}")
+        check_range("moved_vertices", self._moved, len(self._points))
         true_or_false("slide", slide)
         self._energy, self._slide = energy_named(energy), slide
         whole_number("settle", settle, least=1 if slide else 0)
@@ -145,7 +145,7 @@ class MovingMesh:
         self._linear_solver = linear_solver
         still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
         # Walls that nothing moves are those of the first mesh for good: gliding vertices do not cut their corners.
-        self._walls = Rails.around(still, self._points, held=self._moved) if slide and still else None
+        self._walls = BoundaryCurves.around(still, self._points, fixed=self._moved) if slide and still else None
         # In the mesh's own unit, so that no area leaves the numbers' range.
         exponent = np.frexp(np.abs(self._points).max())[1]
         a, b, c = np.ldexp(self._points, -exponent)[self._domain.F].transpose(1, 0, 2)
@@ -217,7 +217,7 @@ class MovingMesh:
         domain, rails = self._domain, self._walls
         mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in domain.loops)
         if rails is None or mixed:
-            rails = Rails.around(domain.loops, here, held=self._moved)
+            rails = BoundaryCurves.around(domain.loops, here, fixed=self._moved)
         track = lay_boundary(rails, domain, here)
         deformation, exponent = at_own_scale(domain, track.uv, self._energy, self._weights)
         descent = SlidingDescent(

@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.newton_descent import in_units
-from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
 from quasiharmonic.solver.methods.untangling import untangled
@@ -35,10 +35,10 @@ def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     Returns
     -------
     MapResult
-        With a stage more where steps were taken; `Status.SETTLED` where corners stay inverted after all, as few as were
+        With a stage more where steps were taken; `Status.STALLED` where corners stay inverted after all, as few as were
         found.
     """
-    before = flipped_triangles(corners, result.uv).size
+    before = inverted_triangles(corners, result.uv).size
     if not before:
         return result
     began, steps = time.perf_counter(), 0
@@ -52,16 +52,16 @@ def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
             break
     uv = np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
     uv[problem.fixed] = problem.target
-    after = flipped_triangles(corners, uv).size
+    after = inverted_triangles(corners, uv).size
     seconds = time.perf_counter() - began
     stage = Stage("untangling corners", steps, seconds, (before, after), (np.inf, np.inf), kept=after < before)
     stages = [*result.stages, stage]
     if after >= before:
-        return replace(result, status=Status.SETTLED, stages=stages, seconds=result.seconds + seconds)
+        return replace(result, status=Status.STALLED, stages=stages, seconds=result.seconds + seconds)
     return replace(
         result,
         uv=uv,
-        status=Status.SETTLED if after else Status.INJECTIVE,
+        status=Status.STALLED if after else Status.INJECTIVE,
         certificate=certify(problem.F, uv, loops=problem.domain.loops),
         stages=stages,
         seconds=result.seconds + seconds,

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.opening import opened_along
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array
 
 
-class Opened(NamedTuple):
+class CutMesh(NamedTuple):
     """A surface that was cut open.
 
     Attributes
@@ -31,8 +31,8 @@ class Opened(NamedTuple):
     origin: IntArray
 
 
-@takes_mesh
-def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain: float = np.inf) -> Opened:
+@accepts_mesh
+def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, min_gain: float = np.inf) -> CutMesh:
     """Cut a surface along edges into a disk, which has one boundary loop and fits into any outline without holes.
 
     Parameters
@@ -43,13 +43,13 @@ def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain
         Triangles of any number of surfaces, each of which becomes a disk. One that is a disk stays as it is.
     edges : (k, 2) array of int, optional
         Edges to be cut in any case.
-    gain : float
+    min_gain : float
         What cuts must be worth beyond those that make a disk, as `quasiharmonic.find_cuts` has it: 0.1
         for surfaces that are to lie flat with little distortion. By default there are no others.
 
     Returns
     -------
-    Opened
+    CutMesh
 
     Raises
     ------
@@ -58,5 +58,5 @@ def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, gain
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    opened, origin = opened_along(F, find_cuts(V, F, edges=edges, gain=gain), len(V))
-    return Opened(V[origin], opened, origin)
+    opened, origin = opened_along(F, find_cuts(V, F, edges=edges, min_gain=min_gain), len(V))
+    return CutMesh(V[origin], opened, origin)

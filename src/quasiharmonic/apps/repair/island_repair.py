@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.energies.polishing import polish_map
-from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.fans import fans, renumbered
 from quasiharmonic.geometry.mesh.seams import Island
@@ -86,10 +86,10 @@ class IslandRepair:
     @property
     def inverted(self) -> IntArray:
         """The island's triangles that are not strictly positive, ascending."""
-        return flipped_triangles(self._F, self.uv)
+        return inverted_triangles(self._F, self.uv)
 
     @property
-    def moved(self) -> BoolArray:
+    def moved_mask(self) -> BoolArray:
         """Which of the island's vertices are no longer where they were; (m,) bool."""
         return np.asarray((self.uv != self.island.uv).any(axis=1) & ~(np.isnan(self.uv).any(axis=1)))
 
@@ -106,7 +106,7 @@ class IslandRepair:
                     self._attempt(patch, _ITERATIONS, keep=True)
         if self._repairable().size:
             for part in self._components(~self._held):
-                if flipped_triangles(self._F[part[self._F].any(axis=1)], self.uv).size:
+                if inverted_triangles(self._F[part[self._F].any(axis=1)], self.uv).size:
                     self._attempt(part, self._max_iterations, keep=not whole)
         if self.inverted.size:
             self._explain()
@@ -224,7 +224,7 @@ class IslandRepair:
         around = self._F[patch[self._F].any(axis=1)]
         F, first = renumbered(fans(around)[0], around)
         found = certify(F, self.uv[around.ravel()[first]])
-        return bool(found.overwound.size and np.setdiff1d(found.overwound, np.concatenate(found.loops)).size)
+        return bool(found.multiply_wound.size and np.setdiff1d(found.multiply_wound, np.concatenate(found.loops)).size)
 
     def _explain(self) -> None:
         """Say why there still are inverted triangles, as far as no attempt has said it."""

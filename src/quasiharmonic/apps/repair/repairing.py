@@ -16,11 +16,11 @@ from quasiharmonic.apps.atlas.verdict import mirrored_islands
 from quasiharmonic.apps.repair.island_repair import IslandRepair
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.seams import Island, SeamedMesh, which_island
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_callback, counted, named, true_or_false, whole_number
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class RepairedIsland:
         Its triangles, ascending.
     inverted_before, inverted : (a,), (b,) int64
         Those that were not strictly positive, and those that are still not.
-    moved : (c,) int64
+    moved_vertices : (c,) int64
         Vertices that are in another place than before.
     mirrored : bool
         Whether every triangle was strictly negative, as in an island that was turned over on purpose, one of several.
@@ -49,7 +49,7 @@ class RepairedIsland:
     triangles: IntArray
     inverted_before: IntArray
     inverted: IntArray
-    moved: IntArray
+    moved_vertices: IntArray
     mirrored: bool
     bijective: bool
     reason: str = ""
@@ -65,13 +65,13 @@ class RepairedIsland:
         where = which_island(self.triangles)
         overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
         if self.mirrored:
-            done = "turned over" if self.moved.size else "mirrored, and left so"
+            done = "turned over" if self.moved_vertices.size else "mirrored, and left so"
             return f"{where}: {done}{overlap}"
         if not self.inverted_before.size:
             return f"{where}: nothing to repair{overlap}"
         done = (
             f"{len(self.inverted_before)} inverted before, {len(self.inverted)} now; "
-            f"{counted('vertex', 'vertices', len(self.moved))} moved"
+            f"{counted('vertex', 'vertices', len(self.moved_vertices))} moved"
         )
         left = f"; {named('triangle', 'triangles', self.inverted)} left. {self.reason}" if self.inverted.size else ""
         return f"{where}: {done}{overlap}{left}"
@@ -86,14 +86,14 @@ class RepairedIsland:
             "bijective": self.bijective,
             "inverted_before": self.inverted_before.tolist(),
             "inverted": self.inverted.tolist(),
-            "moved": self.moved.tolist(),
+            "moved_vertices": self.moved_vertices.tolist(),
             "reason": self.reason,
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
         }
 
 
 @dataclass(frozen=True, eq=False)
-class Repaired:
+class RepairResult:
     """A repaired map.
 
     Attributes
@@ -117,9 +117,11 @@ class Repaired:
         return bool(self.islands) and all(island.injective for island in self.islands)
 
     @property
-    def moved(self) -> IntArray:
+    def moved_vertices(self) -> IntArray:
         """Vertices of the mesh that are in another place than before, ascending."""
-        return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *(island.moved for island in self.islands)]))
+        return np.unique(
+            np.concatenate([np.empty(0, dtype=np.int64), *(island.moved_vertices for island in self.islands)])
+        )
 
     def summary(self) -> str:
         """What was done, in all and for each island that needed it."""
@@ -127,7 +129,7 @@ class Repaired:
         lines = [
             f"{counted('island', 'islands', len(self.islands))}: "
             f"{counted('triangle', 'triangles', before)} inverted before, {now} now; "
-            f"{counted('vertex', 'vertices', len(self.moved))} moved"
+            f"{counted('vertex', 'vertices', len(self.moved_vertices))} moved"
         ]
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
@@ -137,13 +139,13 @@ class Repaired:
             "injective": self.injective,
             "inverted_before": sum(len(island.inverted_before) for island in self.islands),
             "inverted": sum(len(island.inverted) for island in self.islands),
-            "moved": len(self.moved),
+            "moved_vertices": len(self.moved_vertices),
             "islands": [island.to_dict() for island in self.islands],
         }
 
 
-@takes_mesh
-@heard
+@accepts_mesh
+@reports_progress
 def repair(
     V: ArrayLike,
     F: ArrayLike,
@@ -155,7 +157,7 @@ def repair(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-) -> Repaired:
+) -> RepairResult:
     """Right the inverted triangles of a map; the boundary stays, and as much of the interior as can.
 
     Around inverted triangles, patches of growing size are mapped anew with their boundary held. Of a patch that
@@ -189,7 +191,7 @@ def repair(
 
     Returns
     -------
-    Repaired
+    RepairResult
         With the map and, island by island, what changed, certified exactly; and why, where triangles are still
         inverted: that is no exception.
 
@@ -207,7 +209,7 @@ def repair(
     >>> uv = V.copy()
     >>> uv[0] = [0.4, 0.1]
     >>> result = repair(V, F, uv)
-    >>> len(result.islands[0].inverted_before), result.injective, result.moved.tolist()
+    >>> len(result.islands[0].inverted_before), result.injective, result.moved_vertices.tolist()
     (2, True, [0])
     """
     whole_number("max_iterations", max_iterations, least=1)
@@ -234,7 +236,7 @@ def repair(
                     triangles=island.triangles,
                     inverted_before=before,
                     inverted=island.triangles[one.inverted],
-                    moved=np.unique(island.vertices[one.moved]),
+                    moved_vertices=np.unique(island.vertices[one.moved_mask]),
                     mirrored=False,
                     bijective=bool(certificate.bijective),
                     reason="" if certificate.injective else one.reason,
@@ -244,7 +246,7 @@ def repair(
         )
     mended = mesh.with_places([new for new, _ in done])
     assert mended.uv is not None
-    return Repaired(mended.uv, mended.FT, tuple(report for _, report in done))
+    return RepairResult(mended.uv, mended.FT, tuple(report for _, report in done))
 
 
 def _mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
@@ -253,13 +255,13 @@ def _mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
     if turn:
         uv[:, 0] = uv[:, 0].min() + uv[:, 0].max() - uv[:, 0]
     certificate = certify(island.F if turn else island.F[:, ::-1], uv)
-    wrong = np.sort(np.concatenate([certificate.flipped, certificate.degenerate]))
+    wrong = np.sort(np.concatenate([certificate.inverted, certificate.degenerate]))
     none = np.empty(0, dtype=np.int64)
     return uv, RepairedIsland(
         triangles=island.triangles,
         inverted_before=none,
         inverted=island.triangles[wrong],
-        moved=np.unique(island.vertices) if turn else none,
+        moved_vertices=np.unique(island.vertices) if turn else none,
         mirrored=True,
         bijective=bool(certificate.bijective),
         reason="Doubles have no room for it the other way around." if wrong.size else "",

@@ -26,7 +26,7 @@ from quasiharmonic.apps.gradients.layers import (
 )
 from quasiharmonic.apps.torch.function import applied
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 
@@ -77,7 +77,7 @@ def injective_map(
     target: torch.Tensor | None = None,
     rest: torch.Tensor | None = None,
     polish: str | Energy = "symmetric-dirichlet",
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> torch.Tensor:

@@ -41,7 +41,7 @@ class Landmarks:
 
 def landmarks_of(
     landmarks: ArrayLike,
-    moved: ArrayLike,
+    target: ArrayLike,
     weights: ArrayLike | None,
     curves: Sequence[CurvePair],
     step: float,
@@ -51,7 +51,7 @@ def landmarks_of(
 
     Parameters
     ----------
-    landmarks, moved, weights, curves
+    landmarks, target, weights, curves
         As of `quasiharmonic.warp_by_landmarks`.
     step : float
         Of points on curves, at most.
@@ -63,19 +63,19 @@ def landmarks_of(
     ValueError
         When they are malformed, outside of the picture, or at the same place.
     """
-    before, after = _points(landmarks, "landmarks"), _points(moved, "moved")
+    before, after = _points(landmarks, "landmarks"), _points(target, "target")
     if before.shape != after.shape:
-        raise ValueError(f"moved must have as many rows as landmarks, {len(before)}, not {len(after)}")
+        raise ValueError(f"target must have as many rows as landmarks, {len(before)}, not {len(after)}")
     weight = _weights(weights, len(before))
     _check_inside("landmarks", before, ((before >= 0) & (before <= size)).all(axis=1), size)
     edge = on_border(before, size)
     if np.array_equal(before[edge], after[edge]):
-        _check_inside("moved", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
+        _check_inside("target", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
     soft = np.flatnonzero(edge & ~np.isinf(weight))
     if soft.size:
         raise ValueError(f"weights: {named('landmark', 'landmarks', soft)} on the border, where all arrive exactly")
     _check_apart("landmarks", before)
-    _check_apart("moved", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
+    _check_apart("target", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
     for number, pair in enumerate(curves):
         if len(pair) != 2:
             raise ValueError(f"curve {number} must be two polylines, the one that goes and where to, not {len(pair)}")

@@ -26,7 +26,7 @@ LARGE = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Warped:
+class WarpResult:
     """A warped picture and the map that warped it.
 
     Attributes
@@ -37,7 +37,7 @@ class Warped:
         Vertices of a mesh of the picture, x to the right and y down, in pixels.
     F : (f, 3) int64
         Its triangles.
-    moved : (n, 2) float64
+    positions : (n, 2) float64
         Where they go.
     result : MapResult
         With the certificate; the warp folds nowhere if it is bijective.
@@ -46,21 +46,21 @@ class Warped:
     image: NDArray[Any]
     points: FloatArray
     F: IntArray
-    moved: FloatArray
+    positions: FloatArray
     result: MapResult
 
 
 def warp_by_landmarks(
     image: ArrayLike,
     landmarks: ArrayLike,
-    moved: ArrayLike,
+    target: ArrayLike,
     *,
     weights: ArrayLike | None = None,
     curves: Sequence[CurvePair] = (),
     smoothness: float | None = None,
     resolution: int = 48,
     energy: str | Energy = "symmetric-dirichlet",
-) -> Warped:
+) -> WarpResult:
     """Warp a picture such that landmarks go where they are told and nothing folds.
 
     The border stays, unless landmarks are on it: then it goes along, straight between one and the next. Corners count
@@ -73,7 +73,7 @@ def warp_by_landmarks(
     landmarks : (k, 2) array
         Points of the picture, x to the right and y down; the centre of the first pixel is (0, 0), and of the last
         (width − 1, height − 1).
-    moved : (k, 2) array
+    target : (k, 2) array
         Where they go. The picture keeps its size: what goes beyond is cut off, what nothing comes to is 0.
     weights : (k,) array, optional
         How much landmarks inside the picture count: each is missed where that costs less than getting there. To miss
@@ -93,7 +93,7 @@ def warp_by_landmarks(
 
     Returns
     -------
-    Warped
+    WarpResult
 
     Raises
     ------
@@ -119,7 +119,7 @@ def warp_by_landmarks(
     whole_number("resolution", resolution, least=2)
     length = 0.125 * float(size.max()) if smoothness is None else smoothness
     not_negative("smoothness", length)
-    given = landmarks_of(landmarks, moved, weights, curves, float(size.max()) / resolution, size)
+    given = landmarks_of(landmarks, target, weights, curves, float(size.max()) / resolution, size)
     if not length and not given.hard.all():
         raise ValueError("weights need a smoothness that is positive: without, a point pulls nothing along")
     before, after, edge = given.before, given.after, on_border(given.before, size)
@@ -132,7 +132,7 @@ def warp_by_landmarks(
     # Landmarks can pass each other: on the picture's own triangles what that costs is spread from the start.
     result = injective_map(points, F, fixed, target, reference="corrected", polish=None if length else energy)
     if result.certificate.crossings.size:
-        raise ValueError("moved: the border that goes along with the landmarks on it crosses itself")
+        raise ValueError("target: the border that goes along with the landmarks on it crosses itself")
     if not result.injective:
         raise RuntimeError(
             "no warp without folds was found: landmarks that go far past each other or the border leave no room "
@@ -141,11 +141,11 @@ def warp_by_landmarks(
     if length:
         pull = Pull(own[~held], after[~held], given.weights[~held])
         result = bend_map(Domain(points, F, fixed), result, energy=energy, length=length, pull=pull)
-    return Warped(warp_along(picture, points, F, result.uv), points, F, result.uv, result)
+    return WarpResult(warp_along(picture, points, F, result.uv), points, F, result.uv, result)
 
 
 def warp_along(
-    image: ArrayLike, points: ArrayLike, F: ArrayLike, moved: ArrayLike, *, shape: tuple[int, int] | None = None
+    image: ArrayLike, points: ArrayLike, F: ArrayLike, positions: ArrayLike, *, shape: tuple[int, int] | None = None
 ) -> NDArray[Any]:
     """Draw a picture where a planar map takes it.
 
@@ -157,7 +157,7 @@ def warp_along(
         A mesh over the picture or a part of it, in pixels.
     F : (f, 3) array of int
         Its triangles.
-    moved : (n, 2) array
+    positions : (n, 2) array
         Where the mesh goes, bijectively.
     shape : (int, int), optional
         Height and width of the result; the picture's by default.
@@ -181,8 +181,8 @@ def warp_along(
     if height < 1 or width < 1:
         raise ValueError(f"shape must be positive, not {shape}")
     rest = map_array("points", points)
-    map_array("moved", moved, len(rest))
-    inverse = InverseMap(rest, F, moved)
+    map_array("positions", positions, len(rest))
+    inverse = InverseMap(rest, F, positions)
     source = _sources(inverse, height, width)
     channels = picture.reshape(*picture.shape[:2], -1)
     layers = [np.ascontiguousarray(channels[..., k], dtype=_drawable(picture.dtype)) for k in range(channels.shape[2])]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 S = TypeVar("S")
 
@@ -42,7 +42,7 @@ def _half(t: float, value: float) -> float:
 def backtrack(
     trial: Trial[S],
     before: float,
-    promise: float,
+    expected_decrease: float,
     *,
     longest: float = 1.0,
     tries: int,
@@ -56,7 +56,7 @@ def backtrack(
         See `Trial`.
     before : float
         The function's value at the start.
-    promise : float
+    expected_decrease : float
         The rate at which it falls along the direction, to first order; positive.
     longest : float
         The first length.
@@ -72,8 +72,8 @@ def backtrack(
     """
     t = longest
     for _ in range(tries):
-        still_at_it()
-        value, there = trial(t, before - _SUFFICIENT * min(t, 1.0) * promise)
+        heartbeat()
+        value, there = trial(t, before - _SUFFICIENT * min(t, 1.0) * expected_decrease)
         if there is not None:
             return Taken(t, value, there)
         t *= factor(t, value)
@@ -95,7 +95,7 @@ def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf"), *, lon
         How many times as long the next length is; above 1.
     """
     while taken.t >= 1 and longer * taken.t <= limit:
-        still_at_it()
+        heartbeat()
         value, there = trial(longer * taken.t, taken.value)
         if there is None:
             break

@@ -60,7 +60,7 @@ def _out_of_units(w: ComplexArray, exponent: int) -> FloatArray:
     return np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
 
 
-class Lowered(Protocol):
+class NewtonObjective(Protocol):
     """What `NewtonDescent` asks of an energy: a barrier on a mesh, such as `DeformationEnergy`.
 
     What ``deform`` makes of a map is handed to the other methods as it is, and is nobody else's concern.
@@ -118,7 +118,9 @@ class NewtonDescent:
         Of the unit of computation.
     """
 
-    def __init__(self, energy: Lowered, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str) -> None:
+    def __init__(
+        self, energy: NewtonObjective, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
+    ) -> None:
         self.energy = energy
         self.fixed, self._pinned = fixed, uv[fixed]
         self.exponent = exponent
@@ -161,19 +163,19 @@ class NewtonDescent:
         gradient = self.gradient()
         # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
-            direction, promise, newton = self._direction(gradient, negative)
-            small = newton and 0.5 * promise <= tolerance * (self.value + _NOTHING)
+            direction, expected_decrease, newton = self._direction(gradient, negative)
+            small = newton and 0.5 * expected_decrease <= tolerance * (self.value + _NOTHING)
             if small and negative < 0 and self._cut:
                 continue  # the reflected model is pessimistic: only the clamped one may declare an end
             if small and negative == 0 and self.value > _STRETCHED:
                 # The model as it is has the last word, if it has a lowest point that doubles can tell.
                 true, further, newton = self._direction(gradient, 1.0, SHIFTS[:1])
                 if not newton:
-                    self._search(direction, promise)
+                    self._search(direction, expected_decrease)
                     return Status.EXHAUSTED
-                direction, promise, small = true, further, 0.5 * further <= tolerance * self.value
+                direction, expected_decrease, small = true, further, 0.5 * further <= tolerance * self.value
             before = self.value
-            moved = self._search(direction, promise)
+            moved = self._search(direction, expected_decrease)
             if small and negative == 0 and not before - self.value > _MORE * tolerance * before:
                 return Status.POLISHED
             if moved:
@@ -187,7 +189,7 @@ class NewtonDescent:
         if isinstance(self.energy, DeformationEnergy):
             self.energy.check_numbers(self._deformation)
 
-    def lower(self, energy: Lowered) -> None:
+    def lower(self, energy: NewtonObjective) -> None:
         """Go on with another energy on the same triangles."""
         self.energy = energy
         self.system.take_gradients(energy.g)
@@ -214,9 +216,9 @@ class NewtonDescent:
         skipped = self._shift if self._cut and shifts is SHIFTS else 0
         found = self.system.descent(gradient, shifts[skipped:], self.solve)
         if found is not None:
-            direction, promise, tried = found
+            direction, expected_decrease, tried = found
             self._shift = skipped + tried
-            return direction, promise, True
+            return direction, expected_decrease, True
         self._check_numbers()
         if shifts is SHIFTS:
             self._shift = len(SHIFTS) - 1
@@ -231,7 +233,7 @@ class NewtonDescent:
         """The displacement of the free vertices under a load on them, the matrix being factored."""
         return self.system.solve(load)
 
-    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
+    def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
         """The energy of a map (n,) complex128, and the map with what was made of it if it may be gone on from: if its
         energy is below a bound and every triangle, exactly, positive.
         """
@@ -240,9 +242,9 @@ class NewtonDescent:
         accepted = value < bound and is_injective(self.energy.F, self.positions(w))
         return value, (w, deformation) if accepted else None
 
-    def _search(self, direction: ComplexArray, promise: float) -> bool:
+    def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
         """Move along a direction, as far as is good; False where no step lowers the energy enough."""
-        if not promise > 0:
+        if not expected_decrease > 0:
             return False
         full = np.zeros_like(self.w)
         full[self.system.free] = direction
@@ -250,13 +252,15 @@ class NewtonDescent:
         start, before = self.w, self.value
 
         def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-            return self.tried(start + t * full, bound)
+            return self.evaluate_trial(start + t * full, bound)
 
-        taken = backtrack(trial, before, promise, longest=min(1.0, limit), tries=HALVINGS)
+        taken = backtrack(trial, before, expected_decrease, longest=min(1.0, limit), tries=HALVINGS)
         if taken is None:
             # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
             doublings = int(np.count_nonzero(2.0 ** np.arange(1, HALVINGS) <= limit))
-            taken = backtrack(trial, before, promise, longest=2.0, tries=doublings, factor=lambda t, value: 2.0)
+            taken = backtrack(
+                trial, before, expected_decrease, longest=2.0, tries=doublings, factor=lambda t, value: 2.0
+            )
         if taken is None:
             return False
         self._cut = taken.t < _SHORT

@@ -18,7 +18,7 @@ from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
 from quasiharmonic.linsolve.pattern import stiffness_pattern
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
 from quasiharmonic.util.kernels import compiled
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -107,7 +107,7 @@ class NewtonSystem:
         form : QuadraticForm
             On every triangle, with its area and weight in it.
         """
-        still_at_it()
+        heartbeat()
         pp, qq = (np.ascontiguousarray(field, dtype=np.float64) for field in (form.pp, form.qq))
         rest = form.p2, form.q2, form.pq, form.pqc
         p2, q2, pq, pqc = (np.ascontiguousarray(field, dtype=np.complex128) for field in rest)
@@ -182,7 +182,7 @@ class NewtonSystem:
         Returns
         -------
         direction : (n - k,) complex128
-        promise : float
+        expected_decrease : float
             The rate at which the energy falls along it (the squared decrement); not negative.
         number : int
             Of the shift that did. Instead of all three, None where no shift leaves a positive definite matrix.
@@ -193,9 +193,9 @@ class NewtonSystem:
                 direction = (solve or self.solve)(-gradient)
             except NotPositiveDefinite:
                 continue
-            promise = -work(gradient, direction)
-            if promise >= 0:
-                return direction, promise, number
+            expected_decrease = -work(gradient, direction)
+            if expected_decrease >= 0:
+                return direction, expected_decrease, number
         return None
 
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:

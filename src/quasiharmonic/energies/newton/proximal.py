@@ -131,8 +131,8 @@ class NearDescent(NewtonDescent):
             xx, xy, yy = (block[self.system.free] / length**2 for block in blocks)
             self.system.add_blocks(xx, xy, yy)
 
-    def tried(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """As `NewtonDescent.tried`, of the energy with the distance to the others."""
+    def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
+        """As `NewtonDescent.evaluate_trial`, of the energy with the distance to the others."""
         deformation = self.energy.deform(w)
         mean = self.energy.value_of(deformation)
         value = mean + self._apart(w)

@@ -28,9 +28,9 @@ from quasiharmonic.energies.energies import Deformation, QuadraticForm, damped
 from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
 from quasiharmonic.energies.newton.newton_descent import FRACTION, HALVINGS, SHIFTS, NewtonDescent, in_units
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.geometry.curves.boundary_curves import Rails, Track, rails_of
-from quasiharmonic.geometry.curves.deviation import Straying
-from quasiharmonic.geometry.exact.certificate import flipped_triangles, is_injective
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track, rails_of
+from quasiharmonic.geometry.curves.deviation import DeviationBarrier
+from quasiharmonic.geometry.exact.certificate import inverted_triangles, is_injective
 from quasiharmonic.geometry.exact.loops import judge_loops
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import Status
@@ -40,31 +40,31 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
 _WEIGHT = 1e-2
 
 
-def lay_boundary(slide: bool | Rails, domain: Domain, uv: FloatArray) -> Track:
+def lay_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) -> Track:
     """Put the boundary of an injective map onto the curves it is to slide along.
 
     Raises
     ------
     ValueError
-        As `Rails.lay`; when triangles are inverted by the way onto the curves.
+        As `BoundaryCurves.lay`; when triangles are inverted by the way onto the curves.
     """
     track = rails_of(slide, domain.loops, uv).lay(domain.loops, uv)
-    flipped = flipped_triangles(domain.F, track.uv)
-    if flipped.size:
+    inverted = inverted_triangles(domain.F, track.uv)
+    if inverted.size:
         raise ValueError(
-            f"with the boundary on the curves to slide along, {named('triangle', 'triangles', flipped)} inverted or "
+            f"with the boundary on the curves to slide along, {named('triangle', 'triangles', inverted)} inverted or "
             "without area: let it be there from the start (injective_map with slide, or qhm map --slide)"
         )
     return track
 
 
-def moved_onto(slide: bool | Rails, problem: Problem) -> Problem:
+def moved_onto(slide: bool | BoundaryCurves, problem: Problem) -> Problem:
     """The problem with its boundary's target on the curves that it is to slide along."""
     places = np.zeros((problem.n, 2))
     places[problem.fixed] = problem.target
     loops = problem.domain.loops
     track = rails_of(slide, loops, places).lay(loops, places)
-    return problem.moved(track.uv[problem.fixed])
+    return problem.with_target(track.uv[problem.fixed])
 
 
 #: A map in units, lengths along the curves, the map's Jacobians, and its energy without the barrier.
@@ -157,7 +157,7 @@ class SlidingDescent(NewtonDescent):
 
     Attributes
     ----------
-    straying, weight : Straying, float
+    deviation_barrier, weight : Straying, float
         The barrier and its factor, in the energy's units.
     forces : (k,) float64
         What the curves' bends add to the second derivative by each sliding vertex's length, in units.
@@ -177,14 +177,14 @@ class SlidingDescent(NewtonDescent):
     ) -> None:
         self._earlier = system
         self._track, self._s, self._loops = track, track.s, list(loops)
-        self.straying = Straying(track, self._loops)
+        self.deviation_barrier = DeviationBarrier(track, self._loops)
         super().__init__(energy, track.uv, np.setdiff1d(fixed, track.vertices), exponent, linear_solver)
         self._energies = self.value, self.value
         self._weigh()
         self.first = self.value
-        both = (self.straying.pairs >= 0).all(axis=1)
+        both = (self.deviation_barrier.pairs >= 0).all(axis=1)
         self._both = np.flatnonzero(both)
-        self.system.couple(self.straying.pairs[both])
+        self.system.couple(self.deviation_barrier.pairs[both])
         # A map that is injective and no more may overlap itself further.
         self._simple = not judge_loops(self._loops, track.uv)[1]
 
@@ -202,7 +202,7 @@ class SlidingDescent(NewtonDescent):
     def _weigh(self) -> None:
         """Give the barrier its part of the energy at hand, which only falls."""
         self.weight = _WEIGHT * self._energies[1]
-        self.value = self._energies[1] + self.weight * self.straying.value(self._s)
+        self.value = self._energies[1] + self.weight * self.deviation_barrier.value(self._s)
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step; a status where there is no other to take."""
@@ -232,11 +232,11 @@ class SlidingDescent(NewtonDescent):
 
     def _barrier(self) -> tuple[FloatArray, FloatArray]:
         """The barrier's derivatives: by the sliding vertices' lengths, in units, and edge by edge (e, 2, 2)."""
-        by_ends, by_both = self.straying.derivatives(self._s)
+        by_ends, by_both = self.deviation_barrier.derivatives(self._s)
         unit = self.weight * 2.0**self.exponent
         slopes = np.zeros(self._s.size)
         for end in (0, 1):
-            number = self.straying.pairs[:, end]
+            number = self.deviation_barrier.pairs[:, end]
             np.add.at(slopes, number[number >= 0], unit * by_ends[number >= 0, end])
         return slopes, unit * 2.0**self.exponent * by_both
 
@@ -246,20 +246,20 @@ class SlidingDescent(NewtonDescent):
         system = self.system
         system.bend = damped(self.forces, negative)
         for end in (0, 1):
-            number = self.straying.pairs[:, end]
+            number = self.deviation_barrier.pairs[:, end]
             np.add.at(system.bend, number[number >= 0], self._bends[number >= 0, end, end])
-        moves = (system.tangent[self.straying.pairs[self._both]] != 0).all(axis=1)
+        moves = (system.tangent[self.deviation_barrier.pairs[self._both]] != 0).all(axis=1)
         system.coupling = np.where(moves, self._bends[self._both, 0, 1], 0)
-        direction, promise, newton = super()._direction(gradient, negative, shifts)
+        direction, expected_decrease, newton = super()._direction(gradient, negative, shifts)
         wrong = direction[system.at].real * self._side < 0
         if wrong.any():
-            promise += float(np.sum((gradient[system.at] * direction[system.at]).real[wrong]))
+            expected_decrease += float(np.sum((gradient[system.at] * direction[system.at]).real[wrong]))
             direction[system.at[wrong]] = 0
-        return direction, promise, newton
+        return direction, expected_decrease, newton
 
-    def _search(self, direction: ComplexArray, promise: float) -> bool:
+    def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
         """Move along a direction, as far as is good; False where no step lowers the energy enough."""
-        if not promise > 0:
+        if not expected_decrease > 0:
             return False
         at, vertices = self.system.at, self._track.vertices
         full = np.zeros_like(self.w)
@@ -282,7 +282,7 @@ class SlidingDescent(NewtonDescent):
 
             return trial
 
-        taken = backtrack(going((False, True)), self.value, promise, longest=min(1.0, limit), tries=HALVINGS)
+        taken = backtrack(going((False, True)), self.value, expected_decrease, longest=min(1.0, limit), tries=HALVINGS)
         if taken is None:
             return False
         self._cut = taken.t < 1
@@ -294,10 +294,10 @@ class SlidingDescent(NewtonDescent):
         self, w: ComplexArray, s: FloatArray, step: FloatArray, bound: float, *, stop: bool
     ) -> tuple[float, _State | None]:
         """The energy with the boundary moved along its curves, and the state there if that is good."""
-        there = self._track.moved(s, step, stop=stop)
-        if stop and np.array_equal(there, self._track.moved(s, step)):
+        there = self._track.advance(s, step, stop=stop)
+        if stop and np.array_equal(there, self._track.advance(s, step)):
             return np.inf, None  # no kink in the way, and this has been tried
-        barrier = self.weight * self.straying.value(there)
+        barrier = self.weight * self.deviation_barrier.value(there)
         if barrier == np.inf or not self._track.in_order(there):
             return np.inf, None
         w[self._track.vertices] = in_units(self._track.position(there), self.exponent)

@@ -30,7 +30,7 @@ import numpy as np
 
 from quasiharmonic.geometry.coarsening.removal import by_degree, fill_rings, remove_vertices, room_for_round
 from quasiharmonic.util.arrays import BoolArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # Where so small a share of the vertices is all that a round can take out, it is the last.
 _FEW = 0.04
@@ -97,7 +97,7 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
     levels: dict[int, IntArray] = {}
     left, halved = n, 2 * n
     while left > goal:
-        still_at_it()
+        heartbeat()
         if left < _SPARSE * len(names):
             # Numbers for those that are left alone, in the same order.
             T = (np.cumsum(there) - 1).take(T)

@@ -11,7 +11,7 @@ import numpy as np
 from quasiharmonic.geometry.coarsening.levels import Coarsening
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # A triangle's squared sides over twice its area are 2√3 = 3.5 when it is equilateral. Below this on average a vertex
 # has a good place.
@@ -44,7 +44,7 @@ def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> Complex
     w = w.copy()
     for number in reversed(range(len(coarsening.rounds))):
         for vertices, rings in coarsening.rounds[number]:
-            still_at_it()
+            heartbeat()
             w[vertices] = places(w.take(rings))
         if number in coarsening.levels:
             smooth(w, coarsening.levels[number], held)

@@ -5,7 +5,7 @@ edges of the boundary may be from their curve.
 """
 
 from quasiharmonic.geometry.curves.arcs import Arc
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.curves.curve import Curve
 
-__all__ = ["Arc", "Curve", "Rails"]
+__all__ = ["Arc", "BoundaryCurves", "Curve"]

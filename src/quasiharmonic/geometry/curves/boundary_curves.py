@@ -26,7 +26,7 @@ from quasiharmonic.util.arrays import (
 _THERE = 2.0**-51
 
 
-class Rails:
+class BoundaryCurves:
     """The outline that boundary vertices slide along: what ``slide=`` takes.
 
     Vertices at corners stay, the others glide between them in their order. A vertex not quite on its curve is moved
@@ -40,7 +40,7 @@ class Rails:
     on : mapping from int to int, optional
         Boundary vertices that are told their curve, by its number. All others are on the curve nearest to them, or, if
         none is near, stay where they are.
-    held : sequence of int
+    fixed : sequence of int
         Boundary vertices that stay although they could slide.
     corner_angle : float
         Degrees by which a curve turns at a corner, at the least. The ends of an open curve are corners too; a closed
@@ -57,8 +57,8 @@ class Rails:
     --------
     The vertices of a disk's boundary may go around on the circle; of a square, those on its sides slide:
 
-    >>> round_ = Rails([Curve.circle()])
-    >>> square = Rails([[(0, 0), (1, 0), (1, 1), (0, 1)]])
+    >>> round_ = BoundaryCurves([Curve.circle()])
+    >>> square = BoundaryCurves([[(0, 0), (1, 0), (1, 1), (0, 1)]])
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Rails:
         curves: Iterable[Curve | ArrayLike] | Curve,
         *,
         on: Mapping[int, int] | None = None,
-        held: ArrayLike = (),
+        fixed: ArrayLike = (),
         corner_angle: float = 20.0,
         tolerance: float = 1e-3,
     ) -> None:
@@ -83,7 +83,7 @@ class Rails:
         vertices, numbers = index_array("on", list(on)), index_array("on", list(on.values()))
         check_range("on", numbers, len(self.curves), "curve", "curves")
         self.on: dict[int, int] = dict(zip(vertices.tolist(), numbers.tolist(), strict=True))
-        self.held = index_array("held", held).ravel()
+        self.fixed = index_array("fixed", fixed).ravel()
         if not 0 <= corner_angle <= 180:
             raise ValueError(f"corner_angle is between 0 and 180 degrees, not {corner_angle}")
         if not 0 <= tolerance < 1:
@@ -91,27 +91,27 @@ class Rails:
         self.corner_angle, self.tolerance = float(corner_angle), float(tolerance)
 
     @classmethod
-    def around(cls, loops: Sequence[IntArray], uv: FloatArray, *, held: ArrayLike = ()) -> Rails:
+    def around(cls, loops: Sequence[IntArray], uv: FloatArray, *, fixed: ArrayLike = ()) -> BoundaryCurves:
         """The polygons of boundary loops in a map (n, 2), each vertex told its own."""
         loops = loop_arrays(loops, len(uv))
         on = {int(v): k for k, loop in enumerate(loops) for v in loop}
-        return cls([uv[loop] for loop in loops], on=on, held=held)
+        return cls([uv[loop] for loop in loops], on=on, fixed=fixed)
 
-    def holding(self, vertices: IntArray) -> Rails:
+    def holding(self, vertices: IntArray) -> BoundaryCurves:
         """The same with further vertices that stay, unless they are told a curve."""
-        return self._with(self.on, np.union1d(self.held, np.setdiff1d(vertices, index_array("on", list(self.on)))))
+        return self._with(self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on)))))
 
-    def among(self, used: IntArray) -> Rails:
+    def among(self, used: IntArray) -> BoundaryCurves:
         """The same for a mesh of some of the vertices, ascending."""
-        known = np.concatenate([index_array("on", list(self.on)), self.held])
+        known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
         if absent.size:
             raise ValueError(f"{named('vertex', 'vertices', absent)} of the rails in no triangle")
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
-        return self._with(on, np.searchsorted(used, self.held))
+        return self._with(on, np.searchsorted(used, self.fixed))
 
-    def _with(self, on: Mapping[int, int], held: IntArray) -> Rails:
-        return Rails(self.curves, on=on, held=held, corner_angle=self.corner_angle, tolerance=self.tolerance)
+    def _with(self, on: Mapping[int, int], fixed: IntArray) -> BoundaryCurves:
+        return BoundaryCurves(self.curves, on=on, fixed=fixed, corner_angle=self.corner_angle, tolerance=self.tolerance)
 
     def lay(self, loops: Sequence[IntArray], uv: FloatArray) -> Track:
         """Find every boundary vertex its place.
@@ -132,7 +132,7 @@ class Rails:
         boundary = np.concatenate(loops)
         curve, s = self._found(boundary, uv)
         corners = [self._corners(one, uv[boundary]) for one in self.curves]
-        slides = ~np.isin(boundary, self.held)
+        slides = ~np.isin(boundary, self.fixed)
         slides[[member for taken in corners for member in taken]] = False
         places, chains = uv.copy(), []
         for k, (one, taken) in enumerate(zip(self.curves, corners, strict=True)):
@@ -145,7 +145,7 @@ class Rails:
             members = members[np.argsort(along[members], kind="stable")]
             chain = Chain(one, boundary[members], along[members], slides[members])
             _check_order(chain, k, loops, len(uv))
-            moves = (slides[members] | np.isin(members, at_corners)) & ~np.isin(chain.vertices, self.held)
+            moves = (slides[members] | np.isin(members, at_corners)) & ~np.isin(chain.vertices, self.fixed)
             _move(places, chain.vertices[moves], one.position(chain.s[moves]))
             chains.append(chain)
         return Track(chains, places)
@@ -176,7 +176,7 @@ class Rails:
         """The curve of each boundary vertex, -1 for none, and where along it."""
         told = index_array("on", list(self.on))
         check_range("on", told, len(uv))
-        check_range("held", self.held, len(uv))
+        check_range("fixed", self.fixed, len(uv))
         inner = np.setdiff1d(told, boundary)
         if inner.size:
             raise ValueError(f"{named('vertex', 'vertices', inner)} told a curve, but not on the boundary")
@@ -203,13 +203,13 @@ class Rails:
         return curve, s
 
 
-def rails_of(slide: bool | Rails, loops: Sequence[IntArray], uv: FloatArray) -> Rails:
-    """What ``slide=`` means: `Rails` themselves, or True for the polygons of the boundary as it is."""
-    if isinstance(slide, Rails):
+def rails_of(slide: bool | BoundaryCurves, loops: Sequence[IntArray], uv: FloatArray) -> BoundaryCurves:
+    """What ``slide=`` means: `BoundaryCurves` themselves, or True for the polygons of the boundary as it is."""
+    if isinstance(slide, BoundaryCurves):
         return slide
     if slide is True:
-        return Rails.around(loops, uv)
-    raise ValueError(f"slide must be True or Rails, not {kind_of(slide)}")
+        return BoundaryCurves.around(loops, uv)
+    raise ValueError(f"slide must be True or BoundaryCurves, not {kind_of(slide)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,9 +289,9 @@ class Track:
             tangent[part][curve.barred(s[part], forward[part])] = 0
         return tangent, curvature
 
-    def moved(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
-        """Places after a step along the curves, as `Curve.moved` has it."""
-        return np.concatenate([curve.moved(s[part], step[part], stop=stop) for curve, part in self._parts()])
+    def advance(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
+        """Places after a step along the curves, as `Curve.advance` has it."""
+        return np.concatenate([curve.advance(s[part], step[part], stop=stop) for curve, part in self._parts()])
 
     def at_kink(self, s: FloatArray) -> BoolArray:
         """Who is at a kink, or at the end of an open curve."""
@@ -334,5 +334,5 @@ def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> Non
             i, j = loop[wrong[0]], np.roll(loop, -1)[wrong[0]]
             raise ValueError(
                 f"boundary vertices {i} and {j} follow each other around the surface but not along curve {k}: put them "
-                "in order, or, where curves come close, tell vertices theirs (Rails, on=)"
+                "in order, or, where curves come close, tell vertices theirs (BoundaryCurves, on=)"
             )

@@ -212,7 +212,7 @@ class Curve:
         piece = np.where(back, (piece - 1) % self._degree.size, piece)
         return self._direction(piece, np.where(back, 1.0, t))
 
-    def moved(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
+    def advance(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
         """Go along the curve, around if it is closed, to its end if it is not.
 
         Parameters

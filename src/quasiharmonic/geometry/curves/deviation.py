@@ -28,7 +28,7 @@ _ALLOWED = 1.2
 _STRAIGHT = 1e-18
 
 
-class Straying:
+class DeviationBarrier:
     """The barrier of all edges between neighbours on a curve, by the sliding vertices' lengths.
 
     Parameters

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import Certificate, certify, flipped_triangles
+from quasiharmonic.geometry.exact.certificate import Certificate, certify, inverted_triangles
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.util.arrays import FloatArray, IntArray, unchangeable
 
@@ -40,7 +40,7 @@ def certify_each(
     triangles = np.cumsum([0, *map(len, F)])
     places = np.concatenate(uv)
     good = np.array([len(rims) == 1 for rims in loops]) & (np.diff(triangles) > 0)
-    bad = flipped_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), places)
+    bad = inverted_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), places)
     good[np.searchsorted(triangles, bad, side="right") - 1] = False
     alone = np.flatnonzero(good)
     if alone.size:
@@ -56,14 +56,14 @@ def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certif
     none = np.empty(0, dtype=np.int64)
     return Certificate(
         triangles=len(F),
-        flipped=none,
+        inverted=none,
         degenerate=none.copy(),
         nonfinite=none.copy(),
         bijective=True,
         reasons=(),
         loops=tuple(loop.copy() for loop in loops),
         crossings=np.empty((0, 4), dtype=np.int64),
-        overwound=none.copy(),
+        multiply_wound=none.copy(),
         F=unchangeable(F),
         uv=uv.copy(),
     )

@@ -66,19 +66,19 @@ class Certificate(ReadOnly, Displayable):
     ----------
     triangles : int
         Number of triangles judged.
-    flipped, degenerate, nonfinite : (k,) int64
+    inverted, degenerate, nonfinite : (k,) int64
         Ascending indices of the triangles that are clockwise, that have exactly no area (a repeated
         vertex included), and that have a NaN or infinite coordinate and so no orientation.
     bijective : bool or None
         Whether the map is injective and covers no point twice; None when it was not asked for.
     reasons : tuple of Reason
-        Why the map is not bijective. The loops are judged also where triangles are flipped.
+        Why the map is not bijective. The loops are judged also where triangles are inverted.
     loops : tuple of (l,) int64
         Boundary vertices, loop by loop, the surface to the left.
     crossings : (m, 4) int64
         Rows ``i, j, k, l``: the boundary edges ``i → j`` and ``k → l`` share a point that they should
         not share. At most 1000 are listed.
-    overwound : (k,) int64
+    multiply_wound : (k,) int64
         Vertices, all triangles around them positive, whose angles add up to more than 2π. Around an interior vertex
         they then wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
     F : (f, 3) int64
@@ -90,19 +90,19 @@ class Certificate(ReadOnly, Displayable):
     Where all triangles around a vertex are positive, the map is locally injective at it if and only if their angles add
     up to 2π, around an interior vertex, or to less than 2π, at a boundary vertex. Around an interior vertex the sum is
     a multiple of 2π. At a boundary vertex it may be 2π exactly: then the two boundary edges there lie on each other,
-    which `crossings` has, and the vertex is not overwound. This is decided exactly; where the boundary was not judged
-    (`bijective` is None), or the mesh is not a surface, `overwound` is empty.
+    which `crossings` has, and the vertex is not multiply_wound. This is decided exactly; where the boundary was not
+    judged (`bijective` is None), or the mesh is not a surface, `multiply_wound` is empty.
     """
 
     triangles: int
-    flipped: IntArray
+    inverted: IntArray
     degenerate: IntArray
     nonfinite: IntArray
     bijective: bool | None
     reasons: tuple[Reason, ...]
     loops: tuple[IntArray, ...]
     crossings: IntArray
-    overwound: IntArray
+    multiply_wound: IntArray
     F: IntArray
     uv: FloatArray
 
@@ -113,18 +113,18 @@ class Certificate(ReadOnly, Displayable):
         return (
             self.F,
             self.uv,
-            self.flipped,
+            self.inverted,
             self.degenerate,
             self.nonfinite,
             self.crossings,
-            self.overwound,
+            self.multiply_wound,
             *self.loops,
         )
 
     @property
     def injective(self) -> bool:
         """Whether there are triangles and every one is strictly positive."""
-        return self.triangles > 0 and not (self.flipped.size or self.degenerate.size or self.nonfinite.size)
+        return self.triangles > 0 and not (self.inverted.size or self.degenerate.size or self.nonfinite.size)
 
     def summary(self) -> str:
         """Say in a sentence or two what is certified, or what is wrong and where."""
@@ -133,7 +133,7 @@ class Certificate(ReadOnly, Displayable):
             all_of_them = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
             said = f"Injective: {all_of_them} positive."
         elif self.triangles:
-            counted = _counted(self.flipped, self.degenerate, self.nonfinite)
+            counted = _counted(self.inverted, self.degenerate, self.nonfinite)
             said = f"Not injective: of {self.triangles} triangles, {counted}."
         else:
             return "Not injective: there are no triangles."
@@ -145,7 +145,7 @@ class Certificate(ReadOnly, Displayable):
         return f"{said} Not bijective{'' if self.injective else ' either'}: {'; '.join(further[:3])}{more}."
 
     def short_repr(self) -> str:
-        bad = self.flipped.size + self.degenerate.size + self.nonfinite.size
+        bad = self.inverted.size + self.degenerate.size + self.nonfinite.size
         triangles = counted("triangle", "triangles", self.triangles)
         if bad or not self.triangles:
             return f"not injective, {bad:,} of {triangles} not positive"
@@ -163,13 +163,13 @@ class Certificate(ReadOnly, Displayable):
             "injective": self.injective,
             "bijective": self.bijective,
             "triangles": self.triangles,
-            "flipped": self.flipped.tolist(),
+            "inverted": self.inverted.tolist(),
             "degenerate": self.degenerate.tolist(),
             "nonfinite": self.nonfinite.tolist(),
             "reasons": [{"kind": r.kind.value, "text": r.text, "loops": list(r.loops)} for r in self.reasons],
             "loops": [{"start": int(loop[0]), "length": len(loop)} for loop in self.loops],
             "crossings": self.crossings.tolist(),
-            "overwound": self.overwound.tolist(),
+            "multiply_wound": self.multiply_wound.tolist(),
             "summary": self.summary(),
         }
 
@@ -184,17 +184,17 @@ def certify(
     if given == [] and len(F):
         raise ValueError("loops has no boundary loop: leave it out to have the loops found")
     sign, nonfinite = triangle_signs(F, uv)
-    flipped = degenerate = np.empty(0, dtype=np.int64)
+    inverted = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []
     if not len(F):
         reasons.append(Reason(Obstacle.NO_TRIANGLES, "there are no triangles"))
     elif sign.min() <= 0:
-        flipped = np.flatnonzero(sign < 0)
+        inverted = np.flatnonzero(sign < 0)
         degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
-        text = f"of {len(F)} triangles, {_counted(flipped, degenerate, nonfinite)}"
+        text = f"of {len(F)} triangles, {_counted(inverted, degenerate, nonfinite)}"
         reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
     known: list[IntArray] = []
-    crossings, overwound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
+    crossings, multiply_wound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
     if boundary and len(F):
         known, broken = _loops(F, len(uv)) if given is None else (given, [])
         reasons += broken
@@ -202,23 +202,23 @@ def certify(
         # counterclockwise and winds once around what it encloses, and nothing is left to ask.
         plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
         if not broken and not plain:
-            overwound = overwound_vertices(F, uv, sign, known)
+            multiply_wound = overwound_vertices(F, uv, sign, known)
             if np.isfinite(uv[np.concatenate(known)]).all():
                 crossings, found = judge_loops(known, uv)
                 reasons += found
-        if overwound.size:
-            text = f"triangles wind more than once around {named('vertex', 'vertices', overwound)}"
-            reasons.append(Reason(Obstacle.OVERWOUND, text))
+        if multiply_wound.size:
+            text = f"triangles wind more than once around {named('vertex', 'vertices', multiply_wound)}"
+            reasons.append(Reason(Obstacle.MULTIPLY_WOUND, text))
     return Certificate(
         triangles=len(F),
-        flipped=flipped,
+        inverted=inverted,
         degenerate=degenerate,
         nonfinite=nonfinite,
         bijective=not reasons if boundary else None,
         reasons=tuple(reasons),
         loops=tuple(known),
         crossings=crossings,
-        overwound=overwound,
+        multiply_wound=multiply_wound,
         F=F,
         uv=uv,
     )
@@ -230,8 +230,8 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     return len(F) > 0 and bool(triangle_signs(F, uv)[0].min() > 0)
 
 
-def flipped_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
-    """The triangles of an array that are not strictly positive; as `quasiharmonic.flipped_triangles`."""
+def inverted_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
+    """The triangles of an array that are not strictly positive; as `quasiharmonic.inverted_triangles`."""
     return np.flatnonzero(triangle_signs(*_taken(F, uv))[0] <= 0)
 
 
@@ -269,11 +269,11 @@ def _is_rounded(given: Any, places: FloatArray, vertex: int, axis: int) -> bool:
     return not isinstance(number, float | np.floating) and int(number) != int(places[vertex, axis])
 
 
-def _counted(flipped: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
+def _counted(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
     """Count and name the triangles that are not positive, by what is wrong with them."""
     return ", ".join(
         f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({listed(bad.tolist())})"
-        for bad, what in ((flipped, "flipped"), (degenerate, "degenerate"), (nonfinite, "not finite"))
+        for bad, what in ((inverted, "inverted"), (degenerate, "degenerate"), (nonfinite, "not finite"))
         if bad.size
     )
 

@@ -149,7 +149,7 @@ def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
 
 
 class Triangulation:
-    """Triangles of a convex polygon that are flipped one by one.
+    """Triangles of a convex polygon that are inverted one by one.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class Obstacle(StrEnum):
     INTERSECTION = "intersection"
     WINDING = "winding"
     NESTING = "nesting"
-    OVERWOUND = "overwound"
+    MULTIPLY_WOUND = "multiply_wound"
 
 
 @dataclass(frozen=True)

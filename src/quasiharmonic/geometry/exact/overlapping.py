@@ -6,7 +6,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import box_pairs, orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 
 def lying_on_others(F: IntArray, uv: FloatArray) -> IntArray:
@@ -34,7 +34,7 @@ def lying_on_others(F: IntArray, uv: FloatArray) -> IntArray:
     found = np.zeros(len(F), dtype=np.bool_)
     corners = uv[F]
     for i, j in box_pairs(corners.min(axis=1), corners.max(axis=1)):
-        still_at_it()
+        heartbeat()
         one, other = corners[i], corners[j]
         apart = _parted_by_a_side(one, other)
         apart[~apart] = _parted_by_a_side(other[~apart], one[~apart])

@@ -31,7 +31,7 @@ from scipy.sparse import csr_array
 
 from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # From so many vertices together distances are taken in what is around them all, ...
 _AT_A_TIME = 64
@@ -88,7 +88,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
         edge = twin[edge]
         inner = edge >= 0
         edge, source, a, b, low, high = edge[inner], source[inner], a[inner], b[inner], low[inner], high[inner]
-        still_at_it()
+        heartbeat()
         # Across the edge, which is traversed from ``b`` to ``a`` there.
         c = b + height[edge] * (a - b)
         left, right = _cross(low, c) > 0, _cross(c, high) > 0
@@ -185,7 +185,7 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
 def _portions(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
     """Sources in portions, and where each portion begins."""
     for start in range(0, sources.size, _AT_A_TIME):
-        still_at_it()
+        heartbeat()
         yield start, sources[start : start + _AT_A_TIME]
 
 

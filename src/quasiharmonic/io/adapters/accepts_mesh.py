@@ -21,7 +21,7 @@ R_co = TypeVar("R_co", covariant=True)
 Path = str | PathLike[str]
 
 
-class TakesMesh(Protocol[P, R_co]):
+class AcceptsMesh(Protocol[P, R_co]):
     """A function of ``V``, ``F`` and further arguments, or of a mesh and these."""
 
     @overload
@@ -30,7 +30,7 @@ class TakesMesh(Protocol[P, R_co]):
     def __call__(self, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
 
 
-class WritesMesh(Protocol[P, R_co]):
+class WriterAcceptsMesh(Protocol[P, R_co]):
     """A function of a file to write, ``V``, ``F`` and further arguments, or of a file, a mesh and these."""
 
     @overload
@@ -39,7 +39,7 @@ class WritesMesh(Protocol[P, R_co]):
     def __call__(self, path: Path, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
 
 
-class TakesPlanarMesh(Protocol[P, R_co]):
+class AcceptsPlanarMesh(Protocol[P, R_co]):
     """A function of ``points``, ``F`` and further arguments, or of a mesh in the plane and these."""
 
     @overload
@@ -48,28 +48,28 @@ class TakesPlanarMesh(Protocol[P, R_co]):
     def __call__(self, mesh: MeshLike, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
 
 
-def takes_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesMesh[P, R]:
+def accepts_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsMesh[P, R]:
     """Let a function whose first two arguments are ``V`` and ``F`` take one mesh in their place."""
     return _taking(function, 0)
 
 
-def writes_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R]) -> WritesMesh[P, R]:
+def writer_accepts_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R]) -> WriterAcceptsMesh[P, R]:
     """Let a function whose arguments after a path are ``V`` and ``F`` take one mesh in their place."""
     return _taking(function, 1)
 
 
-def takes_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> TakesPlanarMesh[P, R]:
+def accepts_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsPlanarMesh[P, R]:
     """Let a function whose first two arguments are ``points`` and elements ``F`` of a plane take one mesh instead."""
     return _taking(function, 0, planar_cells)
 
 
-def made_of_mesh(init: Callable[..., None]) -> Callable[..., None]:
+def init_accepts_mesh(init: Callable[..., None]) -> Callable[..., None]:
     """Let an ``__init__`` whose arguments after ``self`` are ``V`` and ``F`` take one mesh in their place."""
     made: Callable[..., None] = _taking(init, 1)
     return made
 
 
-def made_of_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
+def init_accepts_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
     """Let an ``__init__`` whose arguments after ``self`` are ``points`` and ``F`` of a plane take one mesh instead."""
     made: Callable[..., None] = _taking(init, 1, planar_cells)
     return made

@@ -61,7 +61,8 @@ class Document:
     def numbers(self, index: int) -> NDArray[Any]:
         """What an accessor refers to, (count, width), of the type in the file; raises one of `DAMAGE`."""
         accessor = self.tree["accessors"][whole(index)]
-        kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        kind = np.dtype(_look_up(accessor, "componentType", _KINDS, index))
+        width = _look_up(accessor, "type", _WIDTHS, index)
         count, sparse = whole(accessor["count"]), accessor.get("sparse")
         if "bufferView" in accessor:
             table = self._rows(accessor, count, kind, width)
@@ -71,7 +72,7 @@ class Document:
             table = np.zeros((count, width), dtype=kind)
         if sparse is not None:
             many, of = whole(sparse["count"]), sparse["indices"]
-            rows = self._rows(of, many, np.dtype(_KINDS[of["componentType"]]), 1)[:, 0]
+            rows = self._rows(of, many, np.dtype(_look_up(of, "componentType", _KINDS, index)), 1)[:, 0]
             table[rows] = self._rows(sparse["values"], many, kind, width)
         return table
 
@@ -238,6 +239,15 @@ def whole(value: object) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
         raise ValueError(f"{ascii(value)[:40]} where a whole number should be")
     return value
+
+
+def _look_up(accessor: dict[str, Any], name: str, table: dict[Any, Any], index: int) -> Any:
+    """What an entry of an accessor stands for; `ValueError` for a value that is not in the table."""
+    value = accessor[name]
+    if value not in table:
+        choices = ", ".join(map(str, table))
+        raise ValueError(f"{name} of accessor {index} must be one of {choices}, not {ascii(value)[:40]}")
+    return table[value]
 
 
 def _no_number(word: str) -> float:

@@ -280,7 +280,7 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
             continue
         seen.add(index)
         node = nodes[index]
-        here = above @ _local(node)
+        here = above @ _local(node, index)
         if "mesh" in node:
             # A skin says where its vertices are, and the node does not.
             placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
@@ -288,17 +288,28 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
     return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
 
 
-def _local(node: dict[str, Any]) -> FloatArray:
+def _local(node: dict[str, Any], index: int) -> FloatArray:
     """The matrix of a node."""
     if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+        return _numbers(node, "matrix", [0] * 16, index).reshape(4, 4).T
     matrix = np.eye(4)
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
+    x, y, z, w = _numbers(node, "rotation", [0, 0, 0, 1], index)
     rotation = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, :3] = np.array(rotation) * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    matrix[:3, :3] = np.array(rotation) * _numbers(node, "scale", [1, 1, 1], index)
+    matrix[:3, 3] = _numbers(node, "translation", [0, 0, 0], index)
     return matrix
+
+
+def _numbers(node: dict[str, Any], name: str, default: list[int], index: int) -> FloatArray:
+    """The numbers of a node's entry, as many as its default has; `ValueError` for anything else."""
+    values = node.get(name, default)
+    if not isinstance(values, list) or len(values) != len(default):
+        count = f"{len(values)}" if isinstance(values, list) else ascii(values)[:40]
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {count}")
+    if not all(isinstance(value, int | float) for value in values):
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {ascii(values)[:40]}")
+    return np.array(values, dtype=np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, box_pairs_between, segment_relation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # Segments that are taken at a time.
 _SEGMENTS = 1 << 14
@@ -45,7 +45,7 @@ def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positio
         part = order[start : start + _SEGMENTS]
         a, b, (first, last) = p[part], q[part], ends[part].T
         met = np.zeros(len(part), dtype=bool)
-        still_at_it()
+        heartbeat()
         for i, j in box_pairs_between(np.minimum(a, b), np.maximum(a, b), low, high):
             spent += i.size
             if spent > most:

@@ -18,7 +18,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.loops import Contacts, contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # More meeting pairs than this are not collected: a target that is this entangled needs no full list.
 MOST_CONTACTS = 10_000
@@ -47,7 +47,7 @@ def turning_number(loop: FloatArray) -> int:
     return int(passes.sum())
 
 
-class BoundaryCurves:
+class TargetCurves:
     """The boundary loops of a surface at their positions in the plane.
 
     Parameters
@@ -137,7 +137,7 @@ class BoundaryCurves:
         when = [self._when(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)]
         steps: list[dict[tuple[int, Fraction], int]] = [{} for _ in self.loops]
         for k in sorted(range(len(edge)), key=lambda k: (edge[k], when[k])):
-            still_at_it()
+            heartbeat()
             # What is crossed at the same point is crossed at once.
             along = steps[self.loop_of[edge[k]]]
             at = (int(edge[k]), when[k])
@@ -150,7 +150,7 @@ class BoundaryCurves:
 
     def _when(self, edge: int, other: int) -> Fraction:
         """Where along an edge another crosses it, from 0 at its tail to 1 at its head."""
-        still_at_it()
+        heartbeat()
         (px, py), (qx, qy), (rx, ry), (sx, sy) = (
             tuple(map(Fraction, self.positions[vertex].tolist())) for vertex in (*self.ends[edge], *self.ends[other])
         )
@@ -176,7 +176,7 @@ class Corners:
         Boundary vertices.
     """
 
-    def __init__(self, curves: BoundaryCurves) -> None:
+    def __init__(self, curves: TargetCurves) -> None:
         n = len(curves.positions)
         self.known = np.zeros(n, dtype=bool)
         self.before, self.after = np.full((2, n), -1)

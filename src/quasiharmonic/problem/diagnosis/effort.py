@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 
 class EffortSpentError(Exception):
@@ -34,7 +34,7 @@ class Effort:
         EffortSpentError
             When there is not so much left; from then on at every call.
         """
-        still_at_it()
+        heartbeat()
         self.spent += amount
         if self.spent > self.most:
             raise EffortSpentError

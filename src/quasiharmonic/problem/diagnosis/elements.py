@@ -14,7 +14,7 @@ from quasiharmonic.geometry.exact.loops import winding
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis.curves import BoundaryCurves
+from quasiharmonic.problem.diagnosis.curves import TargetCurves
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices, smallest_conflict
 from quasiharmonic.util.arrays import named, named_edges
@@ -29,7 +29,7 @@ def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]
         yield Obstruction(Kind.COLLAPSED_EDGE, Forbids.INJECTIVE, message, vertices=edge, edges=edge)
 
 
-def inverted_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
+def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
     """Triangles with three fixed vertices that the target itself inverts or flattens."""
     whole = np.flatnonzero(fixture.fixed[problem.F].all(axis=1))
     corners = problem.F[whole]
@@ -89,7 +89,7 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
         )
 
 
-def misplaced_pins(problem: Problem, fixture: Fixture, curves: BoundaryCurves, proper: bool) -> Iterator[Obstruction]:
+def misplaced_pins(problem: Problem, fixture: Fixture, curves: TargetCurves, proper: bool) -> Iterator[Obstruction]:
     """Pins that the map cannot reach.
 
     As many interior vertices can be pinned to a position as the boundary winds around it; where it
@@ -99,7 +99,7 @@ def misplaced_pins(problem: Problem, fixture: Fixture, curves: BoundaryCurves, p
     ----------
     problem : Problem
     fixture : Fixture
-    curves : BoundaryCurves
+    curves : TargetCurves
     proper : bool
         Whether the curves are simple and properly nested.
     """

@@ -8,13 +8,13 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis.curves import BoundaryCurves, Corners
+from quasiharmonic.problem.diagnosis.curves import Corners, TargetCurves
 from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.problem.diagnosis.elements import (
     collapsed_edges,
     half_planes,
+    inverted_fixed_triangles,
     inverted_patches,
-    inverted_triangles,
     misplaced_pins,
 )
 from quasiharmonic.problem.diagnosis.fixture import Fixture, stars
@@ -78,7 +78,7 @@ def diagnose(problem: Problem) -> Diagnosis:
        Vision, Graphics, and Image Processing 35 (1986).
     """
     fixture = Fixture.of(problem)
-    curves = BoundaryCurves(fixture.positions, problem.domain.loops)
+    curves = TargetCurves(fixture.positions, problem.domain.loops)
     euler = problem.n - len(problem.domain.edges.interior) - len(problem.domain.edges.boundary) + len(problem.F)
     area = _twice_area(fixture, curves)
     if area < 0 and _fits_mirrored(curves, euler):
@@ -92,7 +92,7 @@ def diagnose(problem: Problem) -> Diagnosis:
     found = list(_global(problem, curves, euler, area))
     found += misplaced_pins(problem, fixture, curves, proper)
     found += collapsed_edges(problem, fixture)
-    found += inverted_triangles(problem, fixture)
+    found += inverted_fixed_triangles(problem, fixture)
     found += inverted_patches(problem, fixture)
     chords, corners = fixture.chords, None
     if proper:
@@ -116,7 +116,7 @@ def diagnose(problem: Problem) -> Diagnosis:
 
 
 def _unplaced(
-    problem: Problem, fixture: Fixture, curves: BoundaryCurves, corners: Corners | None, walls: IntArray
+    problem: Problem, fixture: Fixture, curves: TargetCurves, corners: Corners | None, walls: IntArray
 ) -> tuple[list[Obstruction], list[str]]:
     """Free vertices for which there is no place, and what was left unchecked about them."""
     around = stars(problem, fixture, curves.folds)
@@ -137,21 +137,21 @@ def _unplaced(
     return found, [f"whether a place sees the fixed neighbours of {which}"] * bool(passed_over)
 
 
-def _twice_area(fixture: Fixture, curves: BoundaryCurves) -> int:
+def _twice_area(fixture: Fixture, curves: TargetCurves) -> int:
     """Twice the signed area around which the boundary winds, in squared units of the lattice."""
     tails, heads = fixture.points(curves.ends[:, 0]), fixture.points(curves.ends[:, 1])
     return sum(px * qy - py * qx for (px, py), (qx, qy) in zip(tails, heads, strict=True))
 
 
-def _fits_mirrored(curves: BoundaryCurves, euler: int) -> bool:
+def _fits_mirrored(curves: TargetCurves, euler: int) -> bool:
     """Whether the reflected target passes the conditions on whole curves."""
-    mirrored = BoundaryCurves(curves.positions * [-1.0, 1.0], curves.loops)
+    mirrored = TargetCurves(curves.positions * [-1.0, 1.0], curves.loops)
     if mirrored.turning is None or sum(mirrored.turning) < euler:
         return False
     return mirrored.winding_range is None or bool((mirrored.winding_range[:, 0] >= 0).all())
 
 
-def _proper(curves: BoundaryCurves) -> bool:
+def _proper(curves: TargetCurves) -> bool:
     """Whether the loops are simple, disjoint, and nested as holes in one outer loop."""
     if not curves.simple or curves.turning is None or curves.winding_range is None:
         return False
@@ -159,13 +159,13 @@ def _proper(curves: BoundaryCurves) -> bool:
     return curves.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
 
 
-def _global(problem: Problem, curves: BoundaryCurves, euler: int, area: int) -> Iterator[Obstruction]:
+def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> Iterator[Obstruction]:
     """Obstructions by the loops as a whole.
 
     Parameters
     ----------
     problem : Problem
-    curves : BoundaryCurves
+    curves : TargetCurves
     euler : int
         Euler characteristic of the surface.
     area : int
@@ -201,7 +201,7 @@ def _global(problem: Problem, curves: BoundaryCurves, euler: int, area: int) -> 
     yield from _meetings(curves)
 
 
-def _misnested(curves: BoundaryCurves, euler: int) -> Obstruction:
+def _misnested(curves: TargetCurves, euler: int) -> Obstruction:
     """Simple disjoint loops that are not holes in one outer loop."""
     assert curves.winding_range is not None
     assert curves.turning is not None
@@ -219,7 +219,7 @@ def _misnested(curves: BoundaryCurves, euler: int) -> Obstruction:
     return Obstruction(Kind.NESTING, forbids, message, loops=wrong)
 
 
-def _meetings(curves: BoundaryCurves) -> Iterator[Obstruction]:
+def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
     """Where the curves fold, cross or touch; forbids bijective maps only."""
     if curves.folds.size:
         message = f"At the boundary {named_vertices(curves.folds)} the target goes back the way it came."
@@ -244,7 +244,7 @@ def _meetings(curves: BoundaryCurves) -> Iterator[Obstruction]:
         )
 
 
-def _unchecked(curves: BoundaryCurves, proper: bool) -> Iterator[str]:
+def _unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
     """Conditions that were left out, and why."""
     if proper:
         return

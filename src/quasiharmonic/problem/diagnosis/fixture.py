@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import Convex, Lattice, line
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Fixture:
         Edges of length zero have no left side and are passed over.
         """
         for p, q in zip(self.points(edges[:, 0]), self.points(edges[:, 1]), strict=True):
-            still_at_it()
+            heartbeat()
             if area is None:
                 return None
             if p != q:

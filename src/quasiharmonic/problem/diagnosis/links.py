@@ -26,7 +26,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.triangulation import triangulate
 from quasiharmonic.problem.diagnosis.clipping import MARGIN
 from quasiharmonic.util.arrays import IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 Point = tuple[int, int, int]
 """Homogeneous coordinates, the last positive."""
@@ -99,7 +99,7 @@ class Polygon:
         """
         window = [(self._points[start], self._at[start])]
         for count in range(1, limit + 1):
-            still_at_it()
+            heartbeat()
             ways = [self._shortest(point, t, goal) for point, t in window]
             common = _common_end(ways)
             if common == 1 or any(len(way) == common for way in ways):

@@ -15,7 +15,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import Convex, Walls
-from quasiharmonic.problem.diagnosis.curves import MOST_CONTACTS, BoundaryCurves, Corners
+from quasiharmonic.problem.diagnosis.curves import MOST_CONTACTS, Corners, TargetCurves
 from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices, smallest_conflict
@@ -26,7 +26,7 @@ from quasiharmonic.util.arrays import IntArray, named_edges
 _APART = 8
 
 
-def bad_chords(problem: Problem, fixture: Fixture, curves: BoundaryCurves, corner: Corners) -> Iterator[Obstruction]:
+def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner: Corners) -> Iterator[Obstruction]:
     """Interior edges with both ends fixed that do not lie strictly inside, free of all else that is fixed."""
     chords, where = fixture.chords, fixture.positions
     if not len(chords):

@@ -156,7 +156,7 @@ def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certifi
     """The fixed vertices nearest to triangles that are not positive, ascending."""
     from scipy.spatial import cKDTree
 
-    bad = np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
+    bad = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
     if not bad.size:
         return bad
     # Of magnitude about one, so that distances neither over- nor underflow.

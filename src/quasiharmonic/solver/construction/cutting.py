@@ -12,7 +12,7 @@ from quasiharmonic.solver.construction.sheet import Sheet
 from quasiharmonic.solver.construction.sides import along_sides
 from quasiharmonic.solver.construction.walks import walk
 from quasiharmonic.util.arrays import ComplexArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 
 class TooManyError(Exception):
@@ -74,7 +74,7 @@ class Cutting:
 
     def _cut(self, a: int, b: int) -> None:
         """Cut target and sheet from one point of the target to another."""
-        still_at_it()
+        heartbeat()
         if self._most is not None and len(self.sheet.parents) > self._most:
             raise TooManyError
         self._closed |= {(a, b), (b, a)}

@@ -7,19 +7,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.methods import Patches, RandomRestarts, Untangling
+from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 # How often weights are renewed: as the areas to this power, and no further from each other than by this factor.
 _RENEWALS, _POWER, _SPAN = 4, 0.5, 1e6
 # What rights the last triangles, where vertices on cuts may move too; each has its limit, for doubles may have no room.
-_REPAIRS = Patches(tries=30), Untangling(iterations=200), RandomRestarts(in_vain=20, tries=20)
+_REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(in_vain=20, tries=20)
 
 
 def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:
@@ -69,9 +69,9 @@ def embedded(problem: Problem, w: ComplexArray, held: IntArray) -> ComplexArray:
     """
     best, least = w, len(problem.F) + 1
     for now in _candidates(problem, w, held):
-        flipped = flipped_triangles(problem.F, problem.positions(now)).size
-        if flipped < least:
-            best, least = now, flipped
+        inverted = inverted_triangles(problem.F, problem.positions(now)).size
+        if inverted < least:
+            best, least = now, inverted
         if least == 0:
             break
     return best
@@ -86,9 +86,9 @@ def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[C
         except NotPositiveDefinite:
             break
         yield w
-        flipped = flipped_triangles(problem.F, problem.positions(w)).size
-        if flipped < least:
-            best, least = w, flipped
+        inverted = inverted_triangles(problem.F, problem.positions(w)).size
+        if inverted < least:
+            best, least = w, inverted
         # What is crowded gets softer springs.
         areas = np.abs(signed_areas(problem.F, w))
         weights = weights * np.clip(areas / areas.max(), 1 / _SPAN, 1.0) ** _POWER

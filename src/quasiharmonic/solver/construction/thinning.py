@@ -20,7 +20,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.solver.construction.halfedges import HalfEdges, Triangle
 from quasiharmonic.solver.methods.local_repair import Patch
 from quasiharmonic.util.arrays import ComplexArray, IntArray
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 # Rounding of a determinant relative to the sum of its terms' magnitudes, with room.
 _FLAT = 1e-15
@@ -75,7 +75,7 @@ class Thinning:
         waiting = set(self.left)
         while waiting:
             for vertex in sorted(waiting, reverse=True):
-                still_at_it()
+                heartbeat()
                 waiting.discard(vertex)
                 cut = self._without(vertex, self._in_map)
                 if cut is not None:
@@ -100,7 +100,7 @@ class Thinning:
         bool
             Whether it was taken out; if not all is as before.
         """
-        still_at_it()
+        heartbeat()
         cut = self._without(vertex, self._bent)
         if cut is None:
             return False

@@ -173,13 +173,13 @@ class Iterate:
         """All that the descent of V₃ asks for, in one pass over the triangles."""
         everything = np.array([0, self.xi.size])
         sums, gradient = sweep(self.objective.mesh, self.field.parameterisation, self.xi, self.w, everything)
-        flipped, energy, area, covered = sums[0].tolist()
-        return _Sweep(int(flipped), energy, area if area > 0 else covered, gradient)
+        inverted, energy, area, covered = sums[0].tolist()
+        return _Sweep(int(inverted), energy, area if area > 0 else covered, gradient)
 
     @property
-    def flipped(self) -> int:
+    def inverted(self) -> int:
         """Number of triangles whose image's area is not positive, in floating point."""
-        return self._sweep.flipped
+        return self._sweep.inverted
 
     @property
     def dirichlet(self) -> float:
@@ -209,7 +209,7 @@ class Iterate:
 
 
 class _Sweep(NamedTuple):
-    flipped: int
+    inverted: int
     dirichlet: float
     area: float
     gradient: ComplexArray

@@ -10,8 +10,8 @@ from quasiharmonic.solver.methods.alternating import Alternating
 from quasiharmonic.solver.methods.base import Descent
 from quasiharmonic.solver.methods.composite import Composite
 from quasiharmonic.solver.methods.lbfgs import LBFGS
-from quasiharmonic.solver.methods.line_shift import Combing
-from quasiharmonic.solver.methods.local_repair import Patches
+from quasiharmonic.solver.methods.line_shift import LineShift
+from quasiharmonic.solver.methods.local_repair import LocalRepair
 from quasiharmonic.solver.methods.newton import Newton
 from quasiharmonic.solver.methods.random_restarts import RandomRestarts
 from quasiharmonic.solver.methods.untangling import Untangling
@@ -20,11 +20,11 @@ from quasiharmonic.solver.methods.vector_adam import VectorAdam
 __all__ = [
     "LBFGS",
     "Alternating",
-    "Combing",
     "Composite",
     "Descent",
+    "LineShift",
+    "LocalRepair",
     "Newton",
-    "Patches",
     "RandomRestarts",
     "Untangling",
     "VectorAdam",

@@ -25,7 +25,7 @@ Iterates: TypeAlias = Generator[Iterate, None, bool]
 
 
 @dataclass(frozen=True)
-class SoFar:
+class SearchState:
     """What a search has found before a stage begins.
 
     Attributes
@@ -34,16 +34,16 @@ class SoFar:
         The caller's first map, for the very first stage.
     best_map : (n,) complex128
         The map of the fewest inverted triangles.
-    deepest : Iterate or None
+    lowest_energy : Iterate or None
         The one of the lowest V₃ among those that tensors were descended to.
     """
 
     given: ComplexArray | None
     best_map: ComplexArray
-    deepest: Iterate | None
+    lowest_energy: Iterate | None
 
 
-class Runner(Protocol):
+class StageRunner(Protocol):
     """What a stage asks of the search that runs it. Either call says how the search stands after the stage."""
 
     def attempt(self, stage: Descent, before: Status) -> Status:
@@ -52,7 +52,7 @@ class Runner(Protocol):
     def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
         """Search on a coarse mesh, beginning with what the stage ``begins_with``, and carry the map to the mesh."""
 
-    def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
+    def attempt_tentatively(self, stage: Descent, before: Status) -> Status:
         """Descend on the mesh itself; where that finds no map, later stages go on from where this one began."""
 
     def attempt_where_many(self, stage: Descent, before: Status) -> Status:
@@ -81,7 +81,7 @@ class SearchStage(ABC):
         """The first descent, on whichever mesh."""
 
     @abstractmethod
-    def run(self, search: Runner, before: Status) -> Status:
+    def run(self, search: StageRunner, before: Status) -> Status:
         """Have a search run this stage; how the search stands afterwards."""
 
 
@@ -117,7 +117,7 @@ class Descent(SearchStage):
         """Itself."""
         return self
 
-    def run(self, search: Runner, before: Status) -> Status:
+    def run(self, search: StageRunner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.attempt(self, before)
 
@@ -134,7 +134,7 @@ class Descent(SearchStage):
         return Objective(problem, linear_solver=linear_solver)
 
     @abstractmethod
-    def start(self, objective: Objective, found: SoFar) -> Iterate:
+    def start(self, objective: Objective, found: SearchState) -> Iterate:
         """Where the stage begins.
 
         Raises
@@ -184,10 +184,10 @@ class Patience:
         self._most, self._progress = limits or (np.inf, 0.0)
         self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
 
-    def is_over(self, flipped: int, value: float) -> bool:
+    def is_over(self, inverted: int, value: float) -> bool:
         """Whether too many steps in a row have righted no triangle and lowered the objective by too little."""
-        if flipped < self._flipped or value < self._low_enough:
-            self._flipped, self._value = min(flipped, self._flipped), min(value, self._value)
+        if inverted < self._flipped or value < self._low_enough:
+            self._flipped, self._value = min(inverted, self._flipped), min(value, self._value)
             # V₄ may be negative.
             fraction = self._progress * abs(self._value) if np.isfinite(self._value) else 0.0
             self._low_enough = self._value - fraction
@@ -254,9 +254,9 @@ class TensorDescent(Descent):
         """What is descended: V₃."""
         return Objective(problem, "dirichlet", self.parameterisation, self.reference, linear_solver)
 
-    def start(self, objective: Objective, found: SoFar) -> Iterate:
+    def start(self, objective: Objective, found: SearchState) -> Iterate:
         """At the caller's map if there is one, at the tensors of the lowest V₃ so far, or at ξ = 0."""
-        best = found.deepest if self.resume else None
+        best = found.lowest_energy if self.resume else None
         if found.given is not None:
             return objective.near_map(found.given)
         if best is None:
@@ -306,14 +306,14 @@ class VertexDescent(Descent):
 
     moves_vertices: ClassVar[bool] = True
 
-    def start(self, objective: Objective, found: SoFar) -> Iterate:
+    def start(self, objective: Objective, found: SearchState) -> Iterate:
         """At the map of the fewest inverted triangles, or at Tutte's embedding."""
-        if self.resume and found.deepest is not None:
-            return objective.of_map(self.resumed(found.best_map, found.deepest))
+        if self.resume and found.lowest_energy is not None:
+            return objective.of_map(self.resumed(found.best_map, found.lowest_energy))
         if found.given is not None:
             return objective.near_map(found.given)
         return objective.evaluate(np.zeros(len(objective.problem.F), dtype=np.complex128))
 
-    def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:
+    def resumed(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
         """Which of two maps to go on from."""
         return best_map

@@ -23,12 +23,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.solver.methods.local_repair import Effort, Patch, patch_around, remapped
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
-from quasiharmonic.util.progress import still_at_it
+from quasiharmonic.util.progress import heartbeat
 
 Generator = np.random.Generator
 
@@ -48,7 +48,7 @@ _STEPS_A_PROGRAMME = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class Combing(VertexDescent):
+class LineShift(VertexDescent):
     """Right inverted triangles by linear programmes along random directions.
 
     The directions are drawn from a generator of its own, always the same.
@@ -81,7 +81,7 @@ class Combing(VertexDescent):
             effort.count(len(patch.F), _STEPS_A_PROGRAMME)
             return patch, combed(rng, patch.F, w[patch.vertices], patch.held)
 
-        left = flipped_triangles(problem.F, problem.positions(start.w))
+        left = inverted_triangles(problem.F, problem.positions(start.w))
         yield from remapped(objective, start.w, left, other, patience=self.in_vain, effort=effort)
         return True
 
@@ -182,7 +182,7 @@ def best_shift(F: IntArray, x: FloatArray, y: FloatArray, held: BoolArray) -> Fl
     A = csr_array((value, where), shape=(count, free.size + count))
     area = (x[F] * dy).sum(axis=1)[concerned] / scale
     least = np.where(area > 0, np.minimum(_KEPT * area, _ENOUGH), _RIGHTED)
-    still_at_it()
+    heartbeat()
     result = linprog(
         np.repeat([0.0, 1.0], [free.size, count]),
         A_ub=-A,

@@ -13,7 +13,7 @@ from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.objective import Iterate, Objective
@@ -83,7 +83,7 @@ Attempt: TypeAlias = Callable[[ComplexArray, IntArray], tuple[Patch, ComplexArra
 
 
 @dataclass(frozen=True, kw_only=True)
-class Patches(VertexDescent):
+class LocalRepair(VertexDescent):
     """Right the last inverted triangles one patch at a time.
 
     Attributes
@@ -104,7 +104,7 @@ class Patches(VertexDescent):
         """As of `Descent`; a map after every patch that left fewer inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         w, tries = start.w, self.tries
-        left = flipped_triangles(problem.F, problem.positions(w))
+        left = inverted_triangles(problem.F, problem.positions(w))
         most = min(MOST_TRIANGLES, int(_MOST_SHARE * len(problem.F)))
         for rings in _RINGS:
             for triangle in left.tolist():
@@ -116,7 +116,7 @@ class Patches(VertexDescent):
                 tries -= 1
                 moved = w.copy()
                 moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, 0.0, solver)
-                now = flipped_triangles(problem.F, problem.positions(moved))
+                now = inverted_triangles(problem.F, problem.positions(moved))
                 if now.size < left.size:
                     w, left = moved, now
                     yield objective.of_map(w)
@@ -187,7 +187,7 @@ def remapped(
             patch, there = found
             moved = w.copy()
             moved[patch.vertices] = there
-            now = flipped_triangles(problem.F, problem.positions(moved))
+            now = inverted_triangles(problem.F, problem.positions(moved))
             if now.size <= left.size:
                 fewer, w, left = now.size < left.size, moved, now
                 if fewer:

@@ -18,7 +18,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
@@ -83,17 +83,17 @@ class RandomRestarts(VertexDescent):
         problem, solver = objective.problem, objective.laplacian.solver.name
         rng = np.random.default_rng(0)
         w = start.w
-        left = flipped_triangles(problem.F, problem.positions(w))
+        left = inverted_triangles(problem.F, problem.positions(w))
         if left.size > MOST_FLIPS:
             # Untangling all of the mesh is cut short where it gets nowhere.
             whole = Patience((self.in_vain, 0.0))
-            whole.is_over(start.flipped, start.value)
+            whole.is_over(start.inverted, start.value)
             for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
                 here = objective.of_map(w)
                 yield here
-                if whole.is_over(here.flipped, here.value):
+                if whole.is_over(here.inverted, here.value):
                     return True
-            left = flipped_triangles(problem.F, problem.positions(w))
+            left = inverted_triangles(problem.F, problem.positions(w))
         patience, effort = self.in_vain, Effort(len(problem.F))
         if 0 < left.size <= MOST_FLIPS and objective.of_map(w).energy < _NEXT_TO_NOTHING:
             patience *= _DILIGENCE

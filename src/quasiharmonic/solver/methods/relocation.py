@@ -42,21 +42,21 @@ _MOST_AROUND = 16
 _MANY, _SIZES, _HEIGHTS = 16, (6, 8), 30_000
 
 
-class Tries:
+class RetrySchedule:
     """When it is time for a try, while a descent goes on."""
 
     def __init__(self) -> None:
         self._seen = self._next = 0
         self._few_enough = 0.0
 
-    def due(self, flipped: int) -> bool:
+    def due(self, inverted: int) -> bool:
         """Whether to try the next map of the descent, of which so many triangles are inverted."""
         seen, self._seen = self._seen, self._seen + 1
-        if not 0 < flipped <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
+        if not 0 < inverted <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
             return False
-        if flipped > self._few_enough and seen < self._next:
+        if inverted > self._few_enough and seen < self._next:
             return False
-        self._few_enough, self._next = _FEWER * flipped, 2 * seen + 2
+        self._few_enough, self._next = _FEWER * inverted, 2 * seen + 2
         return True
 
 

@@ -70,13 +70,13 @@ class Regularised(Isotropic):
         _, chi, numerator = self._parts(d)
         return numerator / chi
 
-    def slopes(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``(1 ± G)/χ`` with ``G = 2λD − N/ρ``, since ``χ' = χ/ρ`` with ``ρ = √(ε² + D²)``."""
         root, chi, numerator = self._parts(d)
         by_det = 2 * _LAMBDA * d.det - numerator / root
         return (1 + by_det) / chi, (1 - by_det) / chi
 
-    def bends(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """By ``S = a + b`` and D: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, and φ_SS = 0."""
         root, chi, numerator = self._parts(d)
         mixed = -1 / (chi * root)
@@ -109,9 +109,9 @@ class Untangling(VertexDescent):
     def __post_init__(self) -> None:
         whole_number("iterations", self.iterations, least=1)
 
-    def resumed(self, best_map: ComplexArray, deepest: Iterate) -> ComplexArray:
+    def resumed(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
         """All of the mesh is moved: what matters is how far it is from a map on the whole."""
-        return deepest.w
+        return lowest_energy.w
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`."""
@@ -314,7 +314,7 @@ class RegularisedDescent:
         found = system.descent(gradient, _SHIFTS)
         if found is None or not found[1] > 0:
             return None
-        direction, promise, _ = found
+        direction, expected_decrease, _ = found
         full = np.zeros_like(self.w)
         full[system.free] = direction
         start = self.w
@@ -325,7 +325,7 @@ class RegularisedDescent:
             value = self._deformed.value_of(at)
             return value, (w, at) if value < bound else None
 
-        taken = backtrack(trial, before, promise, tries=_HALVINGS)
+        taken = backtrack(trial, before, expected_decrease, tries=_HALVINGS)
         if taken is None:
             return None
         _, after, (self.w, self._at) = extend(trial, taken)

@@ -15,7 +15,7 @@ import numpy as np
 from quasiharmonic.geometry.mesh.reference import blocks
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import FunctionalDescent, Iterates
-from quasiharmonic.solver.methods.relocation import Tries, placed
+from quasiharmonic.solver.methods.relocation import RetrySchedule, placed
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
@@ -75,17 +75,17 @@ class VectorAdam(FunctionalDescent):
     def _steps(self) -> Sequence[tuple[int, float]]:
         return self.schedule or (TANH_STEPS if self.parameterisation == "tanh" else SI_LOG_STEPS)
 
-    def pace(self, triangles: int) -> Pace:
+    def pace(self, triangles: int) -> AdamState:
         """What the method remembers of so many triangles, to be asked for one step after another."""
         times, lengths = zip(*self._steps, strict=True)
-        return Pace(triangles, self.momenta, times, lengths)
+        return AdamState(triangles, self.momenta, times, lengths)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""
         pace = self.pace(start.xi.size)
-        problem, tries, here = objective.problem, Tries(), start
+        problem, tries, here = objective.problem, RetrySchedule(), start
         for _ in range(self.iterations):
-            if self.placing and tries.due(here.flipped):
+            if self.placing and tries.due(here.inverted):
                 w = placed(problem.F, here.w, problem.fixed)
                 if w is not None:
                     yield objective.of_map(w)
@@ -94,7 +94,7 @@ class VectorAdam(FunctionalDescent):
         return False
 
 
-class Pace:
+class AdamState:
     """The mean gradient and the mean square of it, triangle by triangle, and the steps that follow from them.
 
     No triangle knows of another, so the triangles may be of one mesh or of many.
@@ -114,20 +114,20 @@ class Pace:
         self._square = np.zeros(triangles)
         self._steps = 0
 
-    def part(self, triangles: IntArray | slice) -> Pace:
+    def part(self, triangles: IntArray | slice) -> AdamState:
         """What is remembered of some of the triangles, for these to go on by themselves."""
         return self._with(self._mean[triangles], self._square[triangles])
 
     @staticmethod
-    def joined(paces: Sequence[Pace]) -> Pace:
+    def joined(paces: Sequence[AdamState]) -> AdamState:
         """One for the triangles of several, one after another, which have made as many steps each."""
         return paces[0]._with(
             np.concatenate([pace._mean for pace in paces]), np.concatenate([pace._square for pace in paces])
         )
 
-    def _with(self, mean: ComplexArray, square: FloatArray) -> Pace:
+    def _with(self, mean: ComplexArray, square: FloatArray) -> AdamState:
         """Of the same method after as many steps."""
-        other = Pace(0, self._momenta, self._times, self._lengths)
+        other = AdamState(0, self._momenta, self._times, self._lengths)
         # What is taken from another one's is changed at every step.
         other._mean, other._square, other._steps = np.array(mean), np.array(square), self._steps
         return other

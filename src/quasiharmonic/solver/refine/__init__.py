@@ -1,5 +1,5 @@
 """Maps for problems that the mesh as given does not allow: edges are split until a map exists.
 
 The package builds on `solver.search` and `solver.construction`. Start reading in `mapping` for `injective_map`, then
-`solve_refining`.
+`attempts`.
 """

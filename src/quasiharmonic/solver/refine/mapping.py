@@ -9,19 +9,19 @@ from dataclasses import replace
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Step
 from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.util.arrays import true_or_false
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 
-@takes_mesh
-@heard
+@accepts_mesh
+@reports_progress
 def injective_map(
     V: ArrayLike,
     F: ArrayLike,
@@ -35,8 +35,8 @@ def injective_map(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    record: int = 0,
-    slide: bool | Rails = False,
+    record_every: int = 0,
+    slide: bool | BoundaryCurves = False,
     refine: bool = False,
 ) -> MapResult:
     """Map a triangle mesh into the plane with no triangle inverted.
@@ -61,25 +61,26 @@ def injective_map(
         A map to begin with, for instance that of the same mesh for a target near this one: the search starts at
         its tensors, and afresh where that leads nowhere.
     max_iterations : int
-        Iterations to spend at most on finding the map: one linear solve each on the whole mesh. Tries at repairing a
-        small patch are counted where they succeed; those in vain may together take as long as 16 times so many.
+        Iterations to spend at most on finding the map: one linear solve each on the whole mesh. RetrySchedule at
+        repairing a small patch are counted where they succeed; those in vain may together take as long as 16 times so
+        many.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at every iteration, and with the last one again at least every half second in between:
         while patches are tried, say, or a diagnosis is made, but not within a single factorisation. It may raise
         `KeyboardInterrupt`, on a clock of its own for instance, which ends the search as Ctrl-C does.
-    record : int
-        Keep the map of every ``record``-th iteration in the result's ``path``; none of them by default.
-    slide : bool or Rails
+    record_every : int
+        Keep the map of every ``record_every``-th iteration in the result's ``path``; none of them by default.
+    slide : bool or BoundaryCurves
         While polishing let boundary vertices glide along their outline, its corners held; see `quasiharmonic.polish`.
         The boundary of ``target`` is put onto the curves first, if it is off them by a chord.
     refine : bool
         Where no map of the mesh as given is found, split inner edges, as few as need be: those that the diagnosis
         names; more around what stays inverted; or, for a connected surface without handles and a target whose loops
         are simple, disjoint, nested and wound as the mesh's, pins distinct and strictly inside, as many as a
-        construction with a proof needs. Such a problem ends with a bijective map, with ``NO_ROOM``,
-        or, where dozens of pins lie elsewhere than in the mesh, with ``ENTANGLED``.
+        construction with a proof needs. Such a problem ends with a bijective map, with ``PRECISION_LIMIT``,
+        or, where dozens of pins lie elsewhere than in the mesh, with ``TOO_MANY_SPLITS``.
 
     Returns
     -------
@@ -88,7 +89,7 @@ def injective_map(
         maps met, the one with the fewest inverted triangles; where the diagnosis proves that none is injective,
         the one of least area. Failure to find a map is not an exception. Ctrl-C ends the search and returns the
         best map so far. Where edges were split, ``refined`` has the mesh that it is a map of: old vertices keep their
-        numbers, new ones follow. ``rungs`` tells what was tried.
+        numbers, new ones follow. ``refinement_attempts`` tells what was tried.
 
     Raises
     ------
@@ -116,9 +117,9 @@ def injective_map(
     way = solve
     if refine:
         # Only here: it brings the construction and the diagnosis along, which most maps do without.
-        from quasiharmonic.solver.refine.solve_refining import climb
+        from quasiharmonic.solver.refine.attempts import solve_refining
 
-        way = climb
+        way = solve_refining
     result = way(
         problem,
         strategy=strategy,
@@ -127,7 +128,7 @@ def injective_map(
         max_iterations=max_iterations,
         linear_solver=linear_solver,
         callback=callback,
-        record=record,
+        record_every=record_every,
         slide=slide,
     )
     return replace(result, seconds=time.perf_counter() - began)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.refinement import Refined, composed, split_edges
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 
@@ -34,7 +34,7 @@ class RefinedProblem:
     rounds: int
 
 
-@takes_mesh
+@accepts_mesh
 def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
     """Split edges of a mesh at their midpoints, and the triangles beside them to match.
 
@@ -80,13 +80,13 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     return split_edges(V, F, edges, boundary=boundary)
 
 
-def refine_problem(problem: Problem, *, most_rounds: int = 20) -> RefinedProblem:
+def refine_problem(problem: Problem, *, max_rounds: int = 20) -> RefinedProblem:
     """Split the edges that a diagnosis names, and no others, until it names none.
 
     Parameters
     ----------
     problem : Problem
-    most_rounds : int
+    max_rounds : int
         Diagnoses to act upon at most. One is enough as a rule; where much room is lacking, edges that
         were split may have to be split again.
 
@@ -103,7 +103,7 @@ def refine_problem(problem: Problem, *, most_rounds: int = 20) -> RefinedProblem
     whole = split_edges(problem.V, problem.F, [])
     diagnosis = diagnose(problem)
     rounds = 0
-    while rounds < most_rounds and len(diagnosis.split):
+    while rounds < max_rounds and len(diagnosis.split):
         whole = composed(whole, split_edges(whole.V, whole.F, diagnosis.split))
         problem = Problem(whole.V, whole.F, problem.fixed, problem.target, reference=problem.reference)
         diagnosis = diagnose(problem)

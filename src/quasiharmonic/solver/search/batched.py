@@ -7,7 +7,7 @@ as it looks at each triangle by itself. Every problem walks the way that it woul
 solved falls out; what is left of several groups after the first iterations is joined, and whenever half have fallen
 out, the others move up.
 
-What is left when the stage has run is handed on as `Begun`, and each is searched on by itself.
+What is left when the stage has run is handed on as `ResumedStage`, and each is searched on by itself.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from quasiharmonic.problem.result import MapResult, Stage, Status, Step
 from quasiharmonic.solver.field.passes import clip_moduli, own_sweep, stiffness_of, sweep
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
 from quasiharmonic.solver.methods import VectorAdam
-from quasiharmonic.solver.methods.relocation import Tries, placed_each
-from quasiharmonic.solver.methods.vector_adam import Pace
-from quasiharmonic.solver.search.stages import Begun, Stages
+from quasiharmonic.solver.methods.relocation import RetrySchedule, placed_each
+from quasiharmonic.solver.methods.vector_adam import AdamState
+from quasiharmonic.solver.search.stages import ResumedStage, Stages
 from quasiharmonic.solver.search.strategy import stages_of
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
@@ -90,22 +90,22 @@ class _Member:
         self.problem = problem
         self.live = True
         self.seconds = 0.0
-        self.tries = Tries()
-        self.found: MapResult | Begun | None = None
+        self.tries = RetrySchedule()
+        self.found: MapResult | ResumedStage | None = None
         self.placed_mu: ComplexArray | None = None
         self.history: list[Step] = []
         self.best, self._deepest = (len(problem.F) + 1, np.inf), np.inf
         self.best_map = self._deepest_map = np.empty(0, dtype=np.complex128)
         self.best_xi = self._deepest_xi = np.empty(0, dtype=np.complex128)
 
-    def note(self, flipped: int, energy: float, w: ComplexArray, xi: ComplexArray) -> None:
+    def note(self, inverted: int, energy: float, w: ComplexArray, xi: ComplexArray) -> None:
         """Take note of a map and its tensors."""
-        self.history.append(Step(len(self.history), flipped, energy))
-        better, deeper = (flipped, energy) < self.best, energy < self._deepest or not self._deepest_map.size
+        self.history.append(Step(len(self.history), inverted, energy))
+        better, deeper = (inverted, energy) < self.best, energy < self._deepest or not self._deepest_map.size
         if better or deeper:
             w, xi = w.copy(), xi.copy()
         if better:
-            self.best, self.best_map, self.best_xi = (flipped, energy), w, xi
+            self.best, self.best_map, self.best_xi = (inverted, energy), w, xi
         if deeper:
             self._deepest, self._deepest_map, self._deepest_xi = energy, w, xi
 
@@ -121,14 +121,14 @@ class _Member:
             name=descent.name,
             iterations=len(self.history) - 1,
             seconds=self.seconds,
-            flipped=(first.flipped, last[0]),
+            inverted=(first.inverted, last[0]),
             energy=(first.energy, last[1]),
         )
 
     def hand_on(self, descent: VectorAdam) -> None:
         """The stage is over, and a search by itself begins."""
         self.live = False
-        self.found = Begun(
+        self.found = ResumedStage(
             descent=descent,
             history=self.history,
             best=self.best,
@@ -145,7 +145,7 @@ class _Maps(NamedTuple):
 
     w: ComplexArray
     gradient: ComplexArray
-    flipped: IntArray
+    inverted: IntArray
     energy: FloatArray
 
 
@@ -172,11 +172,11 @@ class _SideBySide:
         if not np.isfinite(w.view(np.float64)).all():
             raise NotPositiveDefinite("the solution is not finite")
         sums, gradient = sweep(self._mesh, self._parameterisation, xi, w, self.triangles)
-        flipped, dirichlet, area, unsigned = sums.T
+        inverted, dirichlet, area, unsigned = sums.T
         covered = np.where(area > 0, area, unsigned)
         with np.errstate(divide="ignore", invalid="ignore"):
             energy = np.where(covered > 0, dirichlet / covered, np.inf)
-        return _Maps(w, gradient, flipped.astype(np.int64), energy)
+        return _Maps(w, gradient, inverted.astype(np.int64), energy)
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
         """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
@@ -242,7 +242,7 @@ def _plain(stage: object) -> TypeGuard[VectorAdam]:
 
 def first_stage(
     problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, budget: int, still_wanted: Callable[[], None]
-) -> list[MapResult | Begun | None]:
+) -> list[MapResult | ResumedStage | None]:
     """Run a stage on many problems together.
 
     Parameters
@@ -295,7 +295,7 @@ class _Walk:
     """
 
     def __init__(
-        self, members: Sequence[_Member], xi: ComplexArray, pace: Pace, descent: VectorAdam, patterns: Patterns
+        self, members: Sequence[_Member], xi: ComplexArray, pace: AdamState, descent: VectorAdam, patterns: Patterns
     ) -> None:
         self.members, self.xi, self.pace, self.descent, self.patterns = members, xi, pace, descent, patterns
 
@@ -320,11 +320,11 @@ class _Walk:
                 side.bounded(self.xi)
             maps = side.evaluate(self.xi)
             live = [k for k, member in enumerate(self.members) if member.live]
-            flipped, energy = maps.flipped.tolist(), maps.energy.tolist()
+            inverted, energy = maps.inverted.tolist(), maps.energy.tolist()
             for k in live:
-                self.members[k].note(flipped[k], energy[k], maps.w[side.vertices_of(k)], self.xi[side.triangles_of(k)])
-            ready = [self.members[k] for k in live if flipped[k] == 0]
-            due = [k for k in live if flipped[k] and iteration < last and self.members[k].tries.due(flipped[k])]
+                self.members[k].note(inverted[k], energy[k], maps.w[side.vertices_of(k)], self.xi[side.triangles_of(k)])
+            ready = [self.members[k] for k in live if inverted[k] == 0]
+            due = [k for k in live if inverted[k] and iteration < last and self.members[k].tries.due(inverted[k])]
             if self.descent.placing and due:
                 ready += side.place(due, maps.w)
             # Nobody knows what an iteration takes for one of them alone: all are charged alike.
@@ -361,7 +361,7 @@ def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
         done = (k for k, member in enumerate(members) if not member.live)
         chosen = sorted([*chosen, *islice(done, _filled_up(len(chosen)) - len(chosen))])
     ends = np.cumsum([len(member.problem.F) for member in members])
-    xi, pace = np.concatenate([walk.xi for walk in walks]), Pace.joined([walk.pace for walk in walks])
+    xi, pace = np.concatenate([walk.xi for walk in walks]), AdamState.joined([walk.pace for walk in walks])
     descent, patterns, joined = walks[0].descent, walks[0].patterns, []
     for first, end in _runs([len(members[k].problem.F) for k in chosen]):
         some = chosen[first:end]

@@ -19,11 +19,11 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Stage, Step
 from quasiharmonic.solver.field.objective import Iterate, Objective
-from quasiharmonic.solver.methods import LBFGS, Newton, Patches, VectorAdam
+from quasiharmonic.solver.methods import LBFGS, LocalRepair, Newton, VectorAdam
 from quasiharmonic.solver.methods.base import Steps
 from quasiharmonic.solver.search.harmonised import Harmonised
 from quasiharmonic.util.arrays import FloatArray
@@ -76,9 +76,9 @@ class HarmonicDescent:
         self.stages: list[Stage] = []
         self._squares = np.zeros(len(self._problem.F))
         self.back()
-        flipped = flipped_triangles(self._problem.F, uv).size
-        distortion = self._measure.distortion if flipped else self._measure.distortion_of_map
-        self.best = flipped, distortion(self._last)
+        inverted = inverted_triangles(self._problem.F, uv).size
+        distortion = self._measure.distortion if inverted else self._measure.distortion_of_map
+        self.best = inverted, distortion(self._last)
         self._report(self.best)
 
     def back(self) -> None:
@@ -114,14 +114,14 @@ class HarmonicDescent:
 
         Whether there are none in the end.
         """
-        if self.history[-1].flipped == 0:
+        if self.history[-1].inverted == 0:
             return True
-        for method in (Newton(iterations=RIGHTING), Patches(tries=RIGHTING)):
+        for method in (Newton(iterations=RIGHTING), LocalRepair(tries=RIGHTING)):
             with self._stage(f"{method.word}, tanh"):
                 self._last = self._objective.evaluate(self._last.xi)
                 for at in method.iterates(self._objective, self._last):
                     self._visit(at)
-                    if self.history[-1].flipped == 0:
+                    if self.history[-1].inverted == 0:
                         return True
         return False
 
@@ -140,7 +140,7 @@ class HarmonicDescent:
                     name=name,
                     iterations=len(self.history) - done,
                     seconds=time.perf_counter() - began,
-                    flipped=(first.flipped, last.flipped),
+                    inverted=(first.inverted, last.inverted),
                     energy=(first.energy, last.energy),
                     kept=self.best < best,
                 )
@@ -179,15 +179,15 @@ class HarmonicDescent:
     def _visit(self, at: Iterate) -> None:
         """Take note of a map."""
         self._last = at
-        flipped, distortion = at.flipped, self._measure.distortion(at)
-        if flipped == 0:
+        inverted, distortion = at.inverted, self._measure.distortion(at)
+        if inverted == 0:
             # Decided on the coordinates that are handed back, not on the solver's own.
             uv = self._problem.positions(at.w)
-            flipped = flipped_triangles(self._problem.F, uv).size
-            self._compare((flipped, self._measure.distortion_of_map(at)), uv)
-        elif flipped <= self.best[0]:
-            self._compare((flipped, distortion), self._problem.positions(at.w))
-        self._report((flipped, distortion))
+            inverted = inverted_triangles(self._problem.F, uv).size
+            self._compare((inverted, self._measure.distortion_of_map(at)), uv)
+        elif inverted <= self.best[0]:
+            self._compare((inverted, distortion), self._problem.positions(at.w))
+        self._report((inverted, distortion))
 
     def _compare(self, state: tuple[int, float], uv: FloatArray) -> None:
         if state < self.best:

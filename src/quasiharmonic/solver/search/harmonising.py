@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet, UnsignedARAP
 from quasiharmonic.energies.springs import MassSpring
-from quasiharmonic.geometry.exact.certificate import certify, flipped_triangles
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
@@ -36,7 +36,7 @@ from quasiharmonic.util.arrays import (
     true_or_false,
     whole_number,
 )
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 #: What can be lowered, by name: each makes its energy from the rest mesh.
 ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
@@ -52,8 +52,8 @@ BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
 ETA = (0.1, 0.1, 0.01, 0.001)
 
 
-@takes_mesh
-@heard
+@accepts_mesh
+@reports_progress
 def harmonise(
     V: ArrayLike,
     F: ArrayLike,
@@ -127,7 +127,7 @@ def harmonise(
         The injective map of least E + κR₁ on the way, ``uv`` included; certified. With status ``POLISHED`` when the
         last round came to rest, ``STILL_FALLING`` when it did not, ``UNIMPROVED`` when no injective map on the way was
         better than ``uv``, ``INTERRUPTED`` by Ctrl-C; or, with the map of fewest inversions, where none was injective,
-        ``IMPOSSIBLE`` if the ``diagnosis`` names what forbids one and else ``SETTLED``. The history holds E + κR₁ at
+        ``IMPOSSIBLE`` if the ``diagnosis`` names what forbids one and else ``STALLED``. The history holds E + κR₁ at
         every map.
 
     Raises
@@ -171,7 +171,7 @@ def harmonise(
     return replace(result, seconds=time.perf_counter() - began)
 
 
-@heard
+@reports_progress
 def harmonise_map(
     domain: Domain,
     uv: ArrayLike,
@@ -206,10 +206,10 @@ def harmonise_map(
     true_or_false("scaled", scaled)
     check_callback(callback)
     start = map_array("uv", uv, domain.n)
-    flipped = flipped_triangles(domain.F, start)
-    if barrier and flipped.size:
+    inverted = inverted_triangles(domain.F, start)
+    if barrier and inverted.size:
         raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', flipped)} inverted or without area, where "
+            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or without area, where "
             "this energy is infinite; begin with an injective map, or lower R₁ (energy=None)"
         )
     name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
@@ -247,11 +247,11 @@ def harmonise_map(
     certificate = certify(domain.F, descent.uv)
     diagnosis = None
     if status is not Status.INTERRUPTED:
-        converged = status is Status.POLISHED and descent.history[-1].flipped == 0
+        converged = status is Status.POLISHED and descent.history[-1].inverted == 0
         if not certificate.injective:
             try:
                 diagnosis = diagnose(problem)
-                status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.SETTLED
+                status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.STALLED
             except KeyboardInterrupt:
                 status = Status.INTERRUPTED
         elif not (descent.best < first or converged):

@@ -22,7 +22,7 @@ from quasiharmonic.problem.batched import posed_each
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.batched import GROUP, SMALL, Patterns, beginning_alike, first_stage
 from quasiharmonic.solver.search.solving import solve
-from quasiharmonic.solver.search.stages import Begun, Stages
+from quasiharmonic.solver.search.stages import ResumedStage, Stages
 from quasiharmonic.solver.search.strategy import STRATEGIES, stages_of
 from quasiharmonic.util.arrays import check_callback, check_choice, whole_number
 
@@ -212,7 +212,7 @@ class _Worker:
         """The results of some problems, or what was raised; ``first`` is the number of the first of them."""
         ready = self._posed_at_once(group)
         posed = [self._posed(first + k, given, ready.get(k)) for k, given in enumerate(group)]
-        begun: dict[int, MapResult | Begun] = {}
+        begun: dict[int, MapResult | ResumedStage] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
         for descent, some in beginning_alike(problems, self._settings.strategy).items():
             found = first_stage(
@@ -260,13 +260,13 @@ class _Worker:
             V, F, fixed, target = given
             last, reference = self._last, self._settings.reference
             if last is not None and _same(last.V, V) and _same(last.F, F) and _same(last.fixed, fixed):
-                return last.moved(target)
+                return last.with_target(target)
             self._last = Problem(V, F, fixed, target, reference=reference) if ready is None else ready
         except Exception as error:
             return _numbered(number, error)
         return self._last
 
-    def _finished(self, number: int, problem: Problem, begun: MapResult | Begun | None) -> MapResult | Exception:
+    def _finished(self, number: int, problem: Problem, begun: MapResult | ResumedStage | None) -> MapResult | Exception:
         """The result of one problem, whatever has been done for it so far."""
         settings = self._settings
         try:

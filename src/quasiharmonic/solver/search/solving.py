@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding import moved_onto
 from quasiharmonic.energies.polishing import energy_named, polished
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Frame, Problem
@@ -34,10 +34,10 @@ from quasiharmonic.util.arrays import (
     map_array,
     whole_number,
 )
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 
-@heard
+@reports_progress
 def solve(
     problem: Problem,
     *,
@@ -47,8 +47,8 @@ def solve(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    record: int = 0,
-    slide: bool | Rails = False,
+    record_every: int = 0,
+    slide: bool | BoundaryCurves = False,
 ) -> MapResult:
     """Solve a problem at hand.
 
@@ -56,7 +56,7 @@ def solve(
     ----------
     problem : Problem
         It has the kind of reference triangles too, and is not changed but for what it keeps to be solved again sooner.
-    strategy, polish, start, max_iterations, linear_solver, callback, record, slide
+    strategy, polish, start, max_iterations, linear_solver, callback, record_every, slide
         As of `injective_map`.
 
     Returns
@@ -73,7 +73,7 @@ def solve(
     """
     began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=1)
-    whole_number("record", record, least=0)
+    whole_number("record_every", record_every, least=0)
     check_callback(callback)
     lower = None if polish is None else energy_named(polish)
     if not isinstance(problem, Problem):
@@ -84,7 +84,7 @@ def solve(
             raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
         problem = moved_onto(slide, problem)
     with problem.exclusive() as own:
-        search = Search(own, linear_solver, callback, max_iterations, record, first)
+        search = Search(own, linear_solver, callback, max_iterations, record_every, first)
         status = search.run(stages_of(strategy, own))
     uv = problem.positions(search.best_map)
     certificate = certify(problem.F, uv, loops=problem.domain.loops)

@@ -21,8 +21,8 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Snapshot, Stage, Status, Step
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.field.tensor import TANH, TensorField, own_tensor
-from quasiharmonic.solver.methods import Combing, Descent, Newton, Patches, Untangling, VectorAdam
-from quasiharmonic.solver.methods.base import FunctionalDescent, Patience, Runner, SearchStage, SoFar, Steps
+from quasiharmonic.solver.methods import Descent, LineShift, LocalRepair, Newton, Untangling, VectorAdam
+from quasiharmonic.solver.methods.base import FunctionalDescent, Patience, SearchStage, SearchState, StageRunner, Steps
 from quasiharmonic.solver.methods.local_repair import MOST_FLIPS
 from quasiharmonic.solver.search.coarse import coarse_mesh
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 # Iterations that tries at patches may amount to in vain, in all stages together, as a multiple of the search's.
 _IN_VAIN = 16
 # The share of inverted triangles above which they count as many.
-_MANY = 0.02
+MANY_INVERTED = 0.02
 # What rights the last few triangles; and what follows the first stage on a coarse mesh.
-_LOCAL = Combing(resume=True), Patches(tries=15, resume=True)
-_COARSE = *_LOCAL, Untangling(resume=True), *_LOCAL
+LOCAL_REPAIRS = LineShift(resume=True), LocalRepair(tries=15, resume=True)
+_COARSE = *LOCAL_REPAIRS, Untangling(resume=True), *LOCAL_REPAIRS
 # Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
 _TO_LEAST_AREA = 30
 
@@ -65,13 +65,13 @@ class CoarseToFine(SearchStage):
         """``first``."""
         return self.first
 
-    def run(self, search: Runner, before: Status) -> Status:
+    def run(self, search: StageRunner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.attempt_on_coarse(self, before)
 
 
 @dataclass(frozen=True)
-class InPassing(SearchStage):
+class TentativeStage(SearchStage):
     """A stage whose iterations are discarded where it finds no map (§9.2): what follows goes on from before it.
 
     Attributes
@@ -91,9 +91,9 @@ class InPassing(SearchStage):
         """``tried``."""
         return self.tried
 
-    def run(self, search: Runner, before: Status) -> Status:
+    def run(self, search: StageRunner, before: Status) -> Status:
         """As of `SearchStage`."""
-        return search.attempt_in_passing(self.tried, before)
+        return search.attempt_tentatively(self.tried, before)
 
 
 @dataclass(frozen=True)
@@ -117,13 +117,13 @@ class WhereMany(SearchStage):
         """``tried``."""
         return self.tried
 
-    def run(self, search: Runner, before: Status) -> Status:
+    def run(self, search: StageRunner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.attempt_where_many(self.tried, before)
 
 
 @dataclass(frozen=True, eq=False)
-class Begun(SearchStage):
+class ResumedStage(SearchStage):
     """A stage that has been run elsewhere and has found no map, as a search is to go on from it.
 
     Attributes
@@ -159,7 +159,7 @@ class Begun(SearchStage):
         """``descent``."""
         return self.descent
 
-    def run(self, search: Runner, before: Status) -> Status:
+    def run(self, search: StageRunner, before: Status) -> Status:
         """As of `SearchStage`."""
         return search.take_over(self)
 
@@ -171,7 +171,7 @@ class _State(NamedTuple):
     best_map: ComplexArray
     best_field: TensorField | None
     best_reference: Reference
-    deepest: Iterate | None
+    lowest_energy: Iterate | None
 
 
 #: Whatever a strategy is made of.
@@ -191,7 +191,7 @@ class Search:
         Called with a `Step` at every iteration.
     budget : int
         Iterations at most.
-    record : int
+    record_every : int
         Keep every so many-th map in ``path``; none for 0.
     first : (n,) complex128, optional
         A map to begin with, of any size and anywhere.
@@ -213,7 +213,7 @@ class Search:
         linear_solver: str,
         callback: Callable[[Step], object] | None,
         budget: int,
-        record: int = 0,
+        record_every: int = 0,
         first: ComplexArray | None = None,
     ) -> None:
         self.problem = problem
@@ -224,7 +224,7 @@ class Search:
         self.callback = callback
         self.budget = budget
         self._in_vain = _IN_VAIN * budget
-        self.record = record
+        self.record_every = record_every
         self.path: list[Snapshot] = []
         self.history: list[Step] = []
         self.stages: list[Stage] = []
@@ -233,7 +233,7 @@ class Search:
         self.best_map = np.zeros(problem.n, dtype=np.complex128)
         self.best_field: TensorField | None = None
         self.best_reference: Reference = "equilateral"
-        self.deepest: Iterate | None = None
+        self.lowest_energy: Iterate | None = None
         self.best = len(problem.F), np.inf
         self._aside: _State | None = None
         self._rounded = self._tried = False
@@ -282,19 +282,19 @@ class Search:
         self._tried = True
         return self._descend_by_any(stage, before)
 
-    def attempt_in_passing(self, stage: Descent, before: Status) -> Status:
+    def attempt_tentatively(self, stage: Descent, before: Status) -> Status:
         """Run a stage on the mesh itself, and forget the lowest V₃ that it came to if it finds no map."""
-        deepest = self.deepest
+        lowest_energy = self.lowest_energy
         status = self.attempt(stage, before)
         if status is not Status.INJECTIVE:
-            self.deepest = deepest
+            self.lowest_energy = lowest_energy
         return status
 
     def attempt_where_many(self, stage: Descent, before: Status) -> Status:
         """Run a stage on the mesh itself, if many of its triangles are inverted in the best map."""
-        return self.attempt(stage, before) if self.best[0] > _MANY * len(self.problem.F) else before
+        return self.attempt(stage, before) if self.best[0] > MANY_INVERTED * len(self.problem.F) else before
 
-    def take_over(self, begun: Begun) -> Status:
+    def take_over(self, begun: ResumedStage) -> Status:
         """Go on from a stage that was run elsewhere, as `attempt` does from its own."""
         objective = begun.descent.objective(self.problem, self._asked)
         self.linear_solver = objective.laplacian.solver.name
@@ -303,7 +303,7 @@ class Search:
         tensors = objective.parameterisation.field
         self.best, self.best_map, self.best_field = begun.best, begun.best_map, tensors(begun.best_xi)
         self.best_reference = objective.mesh.kind
-        self.deepest = Iterate(objective, tensors(begun.deepest_xi), begun.deepest_map)
+        self.lowest_energy = Iterate(objective, tensors(begun.deepest_xi), begun.deepest_map)
         self.stages.append(begun.stage)
         self._tried = True
         return Status.OUT_OF_ITERATIONS
@@ -322,27 +322,27 @@ class Search:
     def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
         """Search on a coarse mesh, if there is one to be had, and carry its map to this one."""
         # A recording shows maps of this mesh only, so no coarse one is searched.
-        coarse = None if self.record else coarse_mesh(self.problem)
+        coarse = None if self.record_every else coarse_mesh(self.problem)
         if coarse is None:
             return before
         done, began, before_it = max(len(self.history), 1), time.perf_counter(), self._state
         problem = Problem.on(coarse.domain, self.problem.target, reference="equilateral")
         first, left = stage.begins_with, self._left
-        status, uv, inverted, self.linear_solver = _on_coarse(problem, first, self._asked, left, self._note)
+        status, uv, inverted, self.linear_solver = search_coarse(problem, first, self._asked, left, self._note)
         certain = status in (Status.INJECTIVE, Status.INTERRUPTED)
         if certain or (status is not Status.IMPOSSIBLE and inverted <= MOST_FLIPS):
             w = coarse.prolong(problem.frame.inward(uv))
-            flipped = self._not_positive(w)
-            if certain or flipped <= min(MOST_FLIPS, self.best[0] - 1):
-                self._take(w, flipped)
-                self._rounded |= status is Status.INJECTIVE and flipped > 0
+            inverted = self._not_positive(w)
+            if certain or inverted <= min(MOST_FLIPS, self.best[0] - 1):
+                self._take(w, inverted)
+                self._rounded |= status is Status.INJECTIVE and inverted > 0
                 self._note(Step(0, *self.best))
         self.stages.append(
             Stage(
                 name=f"{stage.name}, {len(problem.F)} triangles",
                 iterations=len(self.history) - done,
                 seconds=time.perf_counter() - began,
-                flipped=(before_it.best[0], self.best[0]),
+                inverted=(before_it.best[0], self.best[0]),
                 energy=(before_it.best[1], self.best[1]),
                 kept=self.best != before_it.best,
             )
@@ -353,21 +353,21 @@ class Search:
             self._repair_carried(before_it)
         return Status.INJECTIVE if self.best[0] == 0 else before
 
-    def _take(self, w: ComplexArray, flipped: int) -> None:
+    def _take(self, w: ComplexArray, inverted: int) -> None:
         """Take on a map from elsewhere, at its own tensors."""
         mesh = self.problem.domain.mesh("equilateral")
         dw = mesh.derivatives(w)
         field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
-        self._state = _State((flipped, 0.0 if flipped == 0 else np.inf), w, field, mesh.kind, self.deepest)
+        self._state = _State((inverted, 0.0 if inverted == 0 else np.inf), w, field, mesh.kind, self.lowest_energy)
 
     def _repair_carried(self, before_it: _State) -> None:
         """Right the last inverted triangles of a map from a coarse mesh; where that fails, it is put aside.
 
         Other stages then begin anew, and not in front of a wall that the coarse mesh may have put up.
         """
-        for stage in _LOCAL:
+        for stage in LOCAL_REPAIRS:
             if self._left > 0 and 0 < self.best[0] <= MOST_FLIPS:
-                self.deepest = stage.objective(self.problem, self._asked).of_map(self.best_map)
+                self.lowest_energy = stage.objective(self.problem, self._asked).of_map(self.best_map)
                 self._descend(stage)
         if self.best[0]:
             self._aside, self._state = self._state, before_it
@@ -375,15 +375,15 @@ class Search:
     @property
     def _state(self) -> _State:
         """What is known of the best map."""
-        return _State(self.best, self.best_map, self.best_field, self.best_reference, self.deepest)
+        return _State(self.best, self.best_map, self.best_field, self.best_reference, self.lowest_energy)
 
     @_state.setter
     def _state(self, state: _State) -> None:
-        self.best, self.best_map, self.best_field, self.best_reference, self.deepest = state
+        self.best, self.best_map, self.best_field, self.best_reference, self.lowest_energy = state
 
     def _note(self, step: Step) -> None:
         """Write a step down, whatever its number was where it was made."""
-        step = Step(len(self.history), step.flipped, step.energy)
+        step = Step(len(self.history), step.inverted, step.energy)
         self.history.append(step)
         if self.callback is not None:
             self.callback(step)
@@ -400,8 +400,8 @@ class Search:
         """Where no map is injective, go to the one of least area: the target's area and V₃ make it up (eq. 42)."""
         if self._left > 0:
             self._descend(Newton(iterations=_TO_LEAST_AREA, resume=True))
-        if self.deepest is not None:
-            here = self.deepest
+        if self.lowest_energy is not None:
+            here = self.lowest_energy
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.mesh.kind
 
     @property
@@ -422,9 +422,9 @@ class Search:
             if self.linear_solver in self._spare:
                 self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
             given = None if self.history else self._first
-            start = stage.start(objective, SoFar(given, self.best_map, self.deepest))
+            start = stage.start(objective, SearchState(given, self.best_map, self.lowest_energy))
             # The first map of all is what the first stage begins with.
-            before = (start.flipped, start.energy) if self.best_field is None else self.best
+            before = (start.inverted, start.energy) if self.best_field is None else self.best
             status = self._follow(stage, objective, start)
         except NotPositiveDefinite:
             status = Status.UNSOLVABLE
@@ -434,7 +434,7 @@ class Search:
                     name=stage.name,
                     iterations=max(len(self.history) - done, 0),
                     seconds=time.perf_counter() - began,
-                    flipped=((before or self.best)[0], self.best[0]),
+                    inverted=((before or self.best)[0], self.best[0]),
                     energy=((before or self.best)[1], self.best[1]),
                     kept=self.best != before or status is Status.INJECTIVE,
                 )
@@ -450,34 +450,34 @@ class Search:
             if here.w is last:
                 self._in_vain -= 1
                 if self._in_vain <= 0:
-                    return Status.SETTLED
+                    return Status.STALLED
                 continue
             last = here.w
             step = self._visit(here, tensors=not stage.moves_vertices)
-            if step.flipped == 0:
+            if step.inverted == 0:
                 return Status.INJECTIVE
             if self._left <= 0:
                 return Status.OUT_OF_ITERATIONS
-            if patience.is_over(step.flipped, here.value):
-                return Status.SETTLED
-        return Status.SETTLED if steps.at_rest else Status.OUT_OF_ITERATIONS
+            if patience.is_over(step.inverted, here.value):
+                return Status.STALLED
+        return Status.STALLED if steps.at_rest else Status.OUT_OF_ITERATIONS
 
     def _visit(self, here: Iterate, *, tensors: bool) -> Step:
         """Take note of an iterate."""
-        flipped = here.flipped
-        if flipped == 0:
+        inverted = here.inverted
+        if inverted == 0:
             # Not on the solver's own coordinates.
-            flipped = self._not_positive(here.w)
-            self._rounded |= flipped > 0
-        step = Step(len(self.history), flipped, here.energy)
+            inverted = self._not_positive(here.w)
+            self._rounded |= inverted > 0
+        step = Step(len(self.history), inverted, here.energy)
         self._note(step)
-        if self.record and step.iteration % self.record == 0:
+        if self.record_every and step.iteration % self.record_every == 0:
             self.path.append(Snapshot(step.iteration, self.problem.positions(here.w)))
-        if (flipped, step.energy) < self.best:
-            self.best = flipped, step.energy
+        if (inverted, step.energy) < self.best:
+            self.best = inverted, step.energy
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.mesh.kind
-        if tensors and (self.deepest is None or here.energy < self.deepest.energy):
-            self.deepest = here
+        if tensors and (self.lowest_energy is None or here.energy < self.lowest_energy.energy):
+            self.lowest_energy = here
         return step
 
     def _not_positive(self, w: ComplexArray) -> int:
@@ -486,7 +486,7 @@ class Search:
         return int(np.count_nonzero(sign <= 0))
 
 
-def _on_coarse(
+def search_coarse(
     problem: Problem, first: Descent, linear_solver: str, budget: int, callback: Callable[[Step], object]
 ) -> tuple[Status, FloatArray, int, str]:
     """Solve a coarse problem, and lower the distortion of its map a little.

@@ -9,17 +9,17 @@ from itertools import takewhile
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.methods import (
     Alternating,
-    Combing,
     Composite,
     Descent,
+    LineShift,
+    LocalRepair,
     Newton,
-    Patches,
     RandomRestarts,
     Untangling,
     VectorAdam,
 )
 from quasiharmonic.solver.methods.base import SearchStage
-from quasiharmonic.solver.search.stages import CoarseToFine, InPassing, Stages, WhereMany
+from quasiharmonic.solver.search.stages import CoarseToFine, Stages, TentativeStage, WhereMany
 from quasiharmonic.util.arrays import kind_of
 
 # Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
@@ -66,7 +66,7 @@ def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
     else:
         first, newton = VectorAdam(iterations=100, placing=True), Newton(iterations=300, resume=True)
     # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
-    repair: Stages = (Combing(resume=True), Patches(tries=15, resume=True))
+    repair: Stages = (LineShift(resume=True), LocalRepair(tries=15, resume=True))
     if alone:
         # From one of the two starts or the other.
         composite = Composite(iterations=100, placing=True)
@@ -80,11 +80,11 @@ def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
     return (
         *soon,
         Untangling(iterations=400, resume=True),
-        Combing(in_vain=10, resume=True),
+        LineShift(in_vain=10, resume=True),
         *other,
         newton,
         Untangling(iterations=600, resume=True),
-        Combing(in_vain=10, resume=True),
+        LineShift(in_vain=10, resume=True),
         RandomRestarts(in_vain=30, resume=True),
         RandomRestarts(in_vain=30),
         RandomRestarts(in_vain=60, resume=True),
@@ -101,10 +101,10 @@ def paper(_: Problem) -> Stages:
 
     Returns
     -------
-    list of Descent or InPassing
+    list of Descent or TentativeStage
     """
     turn: list[SearchStage] = [
-        InPassing(Alternating(reference="corrected", iterations=20, resume=True)),
+        TentativeStage(Alternating(reference="corrected", iterations=20, resume=True)),
         Newton(reference="corrected", iterations=20, resume=True),
     ]
     return [

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.loops import judge_loops, listed
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.targets.boundary.chords import chords_of
 from quasiharmonic.targets.boundary.corner_fit import pins_by_angle
@@ -25,7 +25,7 @@ from quasiharmonic.targets.specification import outline as specified
 from quasiharmonic.util.arrays import FloatArray, IntArray, kind_of
 
 
-@takes_mesh
+@accepts_mesh
 def boundary_to(
     V: ArrayLike,
     F: ArrayLike,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.textual import integer
 from quasiharmonic.targets.boundary.pins import Corners
 from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array
@@ -131,7 +131,7 @@ def read_corners(text: str) -> AskedCorners:
     return AskedCorners(tuple(entries))
 
 
-@takes_mesh
+@accepts_mesh
 def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArray:
     """Find the boundary vertex nearest to each of some places.
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array, whole_number
 
 # Radians by which a straight loop is taken to turn in all, evenly: corners on a straight side divide it evenly then.
@@ -89,7 +89,7 @@ class BoundaryLoop:
         return found, mean_turns(lengths, self.turning, found)
 
 
-@takes_mesh
+@accepts_mesh
 def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     """Measure how the boundary of a surface turns at each of its vertices.
 
@@ -134,7 +134,7 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     ]
 
 
-@takes_mesh
+@accepts_mesh
 def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
     """Find corners of a surface by angle: boundary vertices between which the boundary is as straight as it can be.
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.opening import opened_along
 from quasiharmonic.geometry.mesh.surface import manifold_edges
 from quasiharmonic.geometry.mesh.topology import components, edge_keys
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.targets.cuts.reaching import reached
 from quasiharmonic.targets.cuts.shortening import shortened
@@ -22,14 +22,14 @@ from quasiharmonic.util.arrays import IntArray, check_range, index_array, triang
 _DEAR = 1e6
 
 
-@takes_mesh
+@accepts_mesh
 def find_cuts(
     V: ArrayLike,
     F: ArrayLike,
     *,
     edges: ArrayLike | None = None,
-    uncut: ArrayLike | None = None,
-    gain: float = 0.1,
+    forbidden_edges: ArrayLike | None = None,
+    min_gain: float = 0.1,
 ) -> IntArray:
     """Find edges along which to cut a surface so that each of its parts is a disk and lies flat with little distortion.
 
@@ -47,9 +47,9 @@ def find_cuts(
     edges : (l, 2) array of int, optional
         Edges to be cut in any case. Where they cut a part off, that part is one to be made a disk. One alone with both
         ends inside opens nothing and is ignored.
-    uncut : (d, 2) array of int, optional
+    forbidden_edges : (d, 2) array of int, optional
         Edges not to be cut, such as diagonals of faces of four corners; every vertex must have others.
-    gain : float
+    min_gain : float
         By how much a cut must lower the mean symmetric Dirichlet energy (0 without distortion), for each piece of
         its length that is as long as the square root of the surface's area. An end inside counts as a tenth of such a
         piece. Positive; more of it means fewer cuts, and `numpy.inf` none but those that make disks.
@@ -63,8 +63,8 @@ def find_cuts(
     Raises
     ------
     ValueError
-        When an array has the wrong shape or refers to what there is not, a coordinate is not finite, ``gain`` is not
-        positive, or the triangles are no surface: edges of three triangles, mixed winding, a vertex twice in a
+        When an array has the wrong shape or refers to what there is not, a coordinate is not finite, ``min_gain`` is
+        not positive, or the triangles are no surface: edges of three triangles, mixed winding, a vertex twice in a
         triangle. The message names the first elements.
 
     Examples
@@ -75,17 +75,17 @@ def find_cuts(
     >>> from quasiharmonic import find_cuts
     >>> from quasiharmonic.surfaces import starfish
     >>> V, F = starfish(3, 12)
-    >>> cut = find_cuts(V, F, gain=0.5)
+    >>> cut = find_cuts(V, F, min_gain=0.5)
     >>> _, times = np.unique(cut, return_counts=True)
     >>> int((times == 1).sum())
     3
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    given, spared = _edge_array("edges", edges), _edge_array("uncut", uncut)
-    check_range("uncut", spared, len(V))
-    if not isinstance(gain, Real) or not float(gain) > 0:
-        raise ValueError(f"gain must be a positive number, not {gain!r}")
+    given, spared = _edge_array("edges", edges), _edge_array("forbidden_edges", forbidden_edges)
+    check_range("forbidden_edges", spared, len(V))
+    if not isinstance(min_gain, Real) or not float(min_gain) > 0:
+        raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
     inner = manifold_edges(F, len(V)).interior
     inner_key = edge_keys(inner[:, 0], inner[:, 1], len(V))
     # Open along what is given, and where surfaces touch at a vertex, each is one of its own.
@@ -97,16 +97,16 @@ def find_cuts(
         graph = edge_graph(V[origin[vertices]], number[FT[triangles]])
         ends = origin[vertices[graph.ends]]
         dear = np.isin(_keys(ends, len(V)), _keys(spared, len(V)))
-        cut = _cut_part(replace(graph, cost=np.where(dear, _DEAR, 1.0) * graph.cost), float(gain))
+        cut = _cut_part(replace(graph, cost=np.where(dear, _DEAR, 1.0) * graph.cost), float(min_gain))
         found.append(np.sort(origin[vertices[cut]], axis=1))
     return np.unique(np.concatenate(found), axis=0)
 
 
-def _cut_part(graph: EdgeGraph, gain: float) -> IntArray:
+def _cut_part(graph: EdgeGraph, min_gain: float) -> IntArray:
     """The edges (k, 2) that a connected surface is cut along."""
     cut = shortened(graph, opening_cuts(graph))
-    if np.isfinite(gain):
-        cut = reached(graph, cut, gain)
+    if np.isfinite(min_gain):
+        cut = reached(graph, cut, min_gain)
     return graph.ends[cut]
 
 

@@ -32,7 +32,7 @@ _EVEN, _TIES = 1e-3, 1e-6
 _ROUNDS = 3
 
 
-def reached(graph: EdgeGraph, cut: BoolArray, gain: float) -> BoolArray:
+def reached(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
     """Lead cuts to what sticks out as far as it is worth their length, and shorten them.
 
     Parameters
@@ -41,7 +41,7 @@ def reached(graph: EdgeGraph, cut: BoolArray, gain: float) -> BoolArray:
         Of a connected surface.
     cut : (e,) bool
         Edges whose cutting makes it a disk.
-    gain : float
+    min_gain : float
         What a unit of length costs, the surface having area 1, in units of the mean energy.
 
     Returns
@@ -49,7 +49,7 @@ def reached(graph: EdgeGraph, cut: BoolArray, gain: float) -> BoolArray:
     (e,) bool
         Edges whose cutting makes it a disk.
     """
-    balance = _Balance(graph, gain)
+    balance = _Balance(graph, min_gain)
     if not balance.shrinking.area.any():
         return cut
     for _ in range(_ROUNDS):
@@ -63,9 +63,9 @@ def reached(graph: EdgeGraph, cut: BoolArray, gain: float) -> BoolArray:
 class _Balance:
     """Energy and length of cuts weighed against each other."""
 
-    def __init__(self, graph: EdgeGraph, gain: float) -> None:
+    def __init__(self, graph: EdgeGraph, min_gain: float) -> None:
         self.graph = graph
-        self.gain = gain
+        self.min_gain = min_gain
         self.shrinking = Shrinking(graph)
         self._rim = graph.rim_vertices
         self._prices: dict[bytes, float] = {}
@@ -81,7 +81,7 @@ class _Balance:
         """The scale w under cuts, whose price is known from then on."""
         w = self.shrinking.of(self._rim | self.graph.touched(cut))
         length = float(self.graph.length[cut].sum()) + _END * int(self._loose(cut).sum())
-        self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.gain * length
+        self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.min_gain * length
         return w
 
     def _loose(self, cut: BoolArray) -> BoolArray:

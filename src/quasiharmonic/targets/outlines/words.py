@@ -155,8 +155,8 @@ def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
         sine = (along.conjugate() * across).imag
         if abs(sine) < 1e-6:
             break
-        s = one.moved(s, np.array([(apart * across.conjugate()).imag / -sine]))
-        t = other.moved(t, np.array([(apart * along.conjugate()).imag / -sine]))
+        s = one.advance(s, np.array([(apart * across.conjugate()).imag / -sine]))
+        t = other.advance(t, np.array([(apart * along.conjugate()).imag / -sine]))
     raise ValueError(_FLATLY)
 
 

@@ -105,7 +105,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
     for k, result in _solved({k: one.problem for k, one in posed.items()}, settings):
         record = read[k].record
         record |= account.sizes([posed[k].problem]) | account.told([result], result.status)
-        record |= {"flips_before": result.history[0].flipped, "seconds_map": result.seconds}
+        record |= {"flips_before": result.history[0].inverted, "seconds_map": result.seconds}
         records.clear(folders[k])
         with account.timed(record, "write"):
             path = records.map_path(folders[k])

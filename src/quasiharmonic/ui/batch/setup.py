@@ -15,7 +15,7 @@ from quasiharmonic.apps.atlas.mapped import faced, naming
 from quasiharmonic.apps.atlas.seaming import cut_apart
 from quasiharmonic.apps.repair.fitting import Fitted, held_in_place, laid_along
 from quasiharmonic.energies.newton.sliding import moved_onto
-from quasiharmonic.geometry.curves import Curve, Rails
+from quasiharmonic.geometry.curves import BoundaryCurves, Curve
 from quasiharmonic.geometry.mesh.seams import Island, SeamedMesh
 from quasiharmonic.targets.boundary.corner_spec import AskedCorners, read_corners
 
@@ -26,12 +26,12 @@ class Posed(NamedTuple):
     Attributes
     ----------
     fitted : Fitted
-    slide : bool or Rails
+    slide : bool or BoundaryCurves
         Whether its boundary slides, and along what.
     """
 
     fitted: Fitted
-    slide: bool | Rails
+    slide: bool | BoundaryCurves
 
 
 def surface_of(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
@@ -82,9 +82,9 @@ def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings
             fitted = (
                 held_in_place(island, fixed, reference=reference) if to is None else _onto(island, k, asked, settings)
             )
-            slide: bool | Rails = settings["slide"]
+            slide: bool | BoundaryCurves = settings["slide"]
             if slide:
-                slide = slide if to is None else Rails(_curves(to, _changed(to)), held=fitted.held)
+                slide = slide if to is None else BoundaryCurves(_curves(to, _changed(to)), fixed=fitted.held)
                 fitted = replace(fitted, problem=moved_onto(slide, fitted.problem))
         found.append(Posed(fitted, slide))
     return found

@@ -29,11 +29,11 @@ from quasiharmonic.apps.atlas.refined import written_over
 from quasiharmonic.apps.flattening.flattened import flattenable
 from quasiharmonic.apps.repair.fitting import Fitted
 from quasiharmonic.energies.polishing import polished
-from quasiharmonic.geometry.curves import Rails
+from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.solver.refine.solve_refining import climb, on_refinement
+from quasiharmonic.solver.refine.attempts import on_refinement, solve_refining
 from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.ui.batch import batched as together
 from quasiharmonic.ui.batch import metadata as account
@@ -189,9 +189,9 @@ def _mapped(
         record["added_vertices"] = added = sum(result.added for result in results)
         record["vertices"] += added
         record["triangles"] += sum(2 * result.added for result in results)
-        record["rung"] = results[-1].rungs[-1].name if len(results) == 1 else None
+        record["rung"] = results[-1].refinement_attempts[-1].name if len(results) == 1 else None
     if all(result.history for result in results):
-        record["flips_before"] = sum(result.history[0].flipped for result in results)
+        record["flips_before"] = sum(result.history[0].inverted for result in results)
     why = [result.diagnosis for result in results if not result.injective]
     if why:
         reasons = [reason.summary() for reason in why if reason is not None and reason.obstructions]
@@ -199,10 +199,10 @@ def _mapped(
     return found, [result.refined for result in results]
 
 
-def _solved(fitted: Fitted, slide: bool | Rails, settings: dict[str, Any], record: Record) -> MapResult:
+def _solved(fitted: Fitted, slide: bool | BoundaryCurves, settings: dict[str, Any], record: Record) -> MapResult:
     """Map one island, and lower its distortion if that is asked for."""
     with account.timed(record, "map"):
-        way = climb if settings["refine"] else solve
+        way = solve_refining if settings["refine"] else solve
         result = way(
             fitted.problem,
             strategy=settings["strategy"],
@@ -254,7 +254,7 @@ def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
         "outcome": wanted if certified else f"not {wanted}",
         "certified": certified,
         "bijective": bijective,
-        "flips_after": len(verdict.flipped),
+        "flips_after": len(verdict.inverted),
         "map_bytes": path.stat().st_size,
     }
 

@@ -15,10 +15,11 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from io import TextIOWrapper
+from typing import Any
 
 from quasiharmonic.ui.cli.interrupts import Interrupts
 from quasiharmonic.ui.cli.report import ReportError, in_words
-from quasiharmonic.ui.cli.streams import NO_READER, tell
+from quasiharmonic.ui.cli.streams import NO_READER, output_failed, tell
 from quasiharmonic.ui.cli.version import Version
 
 # The subcommands in the order of the help; each is a module of `commands`.
@@ -66,8 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             options = parser.parse_args(words)
         except OSError as error:
-            # Of the version, which is printed meanwhile.
-            return _fail("--version", error, 2)
+            # The parser prints the version and the help.
+            return output_failed(error)
         run: Callable[[argparse.Namespace], int] = options.run
         try:
             return run(options)
@@ -94,9 +95,21 @@ def _fail(command: str, why: str | Exception, status: int) -> int:
     return status
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that raises an OSError when the help cannot be printed, which argparse ignores."""
+
+    def print_help(self, file: Any = None) -> None:
+        file = file or sys.stdout
+        if file is None:
+            # On standard error.
+            super().print_help()
+        else:
+            file.write(self.format_help())
+
+
 def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
     """The command's parser, with some of its subcommands."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
         epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written), 3 "

@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
         marked = [corner["vertex"] for loop in told for corner in loop["corners"]]
         save_boundary_figure(options.plot, mesh.V, mesh.F, [loop.vertices for loop in loops], np.array(marked))
         text.append(f"wrote {options.plot}")
-    report.emit(facts, options.json, "\n".join(text))
+    (report.emit_verdict if options.plot is None else report.emit)(facts, options.json, "\n".join(text))
     return 0
 
 

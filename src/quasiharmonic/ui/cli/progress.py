@@ -16,7 +16,7 @@ _INTERVAL = 0.1
 
 
 def _of_search(step: Step) -> str:
-    return f"iteration {step.iteration}   inverted {step.flipped}   energy/area {step.energy:.3g}"
+    return f"iteration {step.iteration}   inverted {step.inverted}   energy/area {step.energy:.3g}"
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli.streams import tell
+from quasiharmonic.ui.cli.streams import require_output, tell
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped import MappedAtlas
@@ -54,6 +54,19 @@ def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
 
         write_whole(destination, json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
     print(text, flush=True)
+
+
+def emit_verdict(facts: dict[str, Any], destination: str | None, text: str) -> None:
+    """`emit` for a command that writes no file.
+
+    Raises
+    ------
+    BrokenPipeError
+        When standard output is closed and ``--json`` names no file, so that nobody can read the report.
+    """
+    if destination is None:
+        require_output()
+    emit(facts, destination, text)
 
 
 def check_outputs(
@@ -141,11 +154,13 @@ def _same(path: Path, other: Path) -> bool:
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
 
 
-_COUNTING = "(counting from 0)"
+_COUNTING = "(indices count from 0)"
 # What a message that names elements by their numbers has in it.
 _NUMBERED = re.compile(
     r"\b(vertex|vertices|nodes?|triangles?|quadrilaterals?|edges?|corners?|loops?|islands?|rows?|between) [-(]?\d"
 )
+# A message that gives the range of indices, or that repeats a number of the command line, needs no such note.
+_NEEDS_NO_NOTE = re.compile(r"\b0 … \d|\bnamed? .*\bmore than once")
 
 
 @contextmanager
@@ -164,7 +179,8 @@ def about(source: Path | str) -> Iterator[None]:
         if str(error).endswith(_COUNTING):
             # Said already, of something more particular.
             raise
-        counting = f" {_COUNTING}" if _NUMBERED.search(str(error)) else ""
+        numbered = _NUMBERED.search(str(error)) and not _NEEDS_NO_NOTE.search(str(error))
+        counting = f" {_COUNTING}" if numbered else ""
         raise ValueError(f"{source}: {error}{counting}") from error
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from quasiharmonic.geometry.curves import Rails
+    from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.geometry.mesh.seams import Island
 
 
@@ -41,7 +41,7 @@ def along(
     corner_angle: float = 20.0,
     held: Sequence[int] = (),
     pieces: Path | None = None,
-) -> Rails:
+) -> BoundaryCurves:
     """The curves of an outline for a boundary to slide along.
 
     Parameters
@@ -49,7 +49,7 @@ def along(
     to, font
         As `quasiharmonic.targets.outline_curves` takes them.
     corner_angle, held
-        As `Rails` has them.
+        As `BoundaryCurves` has them.
     pieces : Path, optional
         A file that tells vertices their sides of the outline.
 
@@ -58,17 +58,17 @@ def along(
     ValueError, OSError, ModuleNotFoundError
         As `outline_curves`; when a line of the file is wrong, or there is no such side.
     """
-    from quasiharmonic.geometry.curves import Rails
+    from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.targets import outline_curves
 
     curves = outline_curves(to, font=font)
     if pieces is None:
-        return Rails(curves, held=held, corner_angle=corner_angle)
+        return BoundaryCurves(curves, fixed=held, corner_angle=corner_angle)
     sides = [side for curve in curves for side in curve.sides(corner_angle)]
-    return Rails(sides, on=read_pieces(pieces, len(sides)), held=held, corner_angle=corner_angle)
+    return BoundaryCurves(sides, on=read_pieces(pieces, len(sides)), fixed=held, corner_angle=corner_angle)
 
 
-def told_off(rails: Rails, island: Island) -> list[str]:
+def told_off(rails: BoundaryCurves, island: Island) -> list[str]:
     """A sentence about the boundary vertices of a map that are on none of the curves, if there are such."""
     from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.util.arrays import named

@@ -33,12 +33,21 @@ def finish(status: int) -> int:
     """
     error = _flush(1)
     _flush(2)
-    if error is None or status:
-        return status
+    return status if error is None or status else output_failed(error)
+
+
+def output_failed(error: OSError) -> int:
+    """Report that standard output cannot be written, unless it has no reader; return the exit status."""
     if isinstance(error, BrokenPipeError):
         return NO_READER
     tell(f"qhm: standard output cannot be written: {error.strerror or error}")
     return 2
+
+
+def require_output() -> None:
+    """Raise a BrokenPipeError when standard output is closed, where `print` does nothing."""
+    if sys.stdout is None:
+        raise BrokenPipeError("standard output is closed")
 
 
 def _flush(number: int) -> OSError | None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.repair.fitting import Fitted
-    from quasiharmonic.geometry.curves import Rails
+    from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.geometry.mesh.seams import Island
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
@@ -37,14 +37,14 @@ class Posed:
         What was done, for the report; of several islands they add up.
     notes : list of str
         The same in sentences.
-    slide : bool or Rails
+    slide : bool or BoundaryCurves
         Whether the boundary slides, and along what.
     """
 
     fitted: Fitted
     facts: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    slide: bool | Rails = False
+    slide: bool | BoundaryCurves = False
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

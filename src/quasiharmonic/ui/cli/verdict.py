@@ -66,8 +66,8 @@ class Judged:
         import numpy as np
 
         if self.verdict is not None:
-            return self.verdict.flipped
-        return np.concatenate([self.certificate.flipped, self.certificate.degenerate])
+            return self.verdict.inverted
+        return np.concatenate([self.certificate.inverted, self.certificate.degenerate])
 
     def summary(self) -> str:
         """Say what is certified, and of what."""
@@ -82,7 +82,7 @@ class Judged:
         return {
             "injective": self.injective,
             "bijective": self.bijective,
-            "flipped": self.certificate.flipped.tolist(),
+            "inverted": self.certificate.inverted.tolist(),
             "degenerate": self.certificate.degenerate.tolist(),
             "faces": self.faces,
             "certificate": self.certificate.to_dict(),

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
+from quasiharmonic.ui.cli.streams import require_output
+
 
 class Version(argparse.Action):
     """Print what `told` says, and end."""
@@ -14,6 +16,7 @@ class Version(argparse.Action):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help="show version and surroundings, and exit")
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        require_output()
         print(told())
         parser.exit()
 

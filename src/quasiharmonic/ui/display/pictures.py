@@ -63,18 +63,18 @@ def _result(result: MapResult, kind: str, measure: str) -> Figure:
         return plot.plot_distortion(result.V, result.F, result.uv, measure)
     if kind == "texture":
         return plot.plot_texture(result.V, result.F, result.uv)
-    return map_figure(result.V, result.F, result.uv, flipped=_bad(result.certificate))
+    return map_figure(result.V, result.F, result.uv, inverted=_bad(result.certificate))
 
 
 def _certificate(certificate: Certificate) -> Figure:
     figure = new_figure((4.5, 4.5))
     ax = figure.add_axes((0.01, 0.02, 0.98, 0.88))
     uv, bad = certificate.uv, _bad(certificate)
-    plot.plot_map(uv, certificate.F, uv, flipped=bad, ax=ax)
+    plot.plot_map(uv, certificate.F, uv, inverted=bad, ax=ax)
     verdict(ax, "map", len(bad))
     for i, j, k, m in certificate.crossings.tolist():
         ax.plot(*uv[[i, j]].T, *uv[[k, m]].T, color=RED, linewidth=2.4, zorder=7)
-    ax.plot(*uv[certificate.overwound].T, "o", color=RED, markersize=5, zorder=7)
+    ax.plot(*uv[certificate.multiply_wound].T, "o", color=RED, markersize=5, zorder=7)
     if not bad.size and certificate.bijective is False:
         figure.texts[-1].remove()
         caption(ax, "map: not bijective", RED)
@@ -94,4 +94,4 @@ def _diagnosis(diagnosis: Diagnosis) -> Figure:
 
 def _bad(certificate: Certificate) -> np.ndarray:
     """The triangles that are not positive."""
-    return np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
+    return np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])

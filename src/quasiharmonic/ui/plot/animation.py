@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.io.adapters.accepts_mesh import writes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.ui.plot.shading import view
 from quasiharmonic.util.arrays import FloatArray, map_array, whole_number
@@ -32,7 +32,7 @@ _COLOURS, _BITS = 255, 5
 _NONE = "there are no frames"
 
 
-@writes_mesh
+@writer_accepts_mesh
 def save_animation(
     path: str | PathLike[str],
     V: ArrayLike,

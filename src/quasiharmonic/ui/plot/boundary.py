@@ -8,7 +8,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.adapters.accepts_mesh import writes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
     BORDER,
     INK,
@@ -29,7 +29,7 @@ _INCHES, _SIZE = 10.0, 7.5
 _DIGIT, _HEIGHT, _OFF = 0.68, 1.25, 0.3
 
 
-@writes_mesh
+@writer_accepts_mesh
 def save_boundary_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, loops: Sequence[IntArray], corners: ArrayLike = ()
 ) -> None:

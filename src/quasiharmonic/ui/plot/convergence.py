@@ -49,13 +49,13 @@ def plot_convergence(result: MapResult) -> Figure:
         values[~(np.isfinite(values) & (values > 0))] = np.nan
         color = _COLORS[number % len(_COLORS)]
         energy.plot(at, values, ".-", color=color, markersize=4, linewidth=1.4, label=name)
-        flips.plot(at, [step.flipped for step in steps], ".-", color=RED, markersize=4, linewidth=1.2)
+        flips.plot(at, [step.inverted for step in steps], ".-", color=RED, markersize=4, linewidth=1.2)
         # The next run begins with the map that this one ended with.
         begin += len(steps) - 1
     if np.isfinite(np.concatenate([line.get_ydata() for line in energy.lines])).any():
         energy.set_yscale("log")
     flips.set_yscale("symlog", linthresh=1)
-    flips.set_ylim(0, 2 * max(1, max(step.flipped for step in result.history)))
+    flips.set_ylim(0, 2 * max(1, max(step.inverted for step in result.history)))
     for ax, label in ((energy, "energy"), (flips, "inverted")):
         ax.set_ylabel(label, color=INK)
         ax.set_xlim(0, max(1, begin))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import Distortion, distortion
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh, writes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_picture
 from quasiharmonic.ui.plot.shading import lit, view
 from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
@@ -76,7 +76,7 @@ class _Scale:
         return colors
 
 
-@takes_mesh
+@accepts_mesh
 def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric") -> Figure:
     """Draw a surface and its map coloured by a measure of distortion, and the measure's histogram.
 
@@ -115,18 +115,18 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     surface, plane, bars = (figure.add_axes((x, y, w, h)) for x, y, w, h in _LAYOUT)
     seen = view(rest, F)
     tinted = color.copy()
-    tinted[found.flipped] = RED
+    tinted[found.inverted] = RED
     paint_surface(surface, seen, F, lit(tinted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
-    paint_map(plane, F, uv, color, found.flipped)
-    many = len(found.flipped)
+    paint_map(plane, F, uv, color, found.inverted)
+    many = len(found.inverted)
     caption(plane, f"map: {many:,} inverted" if many else "map", RED if many else INK)
     _bar(figure, scale)
     _histogram(bars, found, measure, values, scale)
     return figure
 
 
-@writes_mesh
+@writer_accepts_mesh
 def save_distortion_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric"
 ) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
 from quasiharmonic.util.arrays import FloatArray, map_array
 
@@ -20,7 +20,7 @@ SHOWN = ("isometric", "conformal", "area_ratio", "mips")
 _CHECKERS = (0.93, 0.93, 0.90), (0.16, 0.38, 0.75)
 
 
-@takes_mesh
+@accepts_mesh
 def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLike[str] | None = None) -> None:
     """Open a window on a surface and its map, and return when it is closed.
 
@@ -93,7 +93,7 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
     beside = np.column_stack([(unit - 0.5) * size, np.zeros(len(unit))]) + middle + [1.3 * size, 0, 0]
 
     inverted = np.zeros(len(F), dtype=np.bool_)
-    inverted[found.flipped] = True
+    inverted[found.inverted] = True
     for name, points in (("surface", solid), ("map", beside)):
         if not inverted.all():
             drawn = polyscope.register_surface_mesh(name, points, F[~inverted], edge_width=0.3)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh, writes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
     as_mesh,
     caption,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@takes_mesh
+@accepts_mesh
 def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     """Draw a rest surface, shaded and coloured as `plot_map` colours its map.
 
@@ -49,13 +49,13 @@ def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     paint_surface(ax, seen, F, seen.color)
 
 
-@takes_mesh
+@accepts_mesh
 def plot_map(
     V: ArrayLike,
     F: ArrayLike,
     uv: ArrayLike,
     *,
-    flipped: ArrayLike | None = None,
+    inverted: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -68,7 +68,7 @@ def plot_map(
     F : (f, 3) int
     uv : (n, 2) float
         The map.
-    flipped : (k,) int or (f,) bool, optional
+    inverted : (k,) int or (f,) bool, optional
         The triangles to show as inverted, as a certificate lists them. By default those whose area
         in floating point is not positive.
     fixed : (k,) int, optional
@@ -90,11 +90,11 @@ def plot_map(
         from quasiharmonic.ui.plot.figures import ShownAxes
 
         ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9), axes_class=ShownAxes)
-    _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), flipped, fixed)
+    _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), inverted, fixed)
     return ax
 
 
-@takes_mesh
+@accepts_mesh
 def plot_before_after(
     V: ArrayLike,
     F: ArrayLike,
@@ -129,7 +129,7 @@ def plot_before_after(
     return figure
 
 
-@writes_mesh
+@writer_accepts_mesh
 def save_map_figure(
     path: str | PathLike[str],
     V: ArrayLike,
@@ -137,7 +137,7 @@ def save_map_figure(
     uv: ArrayLike,
     before: ArrayLike | None = None,
     *,
-    flipped: ArrayLike | None = None,
+    inverted: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
 ) -> None:
     """Write a picture of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
@@ -151,7 +151,7 @@ def save_map_figure(
     uv : (n, 2) float
     before : (n, 2) float, optional
         The first guess; without it the picture has two panels and is 800 pixels wide.
-    flipped, fixed
+    inverted, fixed
         As for `plot_map`, of ``uv``.
 
     Raises
@@ -161,7 +161,7 @@ def save_map_figure(
     quasiharmonic.io.errors.OutputError
         When the file cannot be written.
     """
-    save_picture(path, map_figure(V, F, uv, before, flipped=flipped, fixed=fixed))
+    save_picture(path, map_figure(V, F, uv, before, inverted=inverted, fixed=fixed))
 
 
 def map_figure(
@@ -170,7 +170,7 @@ def map_figure(
     uv: ArrayLike,
     before: ArrayLike | None = None,
     *,
-    flipped: ArrayLike | None = None,
+    inverted: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
 ) -> Figure:
     """Draw what `save_map_figure` writes."""
@@ -184,7 +184,7 @@ def map_figure(
     if before is not None:
         guess = map_array("before", before, len(rest))
         verdict(axes[1], "first guess", _draw_map(axes[1], seen, F, guess, None, fixed))
-    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, map_array("uv", uv, len(rest)), flipped, fixed))
+    verdict(axes[-1], "map", _draw_map(axes[-1], seen, F, map_array("uv", uv, len(rest)), inverted, fixed))
     return figure
 
 
@@ -193,11 +193,11 @@ def _draw_map(
     seen: View,
     F: IntArray,
     uv: FloatArray,
-    flipped: ArrayLike | None,
+    inverted: ArrayLike | None,
     fixed: ArrayLike | None,
 ) -> int:
     """Draw a map into axes and return the number of its inverted triangles."""
-    inverted = not_positive(F, uv) if flipped is None else np.asarray(flipped)
+    inverted = not_positive(F, uv) if inverted is None else np.asarray(inverted)
     inverted = np.flatnonzero(inverted) if inverted.dtype == bool else inverted.astype(np.int64)
     paint_map(ax, F, uv, seen.color, inverted, fixed)
     return int(inverted.size)

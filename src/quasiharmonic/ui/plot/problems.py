@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import BORDER, INK, RED, as_mesh, caption, fit, new_figure, paint_surface, panels
 from quasiharmonic.ui.plot.shading import drawable, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, held_places, held_vertices
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@takes_mesh
+@accepts_mesh
 def plot_problem(
     V: ArrayLike,
     F: ArrayLike,

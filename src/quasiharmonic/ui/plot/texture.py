@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh, writes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
@@ -36,7 +36,7 @@ _SAMPLES = 2  # per pixel and direction
 _CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
 
 
-@takes_mesh
+@accepts_mesh
 def plot_texture(
     V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24, picture: str | PathLike[str] | None = None
 ) -> Figure:
@@ -90,7 +90,7 @@ def plot_texture(
     return figure
 
 
-@writes_mesh
+@writer_accepts_mesh
 def save_texture_figure(
     path: str | PathLike[str],
     V: ArrayLike,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.energies.smoothing import LARGEST, STEPS, smoothed
-from quasiharmonic.geometry.curves import Rails
+from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
@@ -38,7 +38,7 @@ def settle(
     before: MapResult | None = None,
     *,
     energy: str | None = None,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     callback: Callable[[Step], object] | None = None,
 ) -> Settled:
     """Find the map of a problem, and take the worst distortion off it.
@@ -50,7 +50,7 @@ def settle(
         An injective map of the same problem, which is kept where nothing better is found.
     energy : str, optional
         Lower this until it converges; a few steps of the blend otherwise.
-    slide : bool or Rails
+    slide : bool or BoundaryCurves
         As of `solve`, for ``energy``.
     callback : callable, optional
         Hears every `Step`; may raise `KeyboardInterrupt`.

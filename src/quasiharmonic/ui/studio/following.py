@@ -64,7 +64,7 @@ class Follower:
 
     def _take(self, uv: FloatArray) -> None:
         """Go on from an injective map."""
-        problem = self.problem.moved(uv[self.problem.fixed])
+        problem = self.problem.with_target(uv[self.problem.fixed])
         self._operator = Objective(problem).of_map(problem.frame.inward(uv)).operator
         self._base = uv
 
@@ -108,7 +108,7 @@ class Follower:
             if time.monotonic() > until or waiting():
                 raise KeyboardInterrupt
 
-        result = solve(self.problem.moved(target), start=self._uv, callback=hurry)
+        result = solve(self.problem.with_target(target), start=self._uv, callback=hurry)
         if result.injective:
             self._uv, self._certificate = result.uv, result.certificate
             self._take(self._uv)

@@ -103,7 +103,7 @@ class Recipe:
         if "boundary_to" in text:
             used = [name for name in ("boundary_to", "filled", "outline") if f"{name}(" in text]
             head += [f"from quasiharmonic.targets import {', '.join(used)}"]
-        if "Rails(" in text:
+        if "BoundaryCurves(" in text:
             head += ["from quasiharmonic.targets import outline_curves"]
         return "\n".join([*head, "", text, "print(result.certificate.summary())", ""])
 
@@ -134,12 +134,12 @@ class Recipe:
             return [*(pins if self.pinned else []), f"result = flatten(V, F{held})"], {"flatten"}
         options = "" if self.energy is None else f", polish={self.energy!r}"
         if self.slide and self.outline is not None:
-            options += f", slide=Rails(outline_curves({self.outline.to!r}){self._held()})"
+            options += f", slide=BoundaryCurves(outline_curves({self.outline.to!r}){self._held()})"
         elif self.slide:
             options += ", slide=True"
         start = "" if self.anew else ", start=uv"
         lines = [f"result = injective_map(V, F, fixed, target{options}{start})"]
-        names = {"injective_map"} | ({"Rails"} if self.slide and self.outline is not None else set())
+        names = {"injective_map"} | ({"BoundaryCurves"} if self.slide and self.outline is not None else set())
         if self.energy is None and len(self.sheet.island.F) <= LARGEST:
             polished = f'polish(V, F, result.uv, fixed=fixed, energy="blend", max_iterations={STEPS})'
             return [*lines, f"result = {polished}"], names | {"polish"}
@@ -148,4 +148,4 @@ class Recipe:
     def _held(self) -> str:
         if self.corners is None or self.corners == "auto":
             return ""
-        return f", held=[{', '.join(part.partition(':')[0] for part in self.corners.split(','))}]"
+        return f", fixed=[{', '.join(part.partition(':')[0] for part in self.corners.split(','))}]"

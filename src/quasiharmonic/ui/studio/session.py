@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.energies.newton.sliding import moved_onto
-from quasiharmonic.geometry.curves import Rails
+from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.ui.studio import validation as asking
@@ -23,7 +23,7 @@ from quasiharmonic.ui.studio.outlines import outline_by_hand, outline_drawn, out
 from quasiharmonic.ui.studio.protocol import Array, Frame
 from quasiharmonic.ui.studio.recipes import FIXED, MAP
 from quasiharmonic.ui.studio.setup import first_moment, freed, holding, laid, with_corner
-from quasiharmonic.ui.studio.state import Measured, Moment, bad_triangles, told, verdict
+from quasiharmonic.ui.studio.state import Measured, SessionState, bad_triangles, told, verdict
 from quasiharmonic.ui.studio.surface import Sheet, dropped_sheet, first_sheet
 from quasiharmonic.ui.studio.validation import Refused
 from quasiharmonic.util.arrays import FloatArray
@@ -74,13 +74,13 @@ class Session:
     def __init__(self, tell: Tell, waiting: Callable[[], bool] = lambda: False) -> None:
         self._tell, self._waiting = tell, waiting
         self._sheet: Sheet
-        self._moments: list[Moment] = []
+        self._moments: list[SessionState] = []
         self._at = -1
         self._hand: _Hand | None = None
         self._after = -1
 
     @property
-    def moment(self) -> Moment:
+    def moment(self) -> SessionState:
         """The state that the page shows."""
         return self._moments[self._at]
 
@@ -217,10 +217,10 @@ class Session:
         if energy not in ENERGIES:
             raise Refused(f"{energy[:40]!r} is no energy; there are {', '.join(ENERGIES)}")
         moment = self.moment
-        rails: bool | Rails = False
+        rails: bool | BoundaryCurves = False
         if slide:
             outline = moment.recipe.outline
-            rails = True if outline is None else Rails(outline.curves(), held=moment.held)
+            rails = True if outline is None else BoundaryCurves(outline.curves(), fixed=moment.held)
             moment = replace(moment, problem=moved_onto(rails, moment.problem))
         self._settle(moment, energy=energy, slide=rails)
 
@@ -253,8 +253,8 @@ class Session:
 
     # --- maps at rest, and what is told ------------------------------------------------------------------------------
 
-    def _settle(self, moment: Moment, *, fit: bool = False, energy: str | None = None,
-                slide: bool | Rails = False) -> None:  # fmt: skip
+    def _settle(self, moment: SessionState, *, fit: bool = False, energy: str | None = None,
+                slide: bool | BoundaryCurves = False) -> None:  # fmt: skip
         """Find the map of a moment, and keep it."""
         self._busy("polishing" if energy else "finding the map")
         before = moment.result if moment.result.injective and moment.in_place else None
@@ -262,16 +262,16 @@ class Session:
         recipe = replace(moment.recipe, energy=energy, slide=slide is not False, anew=done.anew)
         problem = moment.problem
         if slide is not False and done.result.injective:
-            problem = problem.moved(done.result.uv[problem.fixed])
+            problem = problem.with_target(done.result.uv[problem.fixed])
         kept = replace(moment, problem=problem, result=done.result, recipe=recipe)
         self._keep(kept, fit=fit)
 
     def _step(self, step: Step) -> None:
         if self._waiting():
             raise KeyboardInterrupt
-        self._tell({"kind": "progress", "flips": step.flipped, "energy": _finite(step.energy)}, {})
+        self._tell({"kind": "progress", "flips": step.inverted, "energy": _finite(step.energy)}, {})
 
-    def _keep(self, moment: Moment, *, fit: bool = False) -> None:
+    def _keep(self, moment: SessionState, *, fit: bool = False) -> None:
         """Make a moment the last one, and show it."""
         del self._moments[self._at + 1 :]
         self._moments.append(moment)

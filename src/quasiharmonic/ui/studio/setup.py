@@ -18,14 +18,14 @@ from quasiharmonic.targets import filled, nearest_on_boundary
 from quasiharmonic.targets.boundary.corner_spec import AskedCorners
 from quasiharmonic.ui.studio.outlines import Outline, outline_named
 from quasiharmonic.ui.studio.recipes import Recipe
-from quasiharmonic.ui.studio.state import Moment
+from quasiharmonic.ui.studio.state import SessionState
 from quasiharmonic.ui.studio.surface import Sheet
 from quasiharmonic.ui.studio.validation import Refused
 
 _FIRST_OUTLINE = "rect:1x1"
 
 
-def first_moment(sheet: Sheet) -> Moment:
+def first_moment(sheet: Sheet) -> SessionState:
     """The problem that a surface comes with: its boundary where its own map has it, or else on a square.
 
     With holes, or cut open, the boundary is free.
@@ -48,10 +48,10 @@ def first_moment(sheet: Sheet) -> Moment:
     pins = np.empty(0, dtype=np.int64) if sheet.fixed is None else np.setdiff1d(sheet.fixed, edge)
     fixed = np.concatenate([edge, pins])
     posed = Problem(island.V, island.F, fixed, island.uv[fixed])
-    return Moment(posed, _unsolved(posed), Recipe(sheet, pinned=len(pins) > 0))
+    return SessionState(posed, _unsolved(posed), Recipe(sheet, pinned=len(pins) > 0))
 
 
-def laid(sheet: Sheet, outline: Outline, corners: Sequence[tuple[int, int]] | Literal["auto"] = ()) -> Moment:
+def laid(sheet: Sheet, outline: Outline, corners: Sequence[tuple[int, int]] | Literal["auto"] = ()) -> SessionState:
     """Lay a surface's boundary along an outline.
 
     Parameters
@@ -74,10 +74,10 @@ def laid(sheet: Sheet, outline: Outline, corners: Sequence[tuple[int, int]] | Li
     at = tuple(at_corners(problem.fixed, problem.target, contours))
     told = corners if corners == "auto" else ",".join(f"{sheet.numbers([v])[0]}:{k}" for v, k in corners)
     chosen = () if corners == "auto" else tuple(corners)
-    return Moment(problem, _unsolved(problem), Recipe(sheet, outline, told or None), at, chosen)
+    return SessionState(problem, _unsolved(problem), Recipe(sheet, outline, told or None), at, chosen)
 
 
-def with_corner(moment: Moment, vertex: int) -> Moment:
+def with_corner(moment: SessionState, vertex: int) -> SessionState:
     """Send the boundary vertex nearest to another one to the next corner of the outline.
 
     Raises
@@ -96,7 +96,7 @@ def with_corner(moment: Moment, vertex: int) -> Moment:
     return laid(recipe.sheet, recipe.outline, (*before, (near, len(before))))
 
 
-def holding(moment: Moment, pins: Sequence[int]) -> Moment:
+def holding(moment: SessionState, pins: Sequence[int]) -> SessionState:
     """Hold these vertices inside, where the map has them, and the boundary where it is."""
     problem = moment.problem
     fixed = np.concatenate([*problem.domain.loops, np.array(pins, dtype=np.int64)])
@@ -107,7 +107,7 @@ def holding(moment: Moment, pins: Sequence[int]) -> Moment:
 
 def freed(
     problem: Problem, recipe: Recipe, pins: Sequence[int] = (), callback: Callable[[Step], object] | None = None
-) -> Moment:
+) -> SessionState:
     """Lay a surface flat, its boundary going where distortion is least, and pins held where a problem holds them.
 
     Raises
@@ -122,7 +122,7 @@ def freed(
     if not result.injective:
         raise Refused(result.status.value)
     recipe = Recipe(recipe.sheet, pinned=len(held) > 0, free=True)
-    return Moment(problem.moved(result.uv[problem.fixed]), result, recipe)
+    return SessionState(problem.with_target(result.uv[problem.fixed]), result, recipe)
 
 
 def _unsolved(problem: Problem) -> MapResult:

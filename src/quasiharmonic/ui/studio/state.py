@@ -22,7 +22,7 @@ _MOST_ELEMENTS = 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class SessionState:
     """One state of the page.
 
     Attributes
@@ -60,10 +60,10 @@ class Moment:
         """Whether the map's held vertices are where they are to be."""
         return np.array_equal(self.result.uv[self.problem.fixed], self.problem.target)
 
-    def with_target(self, target: FloatArray) -> Moment:
+    def with_target(self, target: FloatArray) -> SessionState:
         """The same with its held vertices elsewhere, by hand."""
         recipe = replace(self.recipe, outline=None, corners=None, free=False, energy=None, slide=False)
-        return replace(self, problem=self.problem.moved(target), recipe=recipe, chosen=())
+        return replace(self, problem=self.problem.with_target(target), recipe=recipe, chosen=())
 
 
 class Measured:
@@ -96,7 +96,7 @@ class Measured:
 
 def verdict(certificate: Certificate) -> dict[str, Any]:
     """What is certain about the map that is shown."""
-    bad = len(certificate.flipped) + len(certificate.degenerate) + len(certificate.nonfinite)
+    bad = len(certificate.inverted) + len(certificate.degenerate) + len(certificate.nonfinite)
     return {
         "injective": certificate.injective,
         "bijective": bool(certificate.bijective),
@@ -107,11 +107,11 @@ def verdict(certificate: Certificate) -> dict[str, Any]:
 
 def bad_triangles(certificate: Certificate) -> Array:
     """Triangles that are not positive, (k,) uint32."""
-    some = np.concatenate([certificate.flipped, certificate.degenerate, certificate.nonfinite])
+    some = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
     return np.sort(some).astype(np.uint32)
 
 
-def told(moment: Moment) -> list[dict[str, Any]]:
+def told(moment: SessionState) -> list[dict[str, Any]]:
     """What forbids a map, or a bijective one, as the page marks it."""
     diagnosis, loops = moment.result.diagnosis, moment.problem.domain.loops
     if diagnosis is None:

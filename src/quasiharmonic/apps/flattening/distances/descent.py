@@ -24,10 +24,10 @@ from quasiharmonic.apps.flattening.piece import Piece, Settings
 from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sampled
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.io.adapters.accepts_mesh import takes_mesh
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, map_array, not_negative, whole_number
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 # So many pairs are kept, along segments across so many edges. On a cortex of 9,465 vertices twice as many pairs lower
 # the error by a hundredth of it, half as many raise it by as much.
@@ -39,8 +39,8 @@ _WORK, _FEWEST, _MOST = 1_000_000, 1000, 4000
 _ACCURACY, _GRADIENTS = 0.1, 20
 
 
-@takes_mesh
-@heard
+@accepts_mesh
+@reports_progress
 def keep_distances(
     V: ArrayLike,
     F: ArrayLike,
@@ -51,7 +51,7 @@ def keep_distances(
     tolerance: float = 1e-3,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    record: int = 0,
+    record_every: int = 0,
 ) -> MapResult:
     """Bring distances in the plane near to distances along the surface; every map on the way is bijective.
 
@@ -82,8 +82,8 @@ def keep_distances(
     callback : callable, optional
         Called with a `Step` at the start and after every step, and with the last one again at least every half second
         in between, but not within a single factorisation.
-    record : int
-        Keep the map of every ``record``-th step in the result's ``path``; none of them by default.
+    record_every : int
+        Keep the map of every ``record_every``-th step in the result's ``path``; none of them by default.
 
     Returns
     -------
@@ -116,7 +116,8 @@ def keep_distances(
     """
     began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=0)
-    whole_number("record", record, least=0)
+    whole_number("record_every", record_every, least=0)
+    whole_number("rings", rings, least=1)
     not_negative("tolerance", tolerance)
     piece = Piece(V, F)
     n = len(piece.V)
@@ -124,7 +125,9 @@ def keep_distances(
     judged = certify(piece.F, places, loops=piece.loops)
     if not judged.bijective:
         raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
-    settings = Settings(SymmetricDirichlet(), "distances", tolerance, max_iterations, linear_solver, callback, record)
+    settings = Settings(
+        SymmetricDirichlet(), "distances", tolerance, max_iterations, linear_solver, callback, record_every
+    )
     result = kept(piece, places, rings, settings)
     uv = in_given_unit(result.uv, piece.exponent)
     certificate = certify(piece.F, uv, loops=piece.loops)
@@ -163,7 +166,7 @@ def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first:
 
     def report(value: float) -> None:
         history.append(Step(first + len(history), 0, value))
-        if settings.record and history[-1].iteration % settings.record == 0:
+        if settings.record_every and history[-1].iteration % settings.record_every == 0:
             path.append(Snapshot(history[-1].iteration, in_given_unit(descent.uv, piece.exponent)))
         if settings.callback is not None:
             settings.callback(history[-1])
@@ -217,7 +220,7 @@ def followed(descent: DistanceDescent, settings: Settings, report: Callable[[flo
             with np.errstate(all="ignore"):
                 outcome = descent.step(settings.tolerance)
             report(descent.distortion)
-            if outcome is not None and not descent.ease():
+            if outcome is not None and not descent.relax_barrier():
                 return outcome
     except KeyboardInterrupt:
         return Status.INTERRUPTED

@@ -105,7 +105,7 @@ def kept_by_coarse(piece: Piece, rings: int, settings: Settings, *, least: int =
         certificate=certify(piece.F, found, loops=piece.loops),
         stages=stages,
         history=history,
-        path=[Snapshot(history[-1].iteration, in_given_unit(found, piece.exponent))] if settings.record else [],
+        path=[Snapshot(history[-1].iteration, in_given_unit(found, piece.exponent))] if settings.record_every else [],
         linear_solver=descent.system.solver.name,
         seconds=seconds,
     )

@@ -154,7 +154,7 @@ _APART = 100
 # In powers of two, in its unit: how far away a map may be from the origin.
 _LARGEST = 1000
 # Ends of a search that say no more than that no map was found, of which one may be injective all the same.
-_UNDECIDED = Status.INJECTIVE, Status.SETTLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
+_UNDECIDED = Status.INJECTIVE, Status.STALLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
 
 class Pinned:
@@ -191,7 +191,7 @@ class Pinned:
         self._target = np.ldexp(target, -self.exponent)
         self._energy = piece.energy(settings.density, weights)
         self._solver = ""
-        self.status = Status.SETTLED
+        self.status = Status.STALLED
         self._diagnosis: Diagnosis | None = None
         self._stages: list[Stage] = []
         self._history: list[Step] = []
@@ -214,7 +214,7 @@ class Pinned:
         """Flatten freely, from a start in the surface's unit if there is one, and move that onto the pins; (n, 2)."""
         piece = self._piece
         rough = replace(
-            self._settings, density=SymmetricDirichlet(), name="symmetric-dirichlet", callback=None, record=0
+            self._settings, density=SymmetricDirichlet(), name="symmetric-dirichlet", callback=None, record_every=0
         )
         rough = replace(rough, tolerance=_TOLERANCE, max_iterations=_STEPS)
         flat = Flattening(piece, rough, None).run(None if start is None else np.ldexp(start, -piece.exponent))
@@ -276,7 +276,7 @@ class Pinned:
             here = certify(piece.F, uv, loops=piece.loops)
             if (
                 here.bijective
-                or here.flipped.size + here.degenerate.size < before.flipped.size + before.degenerate.size
+                or here.inverted.size + here.degenerate.size < before.inverted.size + before.degenerate.size
             ):
                 self.keep(uv)
             self.status = found.status
@@ -285,7 +285,7 @@ class Pinned:
             split = self._of_air(found.diagnosis.split)
             if not len(split):
                 self._diagnosis = self._of_surface(found.diagnosis)
-                self.status = Status.SETTLED if self._diagnosis is None else Status.IMPOSSIBLE
+                self.status = Status.STALLED if self._diagnosis is None else Status.IMPOSSIBLE
                 return
 
     def _of_air(self, pairs: IntArray) -> IntArray:
@@ -337,7 +337,7 @@ class Pinned:
     def _report(self, descent: GuardedDescent) -> None:
         settings, number = self._settings, len(self._history)
         self._history.append(Step(number, 0, descent.distortion))
-        if settings.record and number % settings.record == 0:
+        if settings.record_every and number % settings.record_every == 0:
             self._path.append(Snapshot(number, self._outward(descent.uv)))
         if settings.callback is not None:
             settings.callback(self._history[-1])

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.geometry.exact.certificate import flipped_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, named
@@ -116,7 +116,7 @@ def air_around(
     number = np.concatenate([boundary, np.zeros(len(points) - len(outline), dtype=np.int64)])
     number[used] = n + np.arange(len(used))
     air = Air(np.ldexp(points[used], exponent), number[triangles], number[len(outline) + np.arange(len(frame))])
-    bad = flipped_triangles(air.F, np.concatenate([places, air.points]))
+    bad = inverted_triangles(air.F, np.concatenate([places, air.points]))
     if bad.size:
         raise ValueError(f"the boundary is too near to itself for air, at {named('vertex', 'vertices', air.F[bad, 0])}")
     return air

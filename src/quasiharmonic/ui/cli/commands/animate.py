@@ -54,13 +54,13 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--polish", choices=arguments.ENERGIES, help="lower this distortion energy in every frame")
     parser.add_argument(
-        "--limit",
+        "--max-motion-ratio",
         type=float,
         metavar="TIMES",
         help="for --polish: no vertex moves more than so many times as far as the boundary does (default: 3)",
     )
     parser.add_argument(
-        "--bridge", action="store_true", help="go past frames that allow no map halfway between those around them"
+        "--fill-gaps", action="store_true", help="go past frames that allow no map halfway between those around them"
     )
     parser.add_argument(
         "--frames-per-second", type=arguments.count, metavar="N", help="of a moving picture (default: 24)"
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.ui.cli import arguments, progress, report
     from quasiharmonic.ui.plot.animation import check_animation
 
-    arguments.settle(options, "limit", None, asked=options.polish is not None, belongs="--polish")
+    arguments.settle(options, "max_motion_ratio", None, asked=options.polish is not None, belongs="--polish")
     drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
     arguments.settle(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
     targets = _files(options.targets)
@@ -105,8 +105,8 @@ def run(options: argparse.Namespace) -> int:
             problem,
             places,
             polish=options.polish,
-            limit=options.limit,
-            bridge=options.bridge,
+            max_motion_ratio=options.max_motion_ratio,
+            fill_gaps=options.fill_gaps,
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,

@@ -88,5 +88,5 @@ def run(options: argparse.Namespace) -> int:
             else f"Every one of {counted('face', 'faces', mesh.faces)} is convex in the plane: that holds however they "
             "are triangulated."
         )
-    report.emit(facts, options.json, "\n".join(lines))
+    report.emit_verdict(facts, options.json, "\n".join(lines))
     return 0 if good else 1

@@ -49,5 +49,5 @@ def run(options: argparse.Namespace) -> int:
         problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
     diagnosis = diagnose(problem)
     facts = {**diagnosis.to_dict(), **report.sizes(problem.domain), "input": str(options.input)}
-    report.emit(facts, options.json, f"{options.input}: {diagnosis.summary()}")
+    report.emit_verdict(facts, options.json, f"{options.input}: {diagnosis.summary()}")
     return 1 if diagnosis.forbids_injective else 0

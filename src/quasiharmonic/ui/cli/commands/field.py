@@ -44,7 +44,7 @@ def add_parser(commands: Commands) -> None:
         help="from a pixel to the next; or two, along x and along y (default: 1)",
     )
     parser.add_argument(
-        "--least",
+        "--min-jacobian",
         type=float,
         default=0.01,
         metavar="DET",
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     with report.about(options.input):
         held = _border(field) if options.hold_border else None
         try:
-            mended = nearest_invertible(field, spacing=spacing, least=options.least, held=held)
+            mended = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
         except RuntimeError as error:
             raise ValueError(str(error)) from error
     _write(options.output, mended.field)
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
             "injective": mended.certificate.injective,
             "bijective": invertible,
             "folds": mended.folds,
-            "moved": int(mended.moved.sum()),
+            "moved": int(mended.moved_mask.sum()),
             "patches": mended.patches,
             "distance": mended.distance,
             "seconds": mended.seconds,

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.mapped import MappedAtlas
-    from quasiharmonic.geometry.curves import Rails
+    from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.geometry.mesh.refinement import Refined
     from quasiharmonic.geometry.mesh.seams import Island
     from quasiharmonic.problem import Problem
@@ -160,7 +160,7 @@ def search(
     polish: str | None,
     max_iterations: int,
     linear_solver: str,
-    slide: bool | Rails = False,
+    slide: bool | BoundaryCurves = False,
     refine: bool = False,
 ) -> MapResult:
     """Solve with progress on the terminal."""
@@ -169,9 +169,9 @@ def search(
 
     way = solve
     if refine:
-        from quasiharmonic.solver.refine.solve_refining import climb
+        from quasiharmonic.solver.refine.attempts import solve_refining
 
-        way = climb
+        way = solve_refining
     with progress.line() as show:
         return way(
             problem,
@@ -188,12 +188,14 @@ def refined_by(problem: Problem, refined: Refined | None) -> Problem:
     """The problem that a result is of."""
     if refined is None:
         return problem
-    from quasiharmonic.solver.refine.solve_refining import on_refinement
+    from quasiharmonic.solver.refine.attempts import on_refinement
 
     return on_refinement(problem, refined)
 
 
-def smoothed(problem: Problem, result: MapResult, linear_solver: str, slide: bool | Rails = False) -> MapResult:
+def smoothed(
+    problem: Problem, result: MapResult, linear_solver: str, slide: bool | BoundaryCurves = False
+) -> MapResult:
     """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
     from quasiharmonic.energies import smoothing
     from quasiharmonic.ui.cli import progress
@@ -240,9 +242,9 @@ def draw(path: Path, judged: Judged, problems: list[Problem], mapped: MappedAtla
     if kind == "distortion":
         return save_distortion_figure(path, rest, F, halved(uv))
     if len(problems) > 1:
-        return save_map_figure(path, rest, F, framed(uv), flipped=judged.inverted)
+        return save_map_figure(path, rest, F, framed(uv), inverted=judged.inverted)
     try:
         tutte = framed(quasi_harmonic_map(problem, linear_solver=mapped.islands[0].result.linear_solver))
     except NotPositiveDefinite:
         tutte = None
-    save_map_figure(path, rest, F, framed(uv), tutte, flipped=judged.inverted, fixed=problem.fixed)
+    save_map_figure(path, rest, F, framed(uv), tutte, inverted=judged.inverted, fixed=problem.fixed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,8 +74,12 @@ def run(options: argparse.Namespace) -> int:
         lines.append(f"mirrored {named('island', 'islands', mirrored)} measured as the other side shows them")
     if found.distances is not None:
         lines.append(found.distances.summary())
-    with nullcontext() if options.export is None else report.after_writing(options.export):
-        report.emit(facts, options.json, "\n".join(lines))
+    text = "\n".join(lines)
+    if options.export is None:
+        report.emit_verdict(facts, options.json, text)
+        return 0
+    with report.after_writing(options.export):
+        report.emit(facts, options.json, text)
     return 0
 
 
@@ -90,5 +93,7 @@ def _table(found: Distortion, count: int) -> str:
         s = found.summary(name)
         numbers = "".join(f"{value:12.4g}" for value in (s.mean, s.median, s.p95, s.minimum, s.maximum))
         lines.append(f"{name:20}{numbers}  {s.highest}")
-    lines.append(f"{len(found.flipped)} of {count} triangles inverted, {len(found.flat)} without area in the rest mesh")
+    lines.append(
+        f"{len(found.inverted)} of {count} triangles inverted, {len(found.flat)} without area in the rest mesh"
+    )
     return "\n".join(lines)

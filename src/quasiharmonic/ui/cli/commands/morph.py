@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.mesh_motion.morphed import Morphed
+    from quasiharmonic.apps.mesh_motion.morphed import MorphResult
     from quasiharmonic.io.fem.files import FemMesh
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray
@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
         facts = {
             **morphed.to_dict(),
             "injective": not inverted.size,
-            "flipped": inverted.tolist(),
+            "inverted": inverted.tolist(),
             "drift": drift if drift is None or isfinite(drift) else None,
             "input": str(options.input),
             "output": str(options.output),
@@ -142,7 +142,7 @@ def _rest(path: Path, mesh: FemMesh) -> FloatArray:
     return first.points
 
 
-def _sentences(morphed: Morphed, inverted: int, drift: float | None, output: Path) -> str:
+def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output: Path) -> str:
     before, after = morphed.quality_before, morphed.quality_after
     what = "triangle" if morphed.F.shape[1] != 4 else "quadrilateral"
     verdict = f"{inverted} of {len(after)} {what}s are not positive" if inverted else f"every {what} is positive"

@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, draw."""
     from quasiharmonic import io
-    from quasiharmonic.geometry.exact.certificate import flipped_triangles
+    from quasiharmonic.geometry.exact.certificate import inverted_triangles
     from quasiharmonic.ui.cli import arguments, report
     from quasiharmonic.ui.plot import save_distortion_figure, save_map_figure, save_texture_figure
 
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
         elif options.kind == "texture" or options.picture is not None:
             save_texture_figure(options.output, V, F, uv, picture=options.picture)
         else:
-            save_map_figure(options.output, V, F, uv, flipped=flipped_triangles(F, uv))
+            save_map_figure(options.output, V, F, uv, inverted=inverted_triangles(F, uv))
     with report.after_writing(options.output):
         print(f"wrote {options.output}", flush=True)
     return 0

@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding import moved_onto
 from quasiharmonic.energies.polishing import energy_named, polished
-from quasiharmonic.geometry.curves.boundary_curves import Rails
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.mesh.refinement import Refined, composed, split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import MapResult, Rung, Stage, Status, Step
+from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status, Step
 from quasiharmonic.solver.construction.constructing import Construction, constructions, refined_problem
 from quasiharmonic.solver.construction.opening import thinned
 from quasiharmonic.solver.construction.simplicity import is_simple
@@ -36,7 +36,7 @@ from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.solver.search.strategy import soonest, stages_of, without_restarts
 from quasiharmonic.targets.boundary.chords import flattened_edges
 from quasiharmonic.util.arrays import IntArray
-from quasiharmonic.util.progress import heard
+from quasiharmonic.util.progress import reports_progress
 
 AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
     "as given",
@@ -53,8 +53,8 @@ _FEW_ITERATIONS, _FEW_TRIANGLES, _FEW_ROUNDS, _ROUNDS = 600, 1_500_000, 1, 3
 _LEAST = 1
 
 
-@heard
-def climb(
+@reports_progress
+def solve_refining(
     problem: Problem,
     *,
     strategy: str | Stages = "speed",
@@ -63,15 +63,15 @@ def climb(
     max_iterations: int = 2000,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    record: int = 0,
-    slide: bool | Rails = False,
+    record_every: int = 0,
+    slide: bool | BoundaryCurves = False,
 ) -> MapResult:
     """Solve a problem, on a finer mesh where that is needed.
 
     Parameters
     ----------
     problem : Problem
-    strategy, polish, start, max_iterations, linear_solver, callback, record, slide
+    strategy, polish, start, max_iterations, linear_solver, callback, record_every, slide
         As of `injective_map`; those of the search are for the mesh as given.
 
     Returns
@@ -99,10 +99,10 @@ def climb(
             max_iterations=min(budget, max_iterations),
             linear_solver=linear_solver,
             callback=callback,
-            record=record if on is problem else 0,
+            record_every=record_every if on is problem else 0,
         )
 
-    result = _Ladder(problem, search).climb(start, max_iterations)
+    result = _Ladder(problem, search).solve_refining(start, max_iterations)
     if lower is not None and result.status is Status.INJECTIVE:
         fine = on_refinement(problem, result.refined)
         result = polished(fine, result, energy=lower, linear_solver=linear_solver, callback=callback, slide=slide)
@@ -124,21 +124,21 @@ class _Ladder:
         self._some: _Choice = list
         # Inner edges that a straight side of the target flattens.
         self._flat = flattened_edges(problem.F, problem.fixed, problem.target)
-        self._rungs: list[Rung] = []
+        self._rungs: list[RefinementAttempt] = []
         # The latest result, with the stages and the history of all before it; and the best.
         self._last: MapResult | None = None
         self._best: MapResult | None = None
 
-    def climb(self, start: ArrayLike | None, budget: int) -> MapResult:
+    def solve_refining(self, start: ArrayLike | None, budget: int) -> MapResult:
         """The result of the rung that adds the fewest vertices; where none leads to a map, of the last."""
         try:
-            return replace(self._climb(start, budget), rungs=self._rungs)
+            return replace(self._climb(start, budget), refinement_attempts=self._rungs)
         except KeyboardInterrupt:
             if self._last is None or self._best is None:
                 raise
             best = self._taken(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
             best = replace(best, stages=self._last.stages, history=self._last.history)
-            return replace(best, status=Status.INTERRUPTED, rungs=self._rungs)
+            return replace(best, status=Status.INTERRUPTED, refinement_attempts=self._rungs)
 
     def _climb(self, start: ArrayLike | None, budget: int) -> MapResult:
         problem = self._problem
@@ -169,7 +169,7 @@ class _Ladder:
 
     def _taken(self, made: MapResult) -> MapResult:
         """The constructed map, with what was done before it is handed back."""
-        self._rungs.append(Rung(CONSTRUCTED, made.added, made.injective, made.stages[-1].seconds))
+        self._rungs.append(RefinementAttempt(CONSTRUCTED, made.added, made.injective, made.stages[-1].seconds))
         return made
 
     def _between(self, first: MapResult, budget: int, rounds: int) -> MapResult | None:
@@ -213,7 +213,7 @@ class _Ladder:
         result = self._continued(result)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        self._rungs.append(Rung(name, result.added, result.injective, time.perf_counter() - began))
+        self._rungs.append(RefinementAttempt(name, result.added, result.injective, time.perf_counter() - began))
         return result
 
     def _constructed(self, first: MapResult) -> MapResult:
@@ -228,7 +228,7 @@ class _Ladder:
         return replace(result, stages=[*others, replace(last, seconds=time.perf_counter() - began)])
 
     def _as_result(self, made: Construction, first: MapResult, seconds: float) -> MapResult:
-        bad = made.certificate.flipped.size + made.certificate.degenerate.size
+        bad = made.certificate.inverted.size + made.certificate.degenerate.size
         stage = Stage(CONSTRUCTED, 0, seconds, (len(self._problem.F), bad), (np.inf, np.inf))
         return replace(
             first,
@@ -259,13 +259,13 @@ class _Ladder:
 def _status(made: Construction) -> Status:
     if made.certificate.bijective:
         return Status.INJECTIVE
-    return Status.NO_ROOM if made.cut else Status.ENTANGLED
+    return Status.PRECISION_LIMIT if made.cut else Status.TOO_MANY_SPLITS
 
 
 def _rank(result: MapResult) -> tuple[int, bool, int]:
     """The lower, the better."""
     certificate = result.certificate
-    bad = certificate.flipped.size + certificate.degenerate.size + certificate.nonfinite.size
+    bad = certificate.inverted.size + certificate.degenerate.size + certificate.nonfinite.size
     return bad, not certificate.bijective, result.added
 
 
@@ -277,7 +277,7 @@ def _if_any(refined: Refined) -> Refined | None:
 def _around(refined: Refined, certificate: Certificate) -> IntArray:
     """Inner edges (s, 2) of the triangles that are not positive, and of those around them."""
     F, n = refined.F, len(refined.V)
-    bad = np.concatenate([certificate.flipped, certificate.degenerate])
+    bad = np.concatenate([certificate.inverted, certificate.degenerate])
     near = np.zeros(n, dtype=np.bool_)
     near[F[bad]] = True
     tail, head = F[near[F].any(axis=1)], np.roll(F[near[F].any(axis=1)], -1, axis=1)
