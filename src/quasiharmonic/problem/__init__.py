@@ -1,7 +1,7 @@
-"""The question and the answer: a surface with fixed vertices and their targets, the result, and why there is no map.
+"""Mapping problems and results: a surface with fixed vertices and targets, the map, and the diagnosis.
 
-The package builds on `geometry` and `linsolve`. Start reading in `domain`, then `problem`; `result` is the answer, and
-`diagnosis` names what forbids a map.
+The package builds on `geometry` and `linsolve`. Start reading in `domain`, then `problem`; `result` is the solver's
+result, and `diagnosis` reports obstructions to a map.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Many small problems posed at once, for less than each would cost alone.
+"""Build many small problems at once, faster than one by one.
 
-What is looked at when a problem is posed takes some microseconds a call however small the mesh is. So meshes are laid
-side by side, none joined to another, and are checked and their boundaries traced as one. Nothing is said here of what
-is wrong: where anything is, `Problem` says it, of one after another.
+The checks of a problem cost some microseconds per NumPy call, even for small meshes. This module concatenates the
+meshes as separate components, then checks them and traces their boundaries together. It does not report errors: if a
+check fails, the caller builds each `Problem` by itself, which raises the error.
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.problem import Problem
 from quasiharmonic.util.arrays import IntArray, index_array, real_array, triangle_rows
 
-# Binary orders of magnitude in which meshes may be, so that none of their lengths leaves the numbers' range.
+# Largest binary exponent of a mesh's size, in absolute value, so that lengths neither overflow nor underflow.
 _ORDERS = 400
 
 Given = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 def posed_each(given: Sequence[Given]) -> list[Problem] | None:
-    """Pose problems on a mesh each: what `Problem` makes of each, with no reference of their own.
+    """Return a `Problem` for each mesh, without an explicit reference, or None.
 
     Parameters
     ----------
     given : sequence of (V, F, fixed, target)
-        As `Problem` takes them, as arrays of NumPy.
+        The arguments of `Problem`, as NumPy arrays.
 
     Returns
     -------
     list of Problem or None
-        None where anything is the matter with one of them, or they are not alike enough: then each has to be posed by
-        itself.
+        None if a check fails for any of the meshes, or if they differ in dimension. Then build each problem by itself.
     """
     try:
         V = [real_array("V", one[0]) for one in given]
@@ -88,7 +87,7 @@ def posed_each(given: Sequence[Given]) -> list[Problem] | None:
 
 
 def _renumbered(own: Sequence[IntArray], starts: IntArray) -> IntArray | None:
-    """Vertices of all meshes in common numbers, or None where some are none of their own mesh's."""
+    """Return the vertices of all meshes in a common numbering, or None if an index is out of its mesh's range."""
     for indices, n in zip(own, np.diff(starts).tolist(), strict=True):
         if indices.size and (indices.min() < 0 or indices.max() >= n):
             return None
@@ -96,13 +95,13 @@ def _renumbered(own: Sequence[IntArray], starts: IntArray) -> IntArray | None:
 
 
 def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
-    """The edges of meshes side by side, or None where one is no connected surface with boundary."""
+    """Return the edges of the concatenated meshes, or None unless each is a connected surface with boundary."""
     a, b, c = F.T
     n = int(starts[-1])
     found = edges(F, n)
     if ((a == b) | (b == c) | (c == a)).any() or found.nonmanifold.size or found.inconsistent.size:
         return None
-    # A vertex without triangle is a component of its own.
+    # A vertex of no triangle is a component of its own.
     if not np.array_equal(components(F, n), np.repeat(starts[:-1], np.diff(starts))):
         return None
     bounded = np.zeros(starts.size - 1, dtype=bool)
@@ -111,7 +110,7 @@ def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
 
 
 def _areas(V: NDArray[np.float64], F: IntArray, starts: IntArray) -> bool:
-    """Whether all triangles certainly have an area at rest, as `Domain.check_areas` computes it."""
+    """Return whether all triangles have a positive rest area, computed as in `Domain.check_areas`."""
     size = np.maximum.reduceat(np.abs(V).max(axis=1), starts[:-1])
     exponent = np.frexp(size)[1]
     if (np.abs(exponent) > _ORDERS).any():
@@ -121,6 +120,6 @@ def _areas(V: NDArray[np.float64], F: IntArray, starts: IntArray) -> bool:
 
 
 def _parted(pairs: IntArray, starts: IntArray) -> list[IntArray]:
-    """Edges in the order of their smaller ends, (e, 2), mesh by mesh in its own numbers."""
+    """Split edges (e, 2), sorted by their smaller vertex, by mesh and convert them to each mesh's own numbering."""
     ends = np.searchsorted(np.minimum(pairs[:, 0], pairs[:, 1]), starts[1:-1])
     return [part - start for part, start in zip(np.split(pairs, ends), starts[:-1].tolist(), strict=True)]

@@ -1,4 +1,4 @@
-"""Where a map lives: a surface, and which of its vertices are held. Where they go is another question (`Problem`)."""
+"""The domain of a map: a surface and its fixed vertices. `Problem` adds the target positions."""
 
 from __future__ import annotations
 
@@ -27,37 +27,37 @@ from quasiharmonic.util.arrays import (
 
 
 class Domain(ReadOnly):
-    """A surface with some of its vertices held: all that does not change while they move.
+    """A surface and its fixed vertices: all data that does not depend on the target positions.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array
         Rest positions, planar or curved; any real dtype.
     F : (f, 3) array of int
-        Triangles, 0-based and consistently oriented. Never reordered.
+        Triangles, 0-based and consistently oriented. Their order is kept.
     fixed : (k,) array of int
-        Vertices whose positions are given.
+        Vertices with prescribed positions.
 
     Raises
     ------
     ValueError
-        With the first offending elements: wrong shapes or dtypes, indices out of range, numbers that
-        are not finite, repeated or non-manifold elements, mixed winding, several components, isolated
-        vertices, a closed surface, a vertex held twice.
+        With the first offending elements: wrong shapes or dtypes, indices out of range, numbers that are not finite,
+        repeated or non-manifold elements, mixed orientation, several components, isolated vertices, a closed surface, a
+        vertex fixed twice.
 
     Attributes
     ----------
     V, F, fixed : arrays
-        As given, as float64 and int64; not writeable.
+        The input as float64 and int64; not writeable.
     edges : Edges
-        The surface's, by kind.
+        The edges of the surface, by kind.
     loops : list of (l,) int64
-        Boundary loops, the surface to their left; not writeable.
+        Boundary loops, with the surface to their left; not writeable.
 
     Notes
     -----
-    Factorisations are shared by all that is asked of a domain, in any thread. Answers do not depend on that; to save
-    the refactoring, see `exclusive`.
+    All solves on a domain share its factorisations, in any thread. Results do not depend on this sharing. To avoid
+    repeated factorisations, see `exclusive`.
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike) -> None:
@@ -73,13 +73,13 @@ class Domain(ReadOnly):
         return self.V, self.F, self.fixed, *vars(self.edges).values(), *self.loops
 
     def _empty_caches(self) -> None:
-        """Nothing made yet of what is made when it is first asked for, and kept."""
+        """Reset the objects that are computed on first use."""
         self._lock = Lock()
         self._laplacians: dict[str, Laplacian] = {}
         self._meshes: dict[Reference, ReferenceMesh] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        # Factorisations live in a library's memory and stay behind when a domain is pickled or copied.
+        # Factorisations belong to an external library's memory, so pickles and copies omit them.
         return {name: getattr(self, name) for name in ("V", "F", "edges", "loops", "fixed")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -88,9 +88,9 @@ class Domain(ReadOnly):
 
     @contextmanager
     def exclusive(self) -> Iterator[Domain]:
-        """Give this domain, or a twin with factorisations of its own while somebody else is using this one's.
+        """Yield this domain, or a copy with its own factorisations if this domain is already in use.
 
-        Two threads, or a solve within another's callback, would otherwise take turns at refactoring.
+        Without the copy, two threads, or a solve inside another solve's callback, would refactor alternately.
         """
         if not self._lock.acquire(blocking=False):
             twin = object.__new__(Domain)
@@ -116,7 +116,7 @@ class Domain(ReadOnly):
         return np.flatnonzero(marked)
 
     def check_boundary_fixed(self) -> None:
-        """Raise a ValueError that names boundary vertices which are not held, for methods that need all of them."""
+        """Raise a ValueError with the boundary vertices that are not fixed, for methods that need all of them fixed."""
         marked = np.zeros(self.n, dtype=bool)
         marked[self.edges.boundary] = True
         marked[self.fixed] = False
@@ -128,7 +128,7 @@ class Domain(ReadOnly):
             )
 
     def check_areas(self) -> None:
-        """Raise a ValueError that names triangles without area at rest, for methods that look at their shapes."""
+        """Raise a ValueError with the triangles of zero rest area, for methods that use their shapes."""
         flat = flat_triangles(self.V, self.F)
         if flat.size:
             raise ValueError(
@@ -137,7 +137,7 @@ class Domain(ReadOnly):
             )
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
-        """The Laplacian of this mesh and these fixed vertices, analysed once and kept (§6.2, eq. 12).
+        """Return the Laplacian of this mesh and these fixed vertices; it is analysed once and cached (§6.2, eq. 12).
 
         Parameters
         ----------
@@ -147,23 +147,23 @@ class Domain(ReadOnly):
         Returns
         -------
         Laplacian
-            Shared by all that ask for it.
+            The same object for all callers.
 
         Raises
         ------
         ValueError
-            When there is no such solver.
+            If the solver is unknown.
         ImportError
-            When its library is not installed.
+            If the solver's library is not installed.
         """
         if linear_solver not in self._laplacians:
             made = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
-            # "auto" and the name it stands for share one analysis.
+            # "auto" and the solver that it selects share one analysis.
             self._laplacians[linear_solver] = self._laplacians.setdefault(made.solver.name, made)
         return self._laplacians[linear_solver]
 
     def mesh(self, kind: Reference) -> ReferenceMesh:
-        """The mesh with reference triangles of some kind, built once and kept (§9.3).
+        """Return the mesh with reference triangles of one kind; it is built once and cached (§9.3).
 
         Parameters
         ----------
@@ -175,8 +175,8 @@ class Domain(ReadOnly):
 
         Notes
         -----
-        In units near the rest mesh's size, a power of two, so that no area leaves the numbers' range; the
-        functionals have no scale.
+        Positions are scaled by a power of two to magnitude one, so that no area overflows or underflows. The
+        functionals are scale-invariant.
         """
         if kind not in self._meshes:
             V = self.V

@@ -1,4 +1,4 @@
-"""The question: a surface with some of its vertices held, and where these go."""
+"""The mapping problem: a surface, its fixed vertices and their target positions."""
 
 from __future__ import annotations
 
@@ -23,40 +23,39 @@ if TYPE_CHECKING:
 
 
 class Problem(ReadOnly, Displayable):
-    """A mesh with positions in the plane for its boundary and any pinned interior vertices.
+    """A mesh with target positions for its boundary and any pinned interior vertices.
 
-    What is malformed raises; what is merely hard or hopeless (a target that crosses itself, is wound
-    the wrong way or admits no map) is accepted and ends in a result that says so.
+    Malformed input raises an error. Targets that cross themselves, have the wrong orientation or admit no map are
+    accepted; the result then reports the failure.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions, planar or curved; any real dtype.
     F : (f, 3) array of int
-        Triangles, 0-based and consistently oriented. Never reordered. A planar target is wound as the
-        mesh is: counterclockwise around a mesh whose triangles are counterclockwise.
+        Triangles, 0-based and consistently oriented. Their order is kept. The target needs the orientation of the mesh:
+        counterclockwise around a mesh of counterclockwise triangles.
     fixed : (k,) array of int
-        Vertices with given positions: at least the whole boundary, and any interior vertices.
+        Fixed vertices: the whole boundary, and any interior vertices.
     target : (k, 2) array
-        Their positions, in the order of ``fixed``; any real dtype.
+        Their target positions, in the order of ``fixed``; any real dtype.
     reference : {"equilateral", "rest", "corrected"}, optional
-        Shape of the triangles in which gradients are taken (see `ReferenceMesh`), whatever the strategy
-        would choose.
+        Shape of the triangles in which gradients are taken (see `ReferenceMesh`). It overrides the choice of the
+        strategy.
 
     Raises
     ------
     ValueError
-        With the first offending elements: what `Domain` refuses, boundary vertices without a position, and
-        triangles of zero area in the rest mesh. Those last are accepted when the reference is
-        ``"equilateral"`` or ``"corrected"`` by the caller's own word: that says that their shapes, and
-        the distortion that nobody could measure, do not matter.
+        With the first offending elements: for the conditions that `Domain` checks, boundary vertices that are not
+        fixed, and triangles of zero area in the rest mesh. With an explicit reference ``"equilateral"`` or
+        ``"corrected"``, triangles of zero area are accepted.
 
     Attributes
     ----------
     domain : Domain
-        The surface and its held vertices, shared with all problems that `moved` makes of this one.
+        The surface and its fixed vertices. Problems that `with_target` returns share it.
     target : (k, 2) float64
-        As given; not writeable.
+        Target positions as given; not writeable.
     """
 
     domain: Domain
@@ -97,21 +96,21 @@ class Problem(ReadOnly, Displayable):
 
     @classmethod
     def on(cls, domain: Domain, target: ArrayLike, *, reference: Reference | None = None) -> Problem:
-        """A problem on a domain at hand, whose topology and symbolic factorisation it shares.
+        """Return a problem on an existing domain, sharing its topology and symbolic factorisation.
 
         Parameters
         ----------
         domain : Domain
-            With its whole boundary held.
+            A domain whose whole boundary is fixed.
         target : (k, 2) array
-            Where ``domain.fixed`` go.
+            Target positions of ``domain.fixed``.
         reference : {"equilateral", "rest", "corrected"}, optional
-            As of `Problem`; rest areas are not looked at.
+            As in `Problem`. Rest areas are not checked.
 
         Raises
         ------
         ValueError
-            When there are not as many places as fixed vertices, or one is not finite.
+            If the number of target positions differs from the number of fixed vertices, or one is not finite.
         """
         problem = object.__new__(cls)
         problem._pose(domain, target, reference)
@@ -127,7 +126,7 @@ class Problem(ReadOnly, Displayable):
         return (self.target,)
 
     def with_target(self, target: ArrayLike) -> Problem:
-        """The same problem with its fixed vertices elsewhere.
+        """Return the same problem with other target positions.
 
         Parameters
         ----------
@@ -137,18 +136,18 @@ class Problem(ReadOnly, Displayable):
         Returns
         -------
         Problem
-            A new one on the same domain; this one stays as it is.
+            A new problem on the same domain; this problem is not modified.
 
         Raises
         ------
         ValueError
-            When there are not as many places as fixed vertices, or one is not finite.
+            If the number of target positions differs from the number of fixed vertices, or one is not finite.
         """
         return Problem.on(self.domain, target, reference=self.reference)
 
     @contextmanager
     def exclusive(self) -> Iterator[Problem]:
-        """Give this problem, or a twin on a domain that nobody else is using; see `Domain.exclusive`."""
+        """Yield this problem, or an equal problem on an unused copy of its domain; see `Domain.exclusive`."""
         with self.domain.exclusive() as domain:
             yield self if domain is self.domain else Problem.on(domain, self.target, reference=self.reference)
 
@@ -169,7 +168,7 @@ class Problem(ReadOnly, Displayable):
 
     @property
     def fixed(self) -> IntArray:
-        """The domain's held vertices (k,) int64."""
+        """The domain's fixed vertices (k,) int64."""
         return self.domain.fixed
 
     def short_repr(self) -> str:
@@ -177,7 +176,7 @@ class Problem(ReadOnly, Displayable):
         return f"{self.n:,} vertices, {len(self.F):,} triangles, {loops}, {len(self.fixed):,} fixed"
 
     def summary(self) -> str:
-        """Say in a few lines what is to be mapped and where its fixed vertices go."""
+        """Return a few lines of text about the mesh and the extent of its target positions."""
         (left, lower), (right, upper) = self.target.min(axis=0), self.target.max(axis=0)
         curved = self.V.shape[1] == 3 and np.ptp(self.V[:, 2]) > 0
         loops = counted("boundary loop", "boundary loops", len(self.domain.loops))
@@ -191,27 +190,27 @@ class Problem(ReadOnly, Displayable):
         )
 
     def plot(self) -> Figure:
-        """Draw the surface beside where its boundary and its pins go; a matplotlib Figure."""
+        """Draw the surface beside the target positions of its boundary and pins; return a matplotlib Figure."""
         figure: Figure = self._draw("problem")
         return figure
 
     @cached_property
     def frame(self) -> Frame:
-        """The coordinates in which the problem is solved."""
+        """The `Frame`, the coordinates in which the problem is solved."""
         return Frame(self.target)
 
     def positions(self, w: ComplexArray) -> FloatArray:
-        """A map of the frame as the caller gets it, the fixed vertices to the last bit.
+        """Return the positions of a map in the target's units, with fixed vertices exactly at their targets.
 
         Parameters
         ----------
         w : (n,) complex128
-            Places u + iv in the frame that is solved in.
+            Positions u + iv in the coordinates of `frame`.
 
         Returns
         -------
         (n, 2) float64
-            In the target's units.
+            Positions in the target's units.
         """
         uv = self.frame.outward(w)
         uv[self.fixed] = self.target
@@ -219,20 +218,20 @@ class Problem(ReadOnly, Displayable):
 
     @cached_property
     def held(self) -> ComplexArray:
-        """The fixed vertices' places in the frame, zero elsewhere (n,) complex128; not to be written to."""
+        """Target positions of the fixed vertices in the frame, zero elsewhere (n,) complex128; do not write to it."""
         w = np.zeros(self.n, dtype=np.complex128)
         w[self.fixed] = self.frame.inward(self.target)
         return w
 
     @cached_property
     def encloses_area(self) -> bool:
-        """Whether the target's boundary may enclose a positive area, as the triangles of an injective map add up to.
+        """Whether the target's boundary may enclose a positive area, which an injective map requires.
 
-        False only where it certainly does not: all positions are equal, or the boundary is wound the wrong way.
+        False is certain: all positions are equal, or the boundary has the wrong orientation.
         """
         area = 0.0
         for loop in self.domain.loops:
             x, y = self.held[loop].view(np.float64).reshape(-1, 2).T
             area += 0.5 * float((x[:-1] * y[1:] - y[:-1] * x[1:]).sum() + (x[-1] * y[0] - y[-1] * x[0]))
-        # The frame is of unit size, so rounding stays far below this.
+        # The frame has unit size, so rounding errors are far below this tolerance.
         return area > -1e-12 and bool(np.any(self.target != self.target[0]))

@@ -1,4 +1,4 @@
-"""What a solver hands back: the map, the verdict on it, and what was done to get there."""
+"""The result of a solver: the map, its certificate, and the stages that ran."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Status(Enum):
-    """What happened, and what to do next; the value is a sentence for the user."""
+    """Outcome of a solve; the value is a message for the user with the outcome and the next action."""
 
     INJECTIVE = "Every triangle is strictly positive, decided exactly."
     STALLED = (
@@ -84,21 +84,22 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Stage:
-    """One thing that ran, and what it brought.
+    """One stage of a solve and its effect.
 
     Attributes
     ----------
     name : str
-        What ran, in words a log can show.
+        Name of the stage, for logs.
     iterations : int
-        Evaluations of the objective; the very first one of all, the start, is not counted.
+        Evaluations of the objective. The evaluation of the initial map is not counted.
     seconds : float
+        Wall time.
     inverted : tuple of int
-        Triangles not strictly positive before and after.
+        Number of triangles that are not strictly positive, before and after.
     energy : tuple of float
-        V₃ over the target's area before and after (dimensionless); for a polish, the mean energy.
+        V₃ divided by the target's area, before and after (dimensionless). For a polish, the mean energy.
     kept : bool
-        Whether its result was taken on; what makes a map worse is discarded.
+        Whether the result of the stage was kept. A result that makes the map worse is discarded.
     """
 
     name: str
@@ -114,13 +115,13 @@ class Stage:
         return f"{self.name}: {self.iterations} iterations, {self.seconds:.3g} s, {before} → {after} inverted{kept}"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the stage as a dictionary for JSON."""
         return {
             "name": self.name,
             "iterations": self.iterations,
             "seconds": self.seconds,
             "inverted": list(self.inverted),
-            # JSON has no infinity: before the first stage there is no energy.
+            # JSON has no infinity, and the energy before the first stage is infinite.
             "energy": [e if isfinite(e) else None for e in self.energy],
             "kept": self.kept,
         }
@@ -128,16 +129,16 @@ class Stage:
 
 @dataclass(frozen=True)
 class Step:
-    """One line of the history: the state of the map at one iteration.
+    """One entry of the history: the state of the map at one iteration.
 
     Attributes
     ----------
     iteration : int
     inverted : int
-        Triangles whose area, in floating point, is not positive.
+        Triangles whose floating-point area is not positive.
     energy : float
-        V₃ over the target's area: dimensionless, 0 only at injective maps, and the smaller the nearer. In a
-        polish, the mean energy.
+        V₃ divided by the target's area (dimensionless). It is 0 only at injective maps, and decreases towards them. In
+        a polish, the mean energy.
     """
 
     iteration: int
@@ -147,12 +148,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The map at one iteration; flips and energy are ``history[iteration]``.
+    """The map at one iteration; ``history[iteration]`` has its inverted triangles and energy.
 
     Attributes
     ----------
     iteration : int
     uv : (n, 2) float64
+        Positions of the vertices.
     """
 
     iteration: int
@@ -161,17 +163,18 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class RefinementAttempt:
-    """One rung of the ladder that `injective_map` climbs with ``refine``.
+    """One refinement stage of `injective_map` with ``refine``.
 
     Attributes
     ----------
     name : str
-        What was mapped: the mesh as given, or with which edges split.
+        The mesh that was mapped: the given mesh, or which edges were split.
     added : int
-        Vertices that the mesh had more than the one given, after those were taken out that the map did not need.
+        Number of added vertices, after the removal of those that the map did not need.
     injective : bool
-        Whether its map is (certified).
+        Whether the map is injective (certified).
     seconds : float
+        Wall time.
     """
 
     name: str
@@ -180,50 +183,50 @@ class RefinementAttempt:
     seconds: float
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the attempt as a dictionary for JSON."""
         return {"name": self.name, "added": self.added, "injective": self.injective, "seconds": self.seconds}
 
 
 @dataclass(frozen=True, repr=False)
 class MapResult(ReadOnly, Displayable):
-    """A map of the mesh into the plane.
+    """A map of the mesh into the plane, with its certificate.
 
     Attributes
     ----------
     uv : (n, 2) float64
-        Positions, the fixed vertices exactly at their target. Yours to write to: the certificate has a copy
-        of its own, and stays about that.
+        Positions of the vertices; fixed vertices are exactly at their target positions. Writeable: the certificate
+        keeps its own copy.
     status : Status
-        What happened and what to do next.
+        Outcome of the solve and the next action.
     certificate : Certificate
-        The exact verdict on ``uv``.
+        The exact certificate of ``uv``.
     stages : list of Stage
-        What ran, how long, what it brought.
+        The stages that ran, in order.
     history : list of Step
-        Flips and energy at every iteration.
+        Number of inverted triangles and energy at every iteration.
     diagnosis : Diagnosis or None
-        What forbids a map, examined where none was found.
+        Obstructions to a map, if no map was found.
     linear_solver : str
-        The backend that solved the linear systems.
+        Name of the linear solver.
     seconds : float
-        Wall time from the call to the verdict.
+        Wall time of the call, including the certificate.
     mu : (f,) complex128 or None
-        Beltrami coefficients of the tensors of this map: where it is injective, `quasi_harmonic_map` of them
-        gives it back. None after a polish.
+        Beltrami coefficients of the tensors of this map. If the map is injective, `quasi_harmonic_map` of them returns
+        the same map. None after a polish.
     reference : str
-        The triangles in whose frames they are expressed.
+        The reference triangles in whose frames ``mu`` is expressed.
     path : list of Snapshot
-        Maps on the way, where the caller asked to have them recorded.
+        Intermediate maps, if the caller asked to record them.
     V : (n, 2) or (n, 3) float64 or None
-        Rest positions of what was mapped, for pictures and measures, not writeable; None where whoever made the map did
-        not say.
+        Rest positions of the mapped mesh, for plots and distortion measures; not writeable. None if the caller passed
+        no surface.
     refined : Refined or None
-        Where edges were split (``refine``): the mesh that this is a map of, and how it came from the one given. Old
-        vertices keep their numbers.
-    refinement_attempts : list of Rung
-        What was tried, in order, where edges might be split.
+        The refined mesh that was mapped and its relation to the given mesh, if edges were split (``refine``). The given
+        vertices keep their indices.
+    refinement_attempts : list of RefinementAttempt
+        The attempts in order, if ``refine`` allowed to split edges.
     crowded : (c,) int64
-        With ``PRECISION_LIMIT`` the fixed vertices next to what stays inverted.
+        With ``PRECISION_LIMIT``, the fixed vertices next to the triangles that stay inverted.
     """
 
     uv: NDArray[np.float64]
@@ -244,7 +247,7 @@ class MapResult(ReadOnly, Displayable):
 
     def __post_init__(self) -> None:
         if self.V is not None:
-            # Seen through this result alone: whoever handed it over may still write.
+            # A read-only view; the caller's own array stays writeable.
             object.__setattr__(self, "V", self.V.view())
         self._seal()
 
@@ -253,12 +256,12 @@ class MapResult(ReadOnly, Displayable):
 
     @property
     def added(self) -> int:
-        """Vertices that were added, after the old ones."""
+        """Number of added vertices; they follow the given vertices."""
         return 0 if self.refined is None else len(self.refined.parents)
 
     @property
     def F(self) -> NDArray[np.int64]:
-        """The triangles (f, 3) int64, as they were judged."""
+        """The triangles (f, 3) int64 that the certificate covers."""
         return self.certificate.F
 
     @property
@@ -276,38 +279,39 @@ class MapResult(ReadOnly, Displayable):
         return f"{self.certificate.short_repr()}, {steps}, {self.seconds:.3g} s"
 
     def summary(self) -> str:
-        """Say in a few lines what happened, what is certified, what ran, and what forbids a map where that is known."""
+        """Return a few lines of text: outcome, certificate, stages, and the diagnosis if there is one."""
         lines = [self.status.value, self.certificate.summary()]
         lines += [str(stage) for stage in self.stages]
         lines.append(f"{self.seconds:.3g} s in all, solved by {self.linear_solver or 'no linear solver'}")
         return "\n".join(lines if self.diagnosis is None else [*lines, self.diagnosis.summary()])
 
     def plot(self, kind: str = "map", *, measure: str = "isometric") -> Figure:
-        """Draw the surface and its map, or how the search went.
+        """Draw the surface and its map, or the convergence history.
 
         Parameters
         ----------
         kind : {"map", "distortion", "texture", "convergence"}
-            The surface beside the map, inverted triangles in red; both coloured by a measure, and its histogram; with
-            a checkerboard; or flips and energy by iteration.
+            ``"map"``: the surface beside the map, inverted triangles in red. ``"distortion"``: both coloured by a
+            measure, with its histogram. ``"texture"``: both with a checkerboard. ``"convergence"``: inverted triangles
+            and energy by iteration.
         measure : str
             For ``"distortion"``: one of `quasiharmonic.energies.measures.MEASURES`.
 
         Returns
         -------
         matplotlib Figure
-            Displayable by notebooks as it is; see `quasiharmonic.plot`.
+            Notebooks display it directly; see `quasiharmonic.plot`.
 
         Raises
         ------
         ValueError
-            When there is no such kind or measure, or the result does not know its surface.
+            If ``kind`` or ``measure`` is unknown, or ``V`` is None.
         """
         figure: Figure = self._draw(kind, measure=measure)
         return figure
 
     def to_dict(self) -> dict[str, Any]:
-        """The report of ``--json``: everything but the map itself, in plain Python types."""
+        """Return the report of ``--json``: all data except the map itself, in plain Python types."""
         return {
             "injective": self.injective,
             "status": self.status.name.lower(),
@@ -322,7 +326,7 @@ class MapResult(ReadOnly, Displayable):
         }
 
     def _refinement(self) -> dict[str, Any]:
-        """What the report says where edges might be split."""
+        """Return the part of the report about refinement."""
         return {
             "added_vertices": self.added,
             "refinement_attempts": [rung.to_dict() for rung in self.refinement_attempts],

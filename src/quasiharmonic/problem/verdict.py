@@ -1,6 +1,6 @@
-"""The public functions that decide whether a map is injective: triangles may be given as a mesh object or a file.
+"""Public functions that certify a map; triangles may be given as a mesh object or a file.
 
-The decision is in `quasiharmonic.geometry.exact.certificate`, which takes arrays.
+The computation is in `quasiharmonic.geometry.exact.certificate`, which takes arrays.
 """
 
 from __future__ import annotations
@@ -18,38 +18,37 @@ from quasiharmonic.util.arrays import IntArray
 def certify(
     F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[ArrayLike] | None = None
 ) -> Certificate:
-    """Judge a map exactly, on its coordinates as stored.
+    """Certify exactly whether a map is injective and bijective, on its coordinates as stored.
 
     Parameters
     ----------
     F : (f, 3) int, or a mesh
-        Triangles, any integer dtype; or a mesh object, or the path of a file, for its triangles.
+        Triangles, any integer dtype; or a mesh object or the path of a file that has the triangles.
     uv : (n, 2) float
-        Place of every vertex, any dtype that double precision holds exactly. What a consumer in
-        single precision would see is ``certify(F, uv.astype(np.float32))``. Vertices of no triangle
-        are not looked at.
+        Position of every vertex, in any dtype that converts to double precision exactly. To certify a map for single
+        precision, call ``certify(F, uv.astype(np.float32))``. Vertices of no triangle are ignored.
     boundary : bool
-        Judge the boundary too, so that `Certificate.bijective` is known. All components count
-        together: islands that overlap are not bijective.
+        Check the boundary too, which `Certificate.bijective` requires. All components count together: overlapping
+        islands are not bijective.
     loops : sequence of (l,) int, optional
-        The boundary loops of a mesh that is known to be a surface, as `boundary_loops` gives them, at least one and of
-        three vertices or more. That they are the loops of ``F`` is taken on trust, and to find them is half of the
-        work.
+        The boundary loops of ``F``, as `boundary_loops` returns them: at least one loop, each of three or more
+        vertices. ``F`` must be a surface, and the loops must be its own; neither is checked. Passing them saves about
+        half of the time.
 
     Returns
     -------
     Certificate
-        Which triangles are not positive, and why the map is not bijective where it is not.
+        The triangles that are not positive, and the reason if the map is not bijective.
 
     Raises
     ------
     ValueError
-        When ``F``, ``uv`` or a loop has the wrong shape or dtype, there are no loops in ``loops``, or ``F`` or
-        ``loops`` name vertices that are not there.
+        If ``F``, ``uv`` or a loop has the wrong shape or dtype, if ``loops`` is empty, or if ``F`` or ``loops`` has
+        vertex indices out of range.
 
     See Also
     --------
-    is_injective, inverted_triangles : the triangles alone, as an inner loop wants them.
+    is_injective, inverted_triangles : check the triangles only, for inner loops.
 
     Examples
     --------
@@ -63,15 +62,15 @@ def certify(
 
 
 def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
-    """Whether there are triangles and every one is strictly positive, decided exactly.
+    """Return whether the map has triangles and all are strictly positive, decided exactly.
 
-    The predicate to the locator `inverted_triangles`.
+    `inverted_triangles` returns which triangles are not.
 
     Parameters
     ----------
     F : (f, 3) array of int, or a mesh
     uv : (n, 2) array
-        Taken as they are stored, integers and float32 too, as in `certify`.
+        Positions as stored, in any dtype that `certify` accepts, integers and float32 included.
 
     Returns
     -------
@@ -80,29 +79,29 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     Raises
     ------
     ValueError
-        When shapes are wrong or an index is out of range, as in `certify`.
+        If a shape is wrong or an index is out of range, as in `certify`.
     """
     return certificate.is_injective(mesh_triangles(F), uv)
 
 
 def inverted_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
-    """Find the triangles that keep a map from being injective, exactly.
+    """Return the triangles that are not strictly positive, decided exactly.
 
     Parameters
     ----------
     F : (f, 3) array of int, or a mesh
     uv : (n, 2) array
-        Taken as they are stored, integers and float32 too, as in `certify`.
+        Positions as stored, in any dtype that `certify` accepts, integers and float32 included.
 
     Returns
     -------
     (k,) int64
-        Ascending indices of *all* triangles that are not strictly positive: clockwise, without area
-        or not finite. `certify` tells them apart.
+        Ascending indices of *all* triangles that are not strictly positive: inverted, degenerate or not finite.
+        `certify` lists the three kinds separately.
 
     Raises
     ------
     ValueError
-        When shapes are wrong or an index is out of range, as in `certify`.
+        If a shape is wrong or an index is out of range, as in `certify`.
     """
     return certificate.inverted_triangles(mesh_triangles(F), uv)
