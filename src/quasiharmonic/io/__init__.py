@@ -1,7 +1,7 @@
-"""Meshes, maps and problems in files.
+"""Read and write meshes, maps and problems in files.
 
 The package builds on `geometry.mesh`. Each format is a module of `formats` or of `fem`; `adapters` accepts mesh objects
-of other libraries. Start reading in `meshdata`, which is what every reader returns.
+of other libraries. Start reading in `meshdata`, whose `MeshData` every reader returns.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ __all__ = [
 
 
 _Path = str | os.PathLike[str]
-#: What a suffix means, in small letters: how to read a mesh, and how to write one with its map. A new format goes into
-#: both, unless it has no room for a map.
+#: Readers of meshes and writers of mapped meshes by lower-case suffix. Add a new format to both, unless it cannot store
+#: a map.
 READERS: dict[str, Callable[[_Path], MeshData]] = {
     ".obj": read_obj,
     ".off": read_off,
@@ -90,7 +90,7 @@ READERS: dict[str, Callable[[_Path], MeshData]] = {
 }
 MAP_WRITERS: dict[str, Callable[[_Path, MeshData], None]] = {
     ".obj": write_obj,
-    # OFF has room for one set of coordinates only, and so for no seams.
+    # OFF stores one set of coordinates only, and so no seams.
     ".off": lambda path, mesh: write_off(path, in_plane(mesh)),
     ".ply": write_ply,
     ".glb": write_gltf,
@@ -99,7 +99,7 @@ MAP_WRITERS: dict[str, Callable[[_Path, MeshData], None]] = {
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:
-    """Read a triangle mesh, in the format that the suffix of its name says.
+    """Read a triangle mesh; the suffix of the file name selects the format.
 
     Parameters
     ----------
@@ -114,67 +114,67 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
     Raises
     ------
     MeshFileError
-        When the format is not supported, or the file cannot be read as what it should be.
+        If the format is not supported, or the file is not valid in its format.
     """
     return READERS[_suffix(path, "read")](path)
 
 
 def write_map(path: str | os.PathLike[str], mesh: MeshData, uv: ArrayLike) -> None:
-    """Write a mesh with a place for each vertex as its map; as `write_mapped`.
+    """Write a mesh with one position per vertex as its map; see `write_mapped`.
 
     Parameters
     ----------
     path : str or path-like
-        Where to.
+        The file to write.
     mesh : MeshData
-        The mesh, as `read_mesh` gave it.
+        The mesh, as `read_mesh` returned it.
     uv : (n, 2) float
-        Place of every vertex in the plane.
+        Position of every vertex in the plane.
 
     Raises
     ------
     MeshFileError, OutputError
         As `write_mapped`.
     ValueError
-        When ``uv`` has another shape or is not finite.
+        If ``uv`` has another shape or is not finite.
     """
     write_mapped(path, mesh.with_map(uv))
 
 
 def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
-    """Write the map that a mesh carries, in the format that the suffix of the name says.
+    """Write a mesh with its map; the suffix of the file name selects the format.
 
-    OBJ, PLY and glTF get the mesh as it was read, with the map as its texture coordinates; OFF gets the map
-    alone, as a mesh in the plane z = 0. Numbers are written such that reading them gives the same double,
-    except in glTF, which has single precision. The file appears whole or not at all. What it will not hold of the
-    mesh, `not_held` says.
+    OBJ, PLY and glTF files contain the mesh as it was read, with the map as its texture coordinates. OFF files contain
+    the map alone, as a mesh in the plane z = 0. Numbers are written so that reading them returns the same doubles,
+    except in glTF, which has single precision. An error never leaves a partial file. `not_held` lists the data that the
+    file will not contain.
 
     Parameters
     ----------
     path : str or path-like
-        Where to.
+        The file to write.
     mesh : MeshData
-        The mesh, as `read_mesh` gave it, with a map (`MeshData.with_map`, `MeshData.with_places`).
+        The mesh, as `read_mesh` returned it, with a map (`MeshData.with_map`, `MeshData.with_places`).
 
     Raises
     ------
     MeshFileError
-        When the format is not supported, or has no room for seams.
+        If the format is not supported, or cannot store the seams of the map.
     OutputError
-        When it cannot be written; the old file is then untouched.
+        If the file cannot be written. An existing file is then unchanged.
     """
     MAP_WRITERS[_suffix(path, "written")](path, mesh)
 
 
 def check_output(path: str | os.PathLike[str]) -> None:
-    """Say early whether `write_map` could write to ``path``.
+    """Check before a computation whether `write_map` could write to ``path``.
 
     Raises
     ------
     MeshFileError
-        When the format is not supported.
+        If the format is not supported.
     OutputError
-        When it cannot be written.
+        If the file cannot be written.
     """
     _suffix(path, "written")
     check_writable(path)

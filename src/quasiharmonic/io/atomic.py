@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Write files and folders so that an error leaves no partial output."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from quasiharmonic.io.errors import OutputError, printable
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """Say early whether a file could be written to ``path``.
+    """Check before a computation whether a file could be written to ``path``.
 
     Parameters
     ----------
     path : str or path-like
-        Where a file is going to be written, new or in place of another.
+        The file to write, new or existing.
 
     Returns
     -------
     Path
-        The same place with symbolic links resolved: a link to a file stays a link to the new one.
+        The path with symbolic links resolved, so that writing through a link keeps the link.
 
     Raises
     ------
     OutputError
-        When the directory is missing or not writable, or something stands at ``path`` that is not
-        a file or is write-protected.
+        If the directory is missing or not writable, or if ``path`` exists and is not a regular file or is
+        write-protected.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -55,27 +55,26 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 def write_whole(
     path: str | os.PathLike[str], data: bytes | Callable[[BinaryIO], object], *, durable: bool = True
 ) -> None:
-    """Write a file such that readers see the old one or the new one, never a part.
+    """Write a file atomically: readers see the old file or the complete new one.
 
-    The bytes go to a temporary file in the same directory, which takes the place of ``path`` when
-    it is complete and on the disk. An error or an interrupt removes the temporary file; a process
-    killed outright can leave it (``.qhm-*.tmp``), but never a half-written ``path``. A file that is
-    replaced passes its permissions on, a new one gets the usual ones.
+    The bytes go to a temporary file in the same directory, which replaces ``path`` when it is complete and on the disk.
+    An error or an interrupt removes the temporary file. A killed process can leave it (``.qhm-*.tmp``), but never a
+    partial ``path``. The new file keeps the permissions of the file that it replaces.
 
     Parameters
     ----------
     path : str or path-like
-        Where the file is to be.
+        The file to write.
     data : bytes or callable
-        The contents, or a function that writes them to the binary file it is given.
+        The contents, or a function that writes them to the binary file in its argument.
     durable : bool
-        Wait until the file is on the disk. Without it the file may be lost, or empty, when the power fails; what
-        becomes of the process makes no difference.
+        Wait until the file is on the disk. If False, a power failure may lose or empty the file; a crash of the process
+        does not.
 
     Raises
     ------
     OutputError
-        When it cannot be written: no such directory, no permission, disk full.
+        If the file cannot be written: no such directory, no permission, disk full.
     """
     target = check_writable(path)
     part = target.with_name(f".qhm-{os.urandom(8).hex()}.tmp")
@@ -102,19 +101,19 @@ def write_whole(
 
 @contextlib.contextmanager
 def new_folder(path: str | os.PathLike[str], *, leftovers: frozenset[str] = frozenset()) -> Iterator[None]:
-    """Make a folder with those above it that are missing; remove what was made if the block fails and leaves it empty.
+    """Make a folder and its missing parents; remove the new folders if the block fails and leaves them empty.
 
     Parameters
     ----------
     path : str or path-like
-        The folder, which may be there already.
+        The folder, which may already exist.
     leftovers : frozenset of str
-        Names of files that count as nothing.
+        Names of files to ignore and to remove with the folder.
 
     Raises
     ------
     OutputError
-        When it cannot be made.
+        If the folder cannot be made.
     """
     folder = Path(os.path.abspath(path))
     missing = [place for place in (folder, *folder.parents) if not os.path.lexists(place)]
@@ -135,7 +134,7 @@ def new_folder(path: str | os.PathLike[str], *, leftovers: frozenset[str] = froz
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders, the innermost first, up to the first one that cannot be removed."""
+    """Remove folders, the innermost first, until one cannot be removed."""
     with contextlib.suppress(OSError):
         for folder in folders:
             folder.rmdir()
@@ -143,7 +142,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 @contextlib.contextmanager
 def no_remains(*paths: Path) -> Iterator[None]:
-    """Remove those of some files that are new, if the block fails."""
+    """Remove those of some files that did not exist before, if the block fails."""
     new = [path for path in paths if not os.path.lexists(path)]
     try:
         yield
@@ -155,7 +154,7 @@ def no_remains(*paths: Path) -> Iterator[None]:
 
 
 def _mode(path: Path) -> int | None:
-    """Type and permissions of what stands at ``path``, None where nothing does."""
+    """Return type and permissions of the file at ``path``, or None if there is no such file."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:

@@ -1,36 +1,36 @@
-"""What goes wrong with files."""
+"""Exceptions of file input and output."""
 
 from __future__ import annotations
 
 import os
 
-# Letters of what is wrong at most: what a file says is told, but not all that it has in place of a number.
+# Longest description of a fault, in characters. A file may have very long text in place of a number.
 _MOST = 300
 
 
 def printable(path: str | bytes | os.PathLike[str]) -> str:
-    """A file name as messages show it: what no terminal can show is escaped."""
+    """Return a file name for messages, with unprintable characters escaped."""
     text = os.fsdecode(path)
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in text)
 
 
 class MeshFileError(ValueError):
-    """A file that cannot be read as what it should be; the message says where, why and what to do.
+    """A mesh file cannot be read; the message has the location, the cause and the remedy.
 
     Parameters
     ----------
     path : str or path-like
         The file.
     what : str
-        What is wrong, without place and remedy.
+        The fault, without location and remedy.
     line : int, optional
-        Line the fault lies in, counted from 1.
+        Line of the fault, counted from 1.
     remedy : str, optional
         What the user can do about it.
     """
 
     def __init__(self, path: str | os.PathLike[str], what: str, line: int | None = None, remedy: str = "") -> None:
-        # All arguments go to the base class, so that the exception survives pickling between processes.
+        # Pickling between processes needs all arguments in the base class.
         if len(what) > _MOST:
             what = f"{what[: _MOST // 2]} … {what[-_MOST // 2 :]}"
         super().__init__(path, what, line, remedy)
@@ -43,9 +43,9 @@ class MeshFileError(ValueError):
         at = "" if self.line is None else f" at line {self.line}"
         then = f"; {self.remedy}" if self.remedy else ""
         text = f"{self.what}{at}{then}"
-        # What is not valid Unicode must not make the message unprintable.
+        # Escape invalid Unicode, so that the message stays printable.
         return f"{printable(self.path)}: {text.encode('utf-8', 'backslashreplace').decode()}"
 
 
 class OutputError(OSError):
-    """A file that could not be written; whatever stood at its path before still stands there."""
+    """A file could not be written; an existing file at its path is unchanged."""

@@ -1,4 +1,4 @@
-"""What a mesh file holds, and the map in it."""
+"""The contents of a mesh file, and the map in it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from quasiharmonic.util.arrays import (
 
 
 class Carried:
-    """What a file holds besides a mesh, as its reader took it apart: for the writer of the same format.
+    """The contents of a file besides the mesh, for a writer of the same format.
 
     Parameters
     ----------
@@ -38,31 +38,31 @@ class Carried:
         self.V, self.F = V, F
 
     def further(self) -> list[str]:
-        """What there is besides the mesh, in words; only a writer of the same format keeps it."""
+        """Return descriptions of the data besides the mesh, which only a writer of the same format keeps."""
         return []
 
     def fits(self, mesh: MeshData) -> bool:
-        """Whether a mesh is still the one that was in the file, whatever its map."""
+        """Return whether a mesh is still the mesh of the file, whatever its map."""
         return np.array_equal(self.V, mesh.V) and np.array_equal(self.F, mesh.F)
 
 
 @dataclass(frozen=True, eq=False)
 class KeptLines:
-    """Lines of a file that are written back as they stood, so that not one digit changes that need not.
+    """Lines of a file that are written back unchanged, so that unchanged numbers keep their digits.
 
     Attributes
     ----------
     text : bytes
         The lines.
     rows : (n, k) float64
-        What they say.
+        The numbers in the lines.
     """
 
     text: bytes
     rows: FloatArray
 
     def unchanged(self, rows: FloatArray) -> NDArray[np.bool_]:
-        """Which of some rows are what the line of the same number says; (m,) bool."""
+        """Return which rows equal the numbers of the line with the same index; (m,) bool."""
         same = np.zeros(len(rows), dtype=np.bool_)
         if rows.shape[1:] == self.rows.shape[1:]:
             both = min(len(rows), len(self.rows))
@@ -73,10 +73,10 @@ class KeptLines:
 
 @dataclass(frozen=True, eq=False)
 class MeshData:
-    """A mesh as a file has it, with all that is needed to write the file again.
+    """A mesh from a file, with all data needed to write the file again.
 
-    Only ``V`` and ``F`` are needed to make one. Vertices and faces keep the order of the file. Faces of more than three
-    corners are known by their triangles (see `polygon_mesh`), and written as they were.
+    Only ``V`` and ``F`` are required. Vertices and faces keep the order of the file. A face of more than three corners
+    is stored as its triangles (see `polygon_mesh`) and written as the original polygon.
 
     Attributes
     ----------
@@ -87,29 +87,29 @@ class MeshData:
     vt : (m, 2) float64 or None
         Texture coordinates.
     FT : (f, 3) int64 or None
-        For every corner its row of ``vt``; -1 where the corner has none.
+        For every corner its row of ``vt``; -1 if the corner has no texture coordinate.
     extra : (n, k) float64 or None
-        What stood behind the three coordinates of a vertex (weight, colour); NaN where nothing did.
+        Further numbers after the three coordinates of a vertex (weight, colour); NaN where the file has none.
     lines, map_lines : KeptLines or None
-        The lines of the first vertices, and of the first texture coordinates, as they stood.
+        Original lines of the first vertices, and of the first texture coordinates.
     newline : bytes
-        What ends the file's lines.
+        Line ending of the file.
     normals : bytes
-        The ``vn`` lines as they stood. They are never looked into, only written back.
+        The ``vn`` lines, unparsed. They are only written back.
     FN : (f, 3) int64 or None
-        For every corner its line of ``normals``; -1 where the corner has none.
+        For every corner its line of ``normals``; -1 if the corner has no normal.
     statements : bytes
-        Lines that are neither vertex nor face (groups, materials, comments), each as it stood.
+        Lines that are neither vertex nor face (groups, materials, comments), unchanged.
     statement_faces : (s,) int64
-        For each line of ``statements``, how many of the file's faces come before it; -1 before the first vertex.
+        For each line of ``statements``, the number of the file's faces before it; -1 before the first vertex.
     polygons : Polygons or None
-        The file's faces as rings of corners of the triangles; None where they are these.
+        The file's faces as rings of corners of the triangles; None if all faces are triangles.
     source : str
-        The file it came from, for messages.
+        The file that was read, for messages.
     carried : Carried or None
-        All else that its file holds, for a writer of the same format; None where there is nothing else.
+        All other data of the file, for a writer of the same format; None if there is no other data.
     texture : Texture or None
-        A picture that is to be written with the map, by formats that can.
+        An image to write with the map, in formats that support textures.
     """
 
     V: FloatArray
@@ -130,7 +130,7 @@ class MeshData:
     texture: Texture | None = None
 
     def __post_init__(self) -> None:
-        """Bring the arrays into the types and shapes above; `ValueError` for what cannot be."""
+        """Convert the arrays to the types and shapes above; raise `ValueError` for invalid ones."""
         V = vertex_array(self.V)
         if V.shape[1] == 2:
             V = np.column_stack([V, np.zeros(len(V))])
@@ -149,7 +149,7 @@ class MeshData:
 
     @property
     def faces(self) -> int:
-        """How many faces the file has."""
+        """Number of faces in the file."""
         return len(self.F) if self.polygons is None else len(self.polygons)
 
     def with_map(self, uv: ArrayLike) -> MeshData:
@@ -158,7 +158,7 @@ class MeshData:
         Parameters
         ----------
         uv : (n, 2) float
-            Place of every vertex in the plane.
+            Position of every vertex in the plane.
 
         Returns
         -------
@@ -167,7 +167,7 @@ class MeshData:
         Raises
         ------
         ValueError
-            When the shape is another, or a place is not finite.
+            If the shape is wrong, or a position is not finite.
         """
         return replace(self, vt=map_array("uv", uv, len(self.V)), FT=self.F)
 
@@ -177,7 +177,7 @@ class MeshData:
         Parameters
         ----------
         mapped : SeamedMesh
-            With as many triangles, in the same order.
+            A mesh with the same triangles in the same order.
 
         Returns
         -------
@@ -186,27 +186,27 @@ class MeshData:
         return replace(self, vt=mapped.uv, FT=mapped.FT)
 
     def as_plane(self, uv: ArrayLike) -> MeshData:
-        """Return the map alone: a mesh in the plane z = 0 with the same faces.
+        """Return the map alone, as a mesh in the plane z = 0 with the same faces.
 
         Parameters
         ----------
         uv : (n, 2) float
-            Place of every vertex in the plane.
+            Position of every vertex in the plane.
 
         Returns
         -------
         MeshData
-            Positions and faces, and nothing else of this one.
+            The positions and the faces, without the other data of this mesh.
 
         Raises
         ------
         ValueError
-            When the shape is another, or a place is not finite.
+            If the shape is wrong, or a position is not finite.
         """
         return MeshData(map_array("uv", uv, len(self.V)), self.F, polygons=self.polygons, source=self.source)
 
     def _corners(self, name: str, values: ArrayLike, rows: int) -> IntArray:
-        """For every corner one of some rows, or -1; (f, 3) int64."""
+        """Check a table of row indices or -1 for every corner; return it as (f, 3) int64."""
         table = triangle_rows(values, name, copy=False)
         if len(table) != len(self.F):
             raise ValueError(f"{name} must have as many rows as F, {len(self.F)}, not {len(table)}")
@@ -223,30 +223,30 @@ def polygon_mesh(
     normal_lines: IntArray | None = None,
     **rest: Any,
 ) -> MeshData:
-    """Make a mesh of faces of any number of corners.
+    """Return a mesh with faces of any number of corners.
 
     Parameters
     ----------
     V : (n, 3) float64
         Positions.
     corners : (c,) int64
-        The faces' vertices, ring after ring.
+        The vertices of the faces, ring after ring.
     starts : (p + 1,) int64
-        Where each ring begins, and the end of the last one.
+        Index in ``corners`` at which each ring starts, then the length of ``corners``.
     places, normal_lines : (c,) int64, optional
-        For every corner its row of ``vt`` and its line of ``normals``; -1 where it has none.
+        For every corner its row of ``vt`` and its line of ``normals``; -1 if it has none.
     **rest
-        As `MeshData` has it.
+        Further arguments of `MeshData`.
 
     Returns
     -------
     MeshData
-        Its ``polygons`` are None where all faces are triangles.
+        Its ``polygons`` are None if all faces are triangles.
 
     Raises
     ------
     ValueError
-        When a face has fewer than three corners, or a vertex twice, or refers to a vertex that there is not.
+        If a face has fewer than three corners or a repeated vertex, or a vertex index is out of range.
     """
     check_range("the faces", corners, len(V))
     if (np.diff(starts) == 3).all():
@@ -264,7 +264,7 @@ def polygon_mesh(
 
 
 def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Gather the texture coordinates of every vertex.
+    """Return the texture coordinates of every vertex, and which vertices are on a seam.
 
     Parameters
     ----------
@@ -273,9 +273,9 @@ def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
     Returns
     -------
     uv : (n, 2) float64
-        Place of each vertex, NaN where no face gives it one; one of its places at a seam.
+        Texture coordinates of each vertex; NaN if no face gives it any. At a seam, one of its texture coordinates.
     seam : (n,) bool
-        Whether the vertex has more than one place. Equal numbers under different indices are one.
+        Whether the vertex has more than one texture coordinate. Equal numbers under different indices count as one.
     """
     uv = np.full((len(mesh.V), 2), np.nan)
     seam = np.zeros(len(mesh.V), dtype=np.bool_)
@@ -288,14 +288,14 @@ def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
 
 
 def map_of(mesh: MeshData) -> FloatArray:
-    """Return the map that a mesh carries: a place in the plane for every vertex.
+    """Return the map of a mesh: a position in the plane for every vertex.
 
-    It is read from the texture coordinates; in a planar mesh without any, the positions are it.
+    The map is the texture coordinates. For a planar mesh without texture coordinates, it is the vertex positions.
 
     Parameters
     ----------
     mesh : MeshData
-        A mesh whose vertices have one place each.
+        A mesh whose map has no seams.
 
     Returns
     -------
@@ -305,8 +305,8 @@ def map_of(mesh: MeshData) -> FloatArray:
     Raises
     ------
     MeshFileError
-        When the mesh has no map, has it on some faces only, or has seams, that is, vertices with
-        several places; the message names the first of them.
+        If the mesh has no map, has it on some faces only, or has seams, that is, vertices with several positions. The
+        message names the first such elements.
     """
     check_mapped(mesh)
     if mesh.FT is None:
@@ -323,7 +323,10 @@ def map_of(mesh: MeshData) -> FloatArray:
 
 
 def in_plane(mesh: MeshData) -> MeshData:
-    """The map that a mesh carries, as a mesh in the plane; vertices that no face uses where a row of their number is.
+    """Return the map of a mesh as a mesh in the plane z = 0.
+
+    A vertex that no face uses gets the row of ``vt`` with its own index if ``vt`` has one row per vertex, and zero
+    otherwise.
 
     Raises
     ------
@@ -337,15 +340,15 @@ def in_plane(mesh: MeshData) -> MeshData:
 
 
 def is_planar(points: FloatArray) -> bool:
-    """Whether points (n, 3) lie in a plane z = constant, up to what rounding to single precision leaves."""
-    # In units of their size, a power of two: a difference of the largest doubles is none.
+    """Return whether points (n, 3) lie in a plane z = constant, up to rounding to single precision."""
+    # Scaling by a power of two avoids overflow in differences of the largest doubles.
     exponent = int(np.frexp(np.abs(points).max())[1])
     extent = np.ptp(np.ldexp(points, -exponent - 1), axis=0)
     return bool(extent[2] <= 1e-6 * extent[:2].max())
 
 
 def check_mapped(mesh: MeshData) -> None:
-    """Raise `MeshFileError` when a mesh has no map, or has it on some faces only."""
+    """Raise `MeshFileError` if a mesh has no map, or has it on some faces only."""
     if mesh.FT is None:
         if not is_planar(mesh.V):
             raise MeshFileError(

@@ -1,4 +1,4 @@
-"""Lists of numbers as people keep them: lines with blanks, commas or semicolons between, in any usual notation."""
+"""Read lists of numbers: lines separated by blanks, commas or semicolons, in any usual notation."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from quasiharmonic.io.textual import is_number, number, read_text, shown
 
 
 def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, list[float]]]:
-    """Read lines of so many numbers each.
+    """Read lines with a given count of numbers each.
 
-    Blanks, tabs and commas separate numbers; where a line has semicolons these do, and commas are decimal points, as
-    spreadsheets write them in half of the world. Exponents have an e or, as Fortran writes them, a d. A comment begins
-    with ``#``. A first line of words is a heading.
+    Blanks, tabs and commas separate numbers. In a line with semicolons, semicolons separate numbers and commas are
+    decimal points, as in spreadsheets of many countries. Exponents have an e, or a d as in Fortran. A comment starts
+    with ``#``. A first line without numbers is a heading.
 
     Parameters
     ----------
     path : str or path-like
     columns : int
+        Count of numbers per line.
 
     Returns
     -------
     list of (int, list of float)
-        Each line's number, from 1 on, and what is in it.
+        For each line its line number, counted from 1, and its numbers.
 
     Raises
     ------
     MeshFileError
-        When the file cannot be read, a line has another count of numbers, or something else than finite ones.
+        If the file cannot be read, or a line has another count of numbers or anything but finite numbers.
     """
     rows = []
     for at, line in enumerate(read_text(path).split(b"\n"), 1):

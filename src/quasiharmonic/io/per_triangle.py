@@ -1,4 +1,4 @@
-"""Values per triangle in files that other tools read: CSV, NPZ and PLY."""
+"""Write values per triangle to files for other tools: CSV, NPZ and PLY."""
 
 from __future__ import annotations
 
@@ -14,45 +14,48 @@ from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import OutputError
 from quasiharmonic.util.arrays import FloatArray, map_array, triangle_rows, vertex_array
 
-#: Suffixes that `write_per_triangle` knows.
+#: Suffixes that `write_per_triangle` supports.
 FORMATS = (".csv", ".npz", ".ply")
-# Names that one of the formats, or what writes it, has a use of its own for.
+# Names that a format or its writer reserves.
 _TAKEN = {"triangle", "F", "uv", "file", "args", "kwds", "allow_pickle", "vertex_indices", "quality"}
 
 
 def write_per_triangle(
     path: str | os.PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, values: Mapping[str, ArrayLike]
 ) -> None:
-    """Write values per triangle beside a mesh, in the format that the suffix says.
+    """Write a mesh, its map and values per triangle; the suffix selects the format.
 
     ``.csv``
-        A line of names and a line for each triangle, in the mesh's order, its number (from 0) first.
+        A header line, then a line for each triangle in the order of the mesh, with its index (from 0) first.
     ``.npz``
         The arrays ``F``, ``uv`` and one for each name, for `numpy.load`.
     ``.ply``
-        The surface with the map as texture coordinates (``s``, ``t``) of its vertices and the values as
-        properties of its faces, the first of them also as ``quality``, by which MeshLab and others colour.
-        Positions and values are doubles.
+        The surface with the map as texture coordinates (``s``, ``t``) of its vertices and the values as properties of
+        its faces. The first value is also written as ``quality``, which MeshLab and others use as colour. Positions and
+        values are doubles.
 
-    Numbers are written such that reading them gives the same double.
+    Numbers are written so that reading them returns the same doubles.
 
     Parameters
     ----------
     path : str or path-like
-        Replaced as a whole once the file is complete.
+        The file to write; an existing file is replaced when the new one is complete.
     V : (n, 2) or (n, 3) float
+        Rest positions.
     F : (f, 3) int
+        Triangles.
     uv : (n, 2) float
+        Positions in the plane.
     values : mapping of str to (f,) float
-        For example `quasiharmonic.Distortion.per_triangle`; names are words of letters, digits and ``_``, and none
-        that the formats have a use of their own for.
+        For example `quasiharmonic.Distortion.per_triangle`. Names consist of letters, digits and ``_``, and must not be
+        reserved by a format.
 
     Raises
     ------
     ValueError
-        When an array has another shape, or a name is not a word or is taken.
+        If an array has the wrong shape, or a name is not a word or is reserved.
     OutputError
-        When the suffix is another, or the file cannot be written.
+        If the suffix is not supported, or the file cannot be written.
     """
     V, F = vertex_array(V, finite=False), triangle_rows(F)
     uv = map_array("uv", uv, len(V), finite=False)
@@ -87,7 +90,7 @@ def _csv(columns: Mapping[str, FloatArray], count: int) -> bytes:
 def _ply(V: FloatArray, F: NDArray[np.int64], uv: FloatArray, columns: Mapping[str, FloatArray]) -> bytes:
     if V.shape[1] == 2:
         V = np.column_stack([V, np.zeros(len(V))])
-    # By the first of them MeshLab colours.
+    # MeshLab colours by "quality": write the first value under this name.
     properties = {"quality": next(iter(columns.values())), **columns} if columns else {}
     header = [
         "ply",

@@ -1,4 +1,4 @@
-"""What a mesh file holds after some of the mesh's edges were split."""
+"""The contents of a mesh file after some of its edges were split."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ if TYPE_CHECKING:
 
 
 def refined_mesh(mesh: MeshData, refined: Refined, uv: FloatArray) -> tuple[MeshData, IntArray]:
-    """Carry all that stands in a mesh file over to a refinement of the mesh.
+    """Transfer all data of a mesh file to a refinement of the mesh.
 
-    Vertices keep their indices, new ones follow. The parts of a triangle stand where it stood, so that
-    they stay in its group and have its material. Colours of new vertices are interpolated; triangles
-    that were split have no normals any more, and a polygon of which one was split is in triangles.
+    The given vertices keep their indices, and new vertices follow. The parts of a triangle replace it in order, so they
+    stay in its group and keep its material. Colours of new vertices are interpolated. Triangles that were split lose
+    their normals. A polygon is replaced by triangles if one of its triangles was split.
 
     Parameters
     ----------
     mesh : MeshData
-        The old mesh.
+        The given mesh.
     refined : Refined
-        What became of it.
+        Its refinement.
     uv : (n, 2) float64
-        Places in the plane for the old vertices.
+        Positions of the given vertices in the plane.
 
     Returns
     -------
     mesh : MeshData
-        The new mesh, with the same map.
+        The refined mesh, with the same map.
     parent : (f,) int64
-        The old triangle that each of its triangles is a part of, ascending.
+        The given triangle that contains each new triangle, ascending.
     """
     order = np.argsort(refined.parent, kind="stable")
     parent, F = refined.parent[order], refined.F[order]
@@ -61,21 +61,21 @@ def refined_mesh(mesh: MeshData, refined: Refined, uv: FloatArray) -> tuple[Mesh
 
 
 def _rings(mesh: MeshData, parent: IntArray) -> tuple[Polygons | None, IntArray]:
-    """The file's faces after some of its triangles were split.
+    """Return the file's faces after some of its triangles were split.
 
     Parameters
     ----------
     mesh : MeshData
-        The old mesh.
+        The given mesh.
     parent : (f,) int64
-        The old triangle that each new one is a part of, ascending.
+        The given triangle that contains each new triangle, ascending.
 
     Returns
     -------
     polygons : Polygons or None
-        None if all are triangles.
+        None if all faces are triangles.
     first : (p + 1,) int64
-        The first new face of each old one, and their number.
+        The first new face of each given face, then the number of new faces.
     """
     if mesh.polygons is None:
         return None, np.searchsorted(parent, np.arange(len(mesh.F) + 1))
@@ -84,7 +84,7 @@ def _rings(mesh: MeshData, parent: IntArray) -> tuple[Polygons | None, IntArray]
     count = np.bincount(face, minlength=len(old))
     whole = count == old.sizes - 2
     first = np.concatenate([[0], np.cumsum(np.where(whole, 1, count))])
-    # Of what is whole the old rings, by the new numbers of its triangles; of the others each triangle is a ring.
+    # Unsplit faces keep their rings, with the new indices of their triangles. Each triangle of a split face is a ring.
     kept = np.repeat(whole, old.sizes)
     triangle, corner = np.divmod(old.corners[kept], 3)
     rings = 3 * np.searchsorted(parent, triangle) + corner

@@ -1,4 +1,4 @@
-"""Maps with seams in files: the mesh cut open along them."""
+"""Maps with seams in files: the mesh cut open along its seams."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def seamed(mesh: MeshData) -> SeamedMesh:
-    """Return a mesh with the map that it carries, or without places where it carries none.
+    """Return a mesh with its map as a `SeamedMesh`, without map if the mesh has none.
+
+    If some corners have no texture coordinates and there are no seams, vertices without one are at NaN.
 
     Raises
     ------
     MeshFileError
-        When it has the map on some faces only, and there are seams. Without seams the vertices that have a place are
-        all that is known, and those without are at NaN.
+        If the mesh has the map on some faces only and has seams.
     """
     if mesh.FT is None or mesh.vt is None:
         return SeamedMesh(mesh.V, mesh.F)
@@ -29,12 +30,12 @@ def seamed(mesh: MeshData) -> SeamedMesh:
 
 
 def mapped(mesh: MeshData) -> SeamedMesh:
-    """Return a mesh with the map that it carries: its texture coordinates, or the plane that it lies in without any.
+    """Return a mesh with its map: its texture coordinates, or the vertex positions if a planar mesh has none.
 
     Raises
     ------
     MeshFileError
-        When the mesh has no map, or has it on some faces only.
+        If the mesh has no map, or has it on some faces only.
     """
     check_mapped(mesh)
     if mesh.FT is None:
@@ -43,26 +44,26 @@ def mapped(mesh: MeshData) -> SeamedMesh:
 
 
 def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return a mesh and the map that it carries, with a vertex for each of a vertex's places.
+    """Return a mesh and its map, with a separate vertex for each position of a vertex at a seam.
 
     Parameters
     ----------
     mesh : MeshData
-        With texture coordinates on every triangle, or planar and without any.
+        A mesh with texture coordinates on every triangle, or a planar mesh without any.
 
     Returns
     -------
     V : (m, 3) float64
-        The mesh's own vertices, then a further one for each further place of one.
+        The vertices of the mesh, then a copy for each further position of a vertex.
     F : (f, 3) int64
-        The mesh's triangles in their order. Where there are no seams, nothing is changed.
+        The triangles of the mesh in their order. Without seams they are unchanged.
     uv : (m, 2) float64
-        Their places; NaN at vertices that no triangle uses.
+        Positions in the plane; NaN at vertices that no triangle uses.
 
     Raises
     ------
     MeshFileError
-        When the mesh has no map, or has it on some faces only.
+        If the mesh has no map, or has it on some faces only.
     """
     opened = mapped(mesh).opened()
     assert opened.uv is not None
@@ -70,7 +71,7 @@ def cut_at_seams(mesh: MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
 
 
 def without_idle(V: FloatArray, F: IntArray, uv: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return a mesh and its map without the vertices that no triangle uses, which have no place; the others in order.
+    """Return a mesh and its map without the vertices that no triangle uses; the others keep their order.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ def without_idle(V: FloatArray, F: IntArray, uv: FloatArray) -> tuple[FloatArray
     Returns
     -------
     V, F, uv
-        Of the same shapes but for the vertices left out.
+        The same arrays without the unused vertices, and renumbered triangles.
     """
     used = np.zeros(len(V), dtype=bool)
     used[F] = True

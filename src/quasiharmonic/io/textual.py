@@ -1,4 +1,4 @@
-"""Reading text files of numbers: the whole file at once where it is regular, by the line where not."""
+"""Read text files of numbers: regular blocks at once, other lines one by one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
 
-# What each kind of file that is not text begins with.
+# First bytes of common files that are not plain text.
 _FOREIGN = {
     b"\xff\xfe": ("is UTF-16 text", "save it as UTF-8"),
     b"\xfe\xff": ("is UTF-16 text", "save it as UTF-8"),
@@ -23,18 +23,18 @@ _FOREIGN = {
     b"\xfd7zXZ": ("is compressed by xz", "unpack it first"),
 }
 _NUMERIC = b"0123456789.eE+-"
-# An exponent as Fortran writes it.
+# An exponent in Fortran notation.
 _FORTRAN = re.compile(rb"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 _INTEGER = re.compile(rb"[+-]?[0-9]+")
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """Read a file as it is.
+    """Read the bytes of a file.
 
     Raises
     ------
     MeshFileError
-        When there is no such file, or it cannot be read.
+        If the file does not exist or cannot be read.
     """
     try:
         mode = os.stat(path).st_mode
@@ -59,13 +59,13 @@ def read_text(path: str | os.PathLike[str]) -> bytes:
     Returns
     -------
     bytes
-        The contents with every line ended by a single newline and no byte order mark. They need
-        not be valid UTF-8: only names and comments have letters, and those are passed through.
+        The contents, each line ended by a single newline, without byte order mark. They need not be valid UTF-8: only
+        names and comments contain non-ASCII characters, and these are passed through.
 
     Raises
     ------
     MeshFileError
-        When there is no such file, it cannot be read, or it is not text.
+        If the file does not exist, cannot be read, or is not text.
     """
     data = read_bytes(path)
     for start, (what, remedy) in _FOREIGN.items():
@@ -82,15 +82,15 @@ def read_text(path: str | os.PathLike[str]) -> bytes:
 
 
 def shown(token: bytes) -> str:
-    """Quote a piece of a file for a message, cut short and in plain ASCII."""
+    """Quote a piece of a file for a message, shortened and in ASCII."""
     text = ascii(token[:40].decode("utf-8", "replace"))
     return text if len(token) <= 40 else f"{text[:-1]}...'"
 
 
 def number(token: bytes) -> float:
-    """Turn decimal text into the nearest double; `ValueError` with a clear text for anything else."""
+    """Convert decimal text to the nearest double; raise `ValueError` with a clear message for anything else."""
     try:
-        # Python reads more than files mean: 1_000, or words for infinity.
+        # Reject what Python accepts but files do not mean: 1_000, or words for infinity.
         value = math.nan if b"_" in token else float(_FORTRAN.sub(b"e", token))
     except ValueError:
         value = math.nan
@@ -100,7 +100,7 @@ def number(token: bytes) -> float:
 
 
 def is_number(token: bytes) -> bool:
-    """Whether `number` takes a piece of text."""
+    """Return whether `number` accepts a piece of text."""
     try:
         number(token)
     except ValueError:
@@ -109,7 +109,7 @@ def is_number(token: bytes) -> bool:
 
 
 def integer(token: bytes) -> int:
-    """Turn decimal text into an integer below 10¹⁸; `ValueError` with a clear text for anything else."""
+    """Convert decimal text to an integer below 10¹⁸; raise `ValueError` with a clear message for anything else."""
     if len(token) <= 18 and token.isdigit():
         return int(token)
     if not _INTEGER.fullmatch(token):
@@ -127,32 +127,31 @@ def number_table(block: bytes, keyword: bytes, rows: int) -> NDArray[np.float64]
     Parameters
     ----------
     block : bytes
-        The lines, each beginning with ``keyword`` and ended by a newline.
+        The lines, each starting with ``keyword`` and ended by a newline.
     keyword : bytes
-        Word before the numbers, or nothing.
+        Word before the numbers, or empty.
     rows : int
         Number of lines.
 
     Returns
     -------
     (rows, k) float64 or None
-        The numbers, with 1 ≤ k ≤ 8; None when the lines are not all alike or hold anything but
-        finite numbers.
+        The numbers, with 1 ≤ k ≤ 8. None if the lines differ in form or contain anything but finite numbers.
     """
     block = _single_spaced(block)
     separators = block[: block.index(b"\n")].count(b" ")
     columns = separators if keyword else separators + 1
     if not 1 <= columns <= 8:
         return None
-    # Without its numbers every line must be the same. Between two separators there is one number
-    # at most, so the right count of numbers means that none is missing anywhere.
+    # Without its numbers every line must be the same. Two separators enclose at most one number, so the right total
+    # means that no number is missing.
     if block.translate(None, _NUMERIC) != (keyword + b" " * separators + b"\n") * rows:
         return None
     numbers = block.translate(None, keyword).split()
     if len(numbers) != rows * columns:
         return None
     try:
-        # float() rounds correctly, and no array function is faster at it.
+        # float() rounds correctly and is as fast as any array function.
         values = np.array(list(map(float, numbers)))
     except ValueError:
         return None
@@ -174,13 +173,13 @@ def integer_table(block: bytes, form: bytes, rows: int) -> NDArray[np.int64] | N
     Returns
     -------
     (rows, k) int64 or None
-        The numbers, too large ones as 2⁶³ - 1; None when a line has another form.
+        The numbers; numbers that are too large become 2⁶³ - 1. None if a line has another form.
     """
     block = _single_spaced(block)
     frame = form.replace(b"1", b"")
     if block.translate(None, b"0123456789") != frame * rows:
         return None
-    # As in `number_table`; besides, digits may not stand where the form has none.
+    # As in `number_table`. In addition, reject digits where the form has none.
     for joint in {form[i : i + 2] for i in range(len(form) - 1)}:
         if b"1" not in joint and block.count(joint) != form.count(joint) * rows:
             return None
@@ -192,7 +191,7 @@ def integer_table(block: bytes, form: bytes, rows: int) -> NDArray[np.int64] | N
 
 
 def _single_spaced(block: bytes) -> bytes:
-    """Make runs of blanks single and drop those at the ends of lines."""
+    """Replace runs of blanks by single ones and remove those at the ends of lines."""
     block = block.replace(b"\t", b" ")
     while b"  " in block:
         block = block.replace(b"  ", b" ")
