@@ -1,8 +1,8 @@
-"""Problems as files: a mesh with a first guess of its map, and a list of the vertices to hold.
+"""Read problem files: a mesh with an initial map, and a list of fixed vertices.
 
-The format is that of the Locally Injective Mappings Benchmark (Du et al. 2020): a folder with
-``input.obj``, whose texture coordinates say where the fixed vertices go, and ``handles.txt``,
-which names these vertices.
+The format is that of the Locally Injective Mappings Benchmark (Du et al. 2020): a folder with ``input.obj`` and
+``handles.txt``. The texture coordinates of ``input.obj`` are the target positions, and ``handles.txt`` lists the fixed
+vertices.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, named
 
 
 class ProblemArrays(NamedTuple):
-    """What `quasiharmonic.Problem` is made from.
+    """The arrays of a `quasiharmonic.Problem`.
 
     Attributes
     ----------
@@ -32,9 +32,9 @@ class ProblemArrays(NamedTuple):
     F : (f, 3) int64
         Triangles.
     fixed : (k,) int64
-        Vertices to hold.
+        Fixed vertices.
     target : (k, 2) float64
-        Where to hold them.
+        Target positions of the fixed vertices.
     """
 
     V: FloatArray
@@ -51,18 +51,17 @@ def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] |
     source : str or path-like
         A folder with ``input.obj`` and, optionally, ``handles.txt``; or an OBJ file alone.
     fixed : str or path-like, optional
-        A list of vertices to hold in place of the folder's. Where there is none at all, the
-        boundary is held.
+        A list of fixed vertices that replaces the folder's list. Without any list, the boundary is fixed.
 
     Returns
     -------
     ProblemArrays
-        ``V, F, fixed, target``, the target being where the texture coordinates put ``fixed``.
+        ``V, F, fixed, target``. The target positions are the texture coordinates of ``fixed``.
 
     Raises
     ------
     MeshFileError
-        When a file cannot be read or does not say where a fixed vertex goes.
+        If a file cannot be read, or a fixed vertex has no target position.
     """
     mesh_path, fixed_path = problem_files(source, fixed)
     mesh = read_obj(mesh_path)
@@ -72,39 +71,39 @@ def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] |
 def problem_files(
     source: str | os.PathLike[str], fixed: str | os.PathLike[str] | None = None
 ) -> tuple[Path, Path | None]:
-    """Tell the files of a problem: of the mesh, and of the vertices to hold where there is one.
+    """Return the paths of a problem's mesh and, if there is one, of its list of fixed vertices.
 
     Parameters
     ----------
     source : path
-        An OBJ file, or a folder with ``input.obj`` and perhaps ``handles.txt``.
+        An OBJ file, or a folder with ``input.obj`` and optionally ``handles.txt``.
     fixed : path, optional
-        A list of vertices, whatever the folder has.
+        A list of fixed vertices that replaces the folder's list.
 
     Returns
     -------
     mesh : Path
     fixed : Path or None
-        Neither need exist: reading them says so.
+        The files may be missing; reading them then raises an error.
     """
     mesh_path = Path(source)
     if mesh_path.is_dir():
         folder, mesh_path = mesh_path, mesh_path / "input.obj"
-        # A link that leads nowhere is a list that is missing, not none.
+        # lexists: a broken link counts as a list, so that reading it raises an error.
         if fixed is None and os.path.lexists(folder / "handles.txt"):
             fixed = folder / "handles.txt"
     return mesh_path, None if fixed is None else Path(fixed)
 
 
 def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArrays:
-    """Make a mapping problem from a mesh that has texture coordinates.
+    """Return the mapping problem of a mesh that has texture coordinates.
 
     Parameters
     ----------
     mesh : MeshData
-        The mesh. Seams are no obstacle where no vertex is fixed.
+        The mesh. It may have seams, except at fixed vertices.
     fixed : (k,) int64, optional
-        Vertices to hold, the boundary when not given.
+        Fixed vertices; the boundary by default.
 
     Returns
     -------
@@ -114,8 +113,8 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
     Raises
     ------
     MeshFileError
-        When nothing is there to hold, or a fixed vertex has no place or several; the message names
-        the first such vertices.
+        If there are no vertices to fix, or a fixed vertex has no or several target positions. The message names the
+        first such vertices.
     """
     if mesh.FT is None:
         raise MeshFileError(
@@ -143,14 +142,14 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
 
 
 def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
-    """Read a list of vertices: 0-based indices, one a line, with blank lines and ``#`` comments.
+    """Read a list of vertices: 0-based indices, one per line, with blank lines and ``#`` comments.
 
     Parameters
     ----------
     path : str or path-like
         The file.
     n : int
-        Number of vertices there are.
+        Number of vertices of the mesh.
 
     Returns
     -------
@@ -160,10 +159,10 @@ def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
     Raises
     ------
     MeshFileError
-        With the line, for anything but an integer, an index outside ``0 … n - 1``, a vertex named
-        twice; for an empty list.
+        With the line, for a line that is not an integer, an index outside ``0 … n - 1``, or a repeated vertex. Also for
+        an empty list.
     """
-    # Every vertex comes once, so this cannot outgrow the mesh.
+    # Each vertex is stored once, so the memory is bounded by the mesh size.
     seen: dict[int, int] = {}
     for line, raw in enumerate(io.BytesIO(read_text(path)), 1):
         text = raw.split(b"#", 1)[0].strip()

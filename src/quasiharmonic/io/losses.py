@@ -1,4 +1,4 @@
-"""What each format has no room for, said before anything is written."""
+"""List the data that a file format cannot store, before a file is written."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ TEXTURED = ".obj", ".glb", ".gltf"
 
 
 def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
-    """What a mesh has that a file written of it will not have.
+    """Return descriptions of the mesh data that the file will not contain.
 
     Parameters
     ----------
     path : str or path-like
-        The file; the suffix of its name says the format.
+        The file; the suffix of its name selects the format.
     mesh : MeshData
-        What is going to be written.
+        The mesh to write.
 
     Returns
     -------
     list of str
-        In words; empty where nothing is lost.
+        Descriptions for messages; empty if nothing is lost.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".off":

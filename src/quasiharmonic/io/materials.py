@@ -1,4 +1,4 @@
-"""Materials of OBJ files: the libraries (.mtl) that they name, and one of our own with a picture."""
+"""Materials of OBJ files: the libraries (.mtl) that they name, and a new library with a texture."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _NAME = "map"
 
 
 def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
-    """Name a mesh's libraries as a file at ``path`` has to, if they stand where its source names them.
+    """Return the mesh with its library names changed to paths relative to the folder of ``path``.
 
-    A library that is beside the new file too, or nowhere, stays as it is named.
+    A name is unchanged if the library also exists beside the new file, or does not exist beside the source.
     """
 
     def renamed(name: str, here: Path, there: Path) -> str:
@@ -27,7 +27,7 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
             return name
         try:
             return os.path.relpath(here / name, there).replace(os.sep, "/")
-        except ValueError:  # on another drive
+        except ValueError:  # The library is on another drive.
             return (here / name).resolve().as_posix()
 
     lines = mesh.statements.split(b"\n")
@@ -38,29 +38,29 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
 
 
 def companions(path: str | os.PathLike[str], texture: Texture) -> tuple[Path, Path]:
-    """Where the library and the picture of an OBJ file with a texture are."""
+    """Return the paths of the library and of the image of an OBJ file with a texture."""
     path = Path(path)
-    # Readers of OBJ files take a blank for the end of a name.
+    # In OBJ files a blank ends a name.
     stem = "_".join(path.stem.split()) + "-texture"
     return path.with_name(stem + ".mtl"), path.with_name(stem + texture.suffix)
 
 
 def write_material(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> MeshData:
-    """Write the library and the picture that go with an OBJ file, and return the mesh that names them.
+    """Write the library and the image of an OBJ file with a texture, and return the mesh that names them.
 
     Parameters
     ----------
     path : str or path-like
         The OBJ file.
     mesh : MeshData
-        With a texture; materials of its own are left out.
+        A mesh with a texture. Its own materials are dropped.
     durable : bool
-        As for `write_whole`.
+        As in `write_whole`.
 
     Returns
     -------
     MeshData
-        To be written at ``path``.
+        The mesh to write at ``path``.
     """
     assert mesh.texture is not None
     library, picture = companions(path, mesh.texture)
@@ -86,7 +86,7 @@ def _names_library(line: bytes) -> bool:
 def _with_names(
     line: bytes, path: str | os.PathLike[str], mesh: MeshData, change: Callable[[str, Path, Path], str]
 ) -> bytes:
-    """A ``mtllib`` line with its names changed: several, or a single one with blanks."""
+    """Return a ``mtllib`` line with its names changed: several names, or a single name with blanks."""
     here, there = Path(mesh.source).parent, Path(path).parent
     rest = os.fsdecode(line.split(None, 1)[1].strip()) if len(line.split(None, 1)) > 1 else ""
     whole = (here / rest).is_file() or (there / rest).is_file()

@@ -1,6 +1,6 @@
-"""Pictures that maps put on surfaces: one's own, or a checkerboard.
+"""Textures for mapped surfaces: an image file or a checkerboard.
 
-A picture is the unit square, v upwards, and is repeated beyond it: every viewer agrees on that.
+The texture covers the unit square, v upwards, and repeats beyond it, as in every viewer.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _SQUARES, _PIXELS = 16, 32
 
 @dataclass(frozen=True)
 class Texture:
-    """A picture, as its file has it.
+    """An image, as the bytes of its file.
 
     Attributes
     ----------
     data : bytes
     media_type, suffix : str
-        What it is: ``image/png`` and ``.png``, or ``image/jpeg`` and ``.jpg``.
+        The format: ``image/png`` and ``.png``, or ``image/jpeg`` and ``.jpg``.
     """
 
     data: bytes
@@ -37,12 +37,12 @@ class Texture:
 
 
 def read_texture(path: str | os.PathLike[str]) -> Texture:
-    """Read a picture, PNG or JPEG.
+    """Read a PNG or JPEG image.
 
     Raises
     ------
     MeshFileError
-        When there is no such file, or it is no such picture.
+        If the file does not exist, or is neither PNG nor JPEG.
     """
     data = read_bytes(path)
     for start, kind in _KINDS.items():
@@ -52,11 +52,11 @@ def read_texture(path: str | os.PathLike[str]) -> Texture:
 
 
 def checkerboard() -> Texture:
-    """A checkerboard, which goes on where it is repeated."""
+    """Return a checkerboard texture that repeats without seams."""
     dark = np.indices((_SQUARES, _SQUARES)).sum(axis=0) % 2 == 1
     pixels = np.where(dark[..., None], _DARK, _LIGHT).astype(np.uint8).repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)
     side = _SQUARES * _PIXELS
-    # Each line begins with a byte that says that it is as it stands.
+    # Each line starts with a filter byte; 0 means unfiltered.
     lines = np.concatenate([np.zeros((side, 1), dtype=np.uint8), pixels.reshape(side, -1)], axis=1)
     head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     parts = (b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b"")

@@ -1,4 +1,4 @@
-"""Functions that take one mesh in place of ``V`` and ``F``."""
+"""Decorators for functions that accept one mesh in place of ``V`` and ``F``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Path = str | PathLike[str]
 
 
 class AcceptsMesh(Protocol[P, R_co]):
-    """A function of ``V``, ``F`` and further arguments, or of a mesh and these."""
+    """A function of ``V``, ``F`` and further arguments, or of a mesh and these arguments."""
 
     @overload
     def __call__(self, V: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
@@ -31,7 +31,7 @@ class AcceptsMesh(Protocol[P, R_co]):
 
 
 class WriterAcceptsMesh(Protocol[P, R_co]):
-    """A function of a file to write, ``V``, ``F`` and further arguments, or of a file, a mesh and these."""
+    """A function of a file to write, ``V``, ``F`` and further arguments, or of a file, a mesh and these arguments."""
 
     @overload
     def __call__(self, path: Path, V: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
@@ -40,7 +40,7 @@ class WriterAcceptsMesh(Protocol[P, R_co]):
 
 
 class AcceptsPlanarMesh(Protocol[P, R_co]):
-    """A function of ``points``, ``F`` and further arguments, or of a mesh in the plane and these."""
+    """A function of ``points``, ``F`` and further arguments, or of a planar mesh and these arguments."""
 
     @overload
     def __call__(self, points: ArrayLike, F: ArrayLike, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
@@ -49,28 +49,28 @@ class AcceptsPlanarMesh(Protocol[P, R_co]):
 
 
 def accepts_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsMesh[P, R]:
-    """Let a function whose first two arguments are ``V`` and ``F`` take one mesh in their place."""
+    """Decorate a function of ``V``, ``F``, … so that it accepts one mesh in their place."""
     return _taking(function, 0)
 
 
 def writer_accepts_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R]) -> WriterAcceptsMesh[P, R]:
-    """Let a function whose arguments after a path are ``V`` and ``F`` take one mesh in their place."""
+    """Decorate a function of a path, ``V``, ``F``, … so that it accepts one mesh in place of ``V`` and ``F``."""
     return _taking(function, 1)
 
 
 def accepts_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsPlanarMesh[P, R]:
-    """Let a function whose first two arguments are ``points`` and elements ``F`` of a plane take one mesh instead."""
+    """Decorate a function of planar ``points`` and elements ``F`` so that it accepts one mesh in their place."""
     return _taking(function, 0, planar_cells)
 
 
 def init_accepts_mesh(init: Callable[..., None]) -> Callable[..., None]:
-    """Let an ``__init__`` whose arguments after ``self`` are ``V`` and ``F`` take one mesh in their place."""
+    """Decorate an ``__init__`` of ``V``, ``F``, … so that it accepts one mesh in their place."""
     made: Callable[..., None] = _taking(init, 1)
     return made
 
 
 def init_accepts_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
-    """Let an ``__init__`` whose arguments after ``self`` are ``points`` and ``F`` of a plane take one mesh instead."""
+    """Decorate an ``__init__`` of planar ``points`` and elements ``F`` so that it accepts one mesh in their place."""
     made: Callable[..., None] = _taking(init, 1, planar_cells)
     return made
 
@@ -78,7 +78,7 @@ def init_accepts_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
 def _taking(
     function: Callable[..., Any], place: int, arrays: Callable[[Any], tuple[FloatArray, IntArray]] = mesh_arrays
 ) -> Any:
-    """A function that takes a mesh as its argument number ``place``, where positions are, and as ``F`` after it."""
+    """Return a function that also accepts a mesh as argument number ``place``, in place of positions and ``F``."""
     first = list(inspect.signature(function).parameters)[place]
 
     @wraps(function)
@@ -98,7 +98,7 @@ def _taking(
 
 
 def _check_room(function: Callable[..., Any], mesh: object, count: int, kwargs: dict[str, Any]) -> None:
-    """Raise a TypeError where a mesh was handed over and ``F`` too."""
+    """Raise a TypeError if both a mesh and ``F`` were passed."""
     parameters = inspect.signature(function).parameters.values()
     most = sum(parameter.kind is not inspect.Parameter.KEYWORD_ONLY for parameter in parameters)
     if "F" in kwargs or count > most:

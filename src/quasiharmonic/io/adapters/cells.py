@@ -1,6 +1,6 @@
-"""The nodes and the elements of meshes of simulations: scikit-fem's, meshio's, PyVista's, DOLFINx's, files.
+"""Nodes and elements of planar simulation meshes: scikit-fem, meshio, PyVista, DOLFINx, and files.
 
-As for other meshes nobody's library is imported: an object is known by what it calls its parts.
+As in `objects`, no library is imported: the adapter recognises an object by its attribute names.
 """
 
 from __future__ import annotations
@@ -16,40 +16,40 @@ from quasiharmonic.geometry.mesh.elements import joined
 from quasiharmonic.io.adapters.objects import MeshLike, planar_arrays
 from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, kind_of, vertex_array
 
-# Kinds of cells by how many nodes they have, and those that are no elements of a planar mesh: meshio's, and VTK's.
+# Number of nodes by kind of cell, in meshio's and VTK's names; then the kinds to skip, which have no area.
 _NODES = {"triangle": 3, "quad": 4, "triangle6": 6, 5: 3, 9: 4, 22: 6}
 _PASSED_OVER = ("vertex", "line", "line3", 1, 2, 3, 4, 21)
-# VTK's number of cells of any number of corners, which are cut into triangles.
+# VTK's kind number of polygons, which are cut into triangles.
 _POLYGON = 7
-# From DOLFINx's order of an element's nodes to the one around it, by how many they are.
+# Permutation from DOLFINx's node order to the order around the element, by number of nodes.
 _AROUND = {3: [0, 1, 2], 4: [0, 1, 3, 2], 6: [0, 1, 2, 5, 3, 4]}
 _FILES = (".msh", ".vtk", ".vtu")
 
 
 def planar_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
-    """The nodes and the elements of what stands for a planar mesh.
+    """Return the nodes and the elements of a planar mesh, given as an object, a mapping or a path.
 
     Parameters
     ----------
     mesh : object, mapping or path
         A mesh of scikit-fem (``doflocs`` and ``dofs.element_dofs``), of DOLFINx (``geometry.x`` and
-        ``geometry.dofmap``), of meshio (``cells`` in blocks), of PyVista (``cells_dict``), the path of a ``.msh``,
-        ``.vtk`` or ``.vtu``, or whatever else `quasiharmonic.io.adapters.objects.mesh_arrays` takes: larger faces of
-        those are cut into triangles.
+        ``geometry.dofmap``), of meshio (``cells`` in blocks) or of PyVista (``cells_dict``); the path of a ``.msh``,
+        ``.vtk`` or ``.vtu`` file; or any mesh that `quasiharmonic.io.adapters.objects.mesh_arrays` accepts, whose
+        larger faces are cut into triangles.
 
     Returns
     -------
     points : (n, 2) float64
-        In the library's order; three columns where they are in no plane of constant z.
+        Nodes in the library's order; (n, 3) if they do not lie in a plane of constant z.
     F : (f, 3), (f, 4) or (f, 6) int64
-        As `quasiharmonic.geometry.mesh.elements` has them.
+        Elements in the format of `quasiharmonic.geometry.mesh.elements`.
 
     Raises
     ------
     ValueError
-        When cells are of other kinds, or six-node triangles beside others.
+        If there are cells of other kinds, or six-node triangles together with other elements.
     quasiharmonic.io.MeshFileError
-        When the file cannot be read.
+        If the file cannot be read.
     """
     if isinstance(mesh, str | PathLike) and Path(mesh).suffix.lower() in _FILES:
         from quasiharmonic.io.fem.files import read_fem
@@ -71,7 +71,7 @@ def planar_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
 
 
 def _elements(blocks: Iterable[tuple[Any, Any]], name: str) -> IntArray:
-    """Elements of blocks of one kind each, meshio's or VTK's, as rows of one length."""
+    """Join blocks of elements, each of one kind in meshio's or VTK's names, into rows of one length."""
     rows = []
     for kind, nodes in blocks:
         if kind in _PASSED_OVER:
@@ -86,7 +86,7 @@ def _elements(blocks: Iterable[tuple[Any, Any]], name: str) -> IntArray:
 
 
 def _blocks(mesh: Any) -> list[tuple[Any, Any]] | None:
-    """Kinds of cells and their nodes, as meshio and PyVista have them; None where a mesh has no such thing."""
+    """Return kinds of cells and their nodes from meshio's or PyVista's attributes; None if the mesh has neither."""
     cells = getattr(mesh, "cells", None)
     if isinstance(cells, Sequence) and cells and all(hasattr(block, "data") for block in cells):
         return [(block.type, block.data) for block in cells]

@@ -1,7 +1,7 @@
-"""The vertices and triangles of whatever stands for a mesh: an object of another library, a mapping, a file.
+"""Vertices and triangles of a mesh, given as an object of another library, a mapping or a file.
 
-Nobody's library is imported: an object is known by what it calls its positions and its faces, as trimesh, PyVista,
-meshio, Open3D, vedo, SciPy's triangulations and this package's own classes do.
+No library is imported: the adapter recognises an object by the attribute names of its positions and faces. It supports
+trimesh, PyVista, meshio, Open3D, vedo, SciPy's triangulations and this package's classes.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _Geometry(Protocol):
     def geometry(self) -> Any: ...
 
 
-#: What stands for a mesh: an object with vertices and faces, a mapping with these keys, or the path of a file.
+#: A mesh: an object with vertices and faces, a mapping with these keys, or the path of a file.
 MeshLike = (
     _VerticesFaces
     | _VerticesTriangles
@@ -87,19 +87,22 @@ MeshLike = (
     | PathLike[str]
 )
 
-# A mesh of trimesh has "triangles" too, which are coordinates: its "faces" come first.
+# "faces" precede "triangles", because "triangles" of a trimesh mesh are coordinates.
 _POSITIONS = ("vertices", "points", "V", "coordinates", "verts")
 _FACES = ("faces", "triangles", "F", "cells", "simplices")
-# What scikit-fem calls its positions, which are columns, as the corners of its elements are.
+# scikit-fem's positions; they are columns, as are the corners of its elements.
 _BY_COLUMNS = "doflocs"
 
-# Kinds of cells that are faces, and those that are no part of a surface and are passed over: meshio's, and VTK's.
+# Kinds of cells that are faces, and kinds to skip (points and lines), in meshio's and VTK's names.
 _FACES_OF, _PASSED_OVER = ("triangle", "quad", "polygon"), ("vertex", "line")
 _FACES_OF_VTK, _PASSED_OVER_OF_VTK = (5, 7, 9), (0, 1, 2, 3, 4)
 
 
 def stands_for_mesh(value: object) -> bool:
-    """Whether a value can only be meant as a whole mesh: it is a path, has vertices and faces, or is no array."""
+    """Return whether a value is meant as a whole mesh.
+
+    Meshes are paths, mappings, objects with vertices and faces, and any other object that is not array-like.
+    """
     if isinstance(value, np.ndarray):
         return False
     if isinstance(value, str | PathLike | Mapping) or None not in _parts(value) or hasattr(value, _BY_COLUMNS):
@@ -111,15 +114,16 @@ def stands_for_mesh(value: object) -> bool:
 
 
 def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
-    """The positions and the triangles of what stands for a mesh.
+    """Return the positions and the triangles of a mesh, given as an object, a mapping or a path.
 
     Parameters
     ----------
     mesh : object, mapping or path
-        With positions as ``vertices``, ``points``, ``V``, ``coordinates`` or ``verts``, and faces as ``faces``,
-        ``triangles``, ``F``, ``cells`` or ``simplices``: rows of corners, VTK's numbers (count, corners, count, …), or
-        meshio's blocks; or a mesh of scikit-fem. Larger faces are cut into triangles as those of files are; vertices
-        and lines among cells are passed over. A path is that of a file as `quasiharmonic.io.read_mesh` reads it.
+        An object or mapping with positions as ``vertices``, ``points``, ``V``, ``coordinates`` or ``verts``, and faces
+        as ``faces``, ``triangles``, ``F``, ``cells`` or ``simplices``. Faces are rows of corners, VTK's list (count,
+        corners, count, …), or meshio's blocks. Also a mesh of scikit-fem, or the path of a file that
+        `quasiharmonic.io.read_mesh` reads. Larger faces are cut into triangles, as those of files are. Points and lines
+        among the cells are skipped.
 
     Returns
     -------
@@ -129,9 +133,9 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     Raises
     ------
     ValueError
-        When these are not to be found, or there are cells that are no faces, such as tetrahedra.
+        If positions or faces are missing, or there are cells that are not faces, such as tetrahedra.
     quasiharmonic.io.MeshFileError
-        When the file cannot be read.
+        If the file cannot be read.
     """
     if isinstance(mesh, str | PathLike):
         from quasiharmonic.io import read_mesh
@@ -156,13 +160,13 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
 
 
 def planar_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
-    """As `mesh_arrays`, of a mesh in the plane: positions (n, 2), whose third coordinate is the same everywhere."""
+    """Return the arrays of `mesh_arrays`, with positions (n, 2) if the third coordinate is constant."""
     V, F = mesh_arrays(mesh)
     return (V[:, :2] if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V), F
 
 
 def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
-    """A mesh with the seams and the map that it carries: a `SeamedMesh`, `MeshData` or file; others have none."""
+    """Return a `SeamedMesh` of a mesh; seams and map come from a `SeamedMesh`, `MeshData` or file only."""
     from quasiharmonic import io
 
     if isinstance(mesh, SeamedMesh):
@@ -177,16 +181,16 @@ def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
 
 
 def mesh_triangles(F: Any) -> Any:
-    """The triangles of what stands for a mesh, and anything else as it is."""
+    """Return the triangles of a mesh, and any other value unchanged."""
     return mesh_arrays(F)[1] if stands_for_mesh(F) else F
 
 
 def _parts(mesh: object) -> tuple[str | None, str | None]:
-    """What a mesh calls its positions and its faces; None for what it has not."""
+    """Return the names of a mesh's positions and faces; None for a missing one."""
 
     def first(names: Iterable[str]) -> str | None:
         parts = ((name, _part(mesh, name)) for name in names)
-        # Some have methods or counts of these names.
+        # Some objects have methods or counts of these names; skip them.
         return next((name for name, part in parts if hasattr(part, "__len__")), None)
 
     return first(_POSITIONS), first(_FACES)
@@ -197,13 +201,13 @@ def _part(mesh: object, name: str) -> Any:
 
 
 def _triangles(V: FloatArray, name: str, faces: Any, kinds: Any) -> IntArray:
-    """Triangles of faces in any of the forms that `mesh_arrays` names."""
+    """Return the triangles of faces in any of the forms that `mesh_arrays` lists."""
     if isinstance(faces, Sequence) and any(hasattr(block, "data") and hasattr(block, "type") for block in faces):
         rings = [ring for block in faces for ring in _block(name, block)]
         return _cut(V, np.concatenate([[], *rings]).astype(np.int64), np.array([len(ring) for ring in rings]))
     try:
         array = np.asarray(faces)
-    except ValueError:  # rows that differ in length
+    except ValueError:  # The rows differ in length.
         rings = [index_array(name, ring) for ring in faces]
         return _cut(V, np.concatenate(rings), np.array([len(ring) for ring in rings]))
     if array.ndim == 1 and array.size:
@@ -214,7 +218,7 @@ def _triangles(V: FloatArray, name: str, faces: Any, kinds: Any) -> IntArray:
 
 
 def _block(name: str, block: Any) -> Iterable[IntArray]:
-    """The faces of one of meshio's blocks."""
+    """Return the faces of one meshio block."""
     if block.type in _PASSED_OVER:
         return ()
     if block.type not in _FACES_OF:
@@ -223,7 +227,10 @@ def _block(name: str, block: Any) -> Iterable[IntArray]:
 
 
 def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
-    """Corners and sizes of the faces in VTK's list (count, corners, count, …); ``kinds`` tells what each cell is."""
+    """Return corners and sizes of the faces in VTK's list (count, corners, count, …).
+
+    ``kinds`` are the kinds of the cells; None if all cells are faces.
+    """
     step = int(numbers[0]) + 1
     if step > 1 and len(numbers) % step == 0 and (numbers[::step] == step - 1).all():
         heads = np.arange(0, len(numbers), step)
@@ -242,7 +249,7 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
 
 
 def _heads(name: str, numbers: list[int]) -> list[int]:
-    """Where the counts stand in VTK's list."""
+    """Return the indices of the counts in VTK's list."""
     heads, at = [], 0
     while at < len(numbers):
         if numbers[at] < 1 or at + numbers[at] >= len(numbers):
@@ -253,7 +260,7 @@ def _heads(name: str, numbers: list[int]) -> list[int]:
 
 
 def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
-    """Triangles (f, 3) of faces of any number of corners."""
+    """Cut faces of any number of corners into triangles (f, 3)."""
     check_range("the faces", corners, len(V))
     space = V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)

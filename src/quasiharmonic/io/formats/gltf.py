@@ -1,6 +1,7 @@
-"""glTF 2.0 files, binary (.glb) or JSON (.gltf): a document, its bytes, and numbers read from and put into them.
+"""glTF 2.0 files, binary (.glb) or JSON (.gltf): read the document and its numbers, change them, and encode the file.
 
-Nothing is run and nothing is fetched: bytes are read from the file itself and from files in its own folder.
+The module runs no code from a file and fetches nothing. It reads bytes only from the file itself and from files in its
+folder.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _SHAPES = {width: shape for shape, width in _WIDTHS.items()}
-# What is packed by these cannot be read without libraries of their own.
+# Compression extensions, which need external libraries and are refused.
 _PACKED = "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"
 _LISTS = (
     *("accessors", "bufferViews", "buffers", "images", "materials", "textures"),
     *("animations", "cameras", "meshes", "nodes", "scenes", "skins"),
 )
 _PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX 20": "image/ktx2"}
-# What goes wrong in a document whose parts are not what they should be.
+# Errors that reading a damaged document may raise.
 DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
 
 
@@ -42,7 +43,7 @@ class Document:
     tree : dict
         The JSON.
     views : list of bytes or memoryview
-        What each of ``tree["bufferViews"]`` covers.
+        The bytes of each of ``tree["bufferViews"]``.
     """
 
     def __init__(self, tree: dict[str, Any], views: list[bytes | memoryview]) -> None:
@@ -51,15 +52,15 @@ class Document:
 
     @property
     def size(self) -> int:
-        """How many bytes all views have together."""
+        """Total number of bytes of all views."""
         return sum(map(len, self.views))
 
     def copy(self) -> Document:
-        """Another document to change; the bytes are shared."""
+        """Return a copy to modify; the bytes are shared."""
         return Document(json.loads(json.dumps(self.tree)), list(self.views))
 
     def numbers(self, index: int) -> NDArray[Any]:
-        """What an accessor refers to, (count, width), of the type in the file; raises one of `DAMAGE`."""
+        """Return the numbers of an accessor, (count, width), in the type of the file; raise one of `DAMAGE`."""
         accessor = self.tree["accessors"][whole(index)]
         kind = np.dtype(_look_up(accessor, "componentType", _KINDS, index))
         width = _look_up(accessor, "type", _WIDTHS, index)
@@ -77,28 +78,28 @@ class Document:
         return table
 
     def reals(self, index: int) -> NDArray[np.float64]:
-        """What an accessor means, (count, width): of normalised integers their share of the largest."""
+        """Return the values of an accessor, (count, width); normalised integers are divided by the largest one."""
         table = self.numbers(index)
         if table.dtype.kind == "f" or not self.tree["accessors"][index].get("normalized"):
             return table.astype(np.float64)
         return np.maximum(table / np.iinfo(table.dtype).max, -1.0)
 
     def add(self, table: NDArray[Any], *, indices: bool = False) -> int:
-        """Add an accessor for numbers (count, width), indices or something at vertices; return its number."""
+        """Add an accessor for numbers (count, width), either indices or vertex data; return its index."""
         accessors = self.tree.setdefault("accessors", [])
         accessors.append({})
         self.put(len(accessors) - 1, table, indices=indices)
         return len(accessors) - 1
 
     def put(self, index: int, table: NDArray[Any], *, indices: bool = False, repeated: bool = False) -> None:
-        """Have an accessor refer to other numbers (count, width), ``repeated`` if they are the old ones oftener."""
+        """Replace the numbers (count, width) of an accessor; ``repeated`` means that they only repeat its old rows."""
         accessor = self.tree["accessors"][index]
         old = accessor.get("bufferView")
         for stale in ("sparse", "byteOffset", *(() if repeated else ("min", "max", "normalized"))):
             accessor.pop(stale, None)
         table = np.ascontiguousarray(table)
         raw = table.view(np.uint8).reshape(len(table), -1)
-        # Whatever is at vertices begins at multiples of four bytes.
+        # Rows of vertex data start at multiples of four bytes.
         padding = 0 if indices else -raw.shape[1] % 4
         view = {"buffer": 0, "target": 34963 if indices else 34962}
         if padding:
@@ -114,13 +115,13 @@ class Document:
         accessor["componentType"] = _CODES[table.dtype]
 
     def add_bytes(self, data: bytes) -> int:
-        """Add a view of some bytes, a picture's; return its index."""
+        """Add a view of the bytes of an image; return its index."""
         self.tree.setdefault("bufferViews", []).append({"buffer": 0})
         self.views.append(data)
         return len(self.views) - 1
 
     def encoded(self, *, binary: bool) -> bytes:
-        """The file: binary, or JSON with the bytes in it as text; `ValueError` when it is too large for either."""
+        """Return the bytes of the file: binary, or JSON with base64 data; raise `ValueError` if it is too large."""
         if self.size >= 1 << 31:
             raise ValueError("a glTF file has at most 2 GiB: write .ply or .obj")
         tree, buffer = dict(self.tree), bytearray()
@@ -142,7 +143,7 @@ class Document:
         return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
 
     def _referred(self, view: int) -> int:
-        """How often a view is referred to."""
+        """Return the number of references to a view."""
 
         def count(node: object) -> int:
             if isinstance(node, dict):
@@ -152,7 +153,7 @@ class Document:
         return count(self.tree)
 
     def _rows(self, where: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
-        """Rows of numbers in a view, a copy."""
+        """Return a copy of rows of numbers in a view."""
         index = whole(where["bufferView"])
         view, begin, row = self.views[index], whole(where.get("byteOffset", 0)), kind.itemsize * width
         stride = whole(self.tree["bufferViews"][index].get("byteStride", row))
@@ -168,7 +169,7 @@ def load(path: str | os.PathLike[str]) -> Document:
     Raises
     ------
     MeshFileError
-        When it is none, is damaged or packed, or refers to bytes that are not in its own folder.
+        If the file is not glTF, is damaged or compressed, or refers to bytes outside its own folder.
     """
     data = read_bytes(path)
     try:
@@ -187,7 +188,7 @@ def load(path: str | os.PathLike[str]) -> Document:
         buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
         views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
     except MeshFileError:
-        # Of a file that this one refers to.
+        # An error in a file that this one refers to.
         raise
     except DAMAGE as error:
         raise MeshFileError(path, f"is damaged: {fault(error)}") from error
@@ -195,7 +196,7 @@ def load(path: str | os.PathLike[str]) -> Document:
 
 
 def fault(error: Exception) -> str:
-    """What is wrong with a document, from the error that it led to."""
+    """Return a description of a document's fault, from the error that it raised."""
     match error:
         case ValueError():
             return str(error)
@@ -209,12 +210,12 @@ def fault(error: Exception) -> str:
 
 
 def picture_type(data: bytes) -> str | None:
-    """The media type of a picture that glTF can refer to; None for anything else."""
+    """Return the media type of an image that glTF supports; None for anything else."""
     return next((kind for magic, kind in _PICTURES.items() if data.startswith(magic)), None)
 
 
 def embed_pictures(document: Document, folder: Path) -> list[str]:
-    """Take pictures that stand in files of the document's folder into it; return the names of those that do not."""
+    """Embed images from files in the document's folder; return the names of those that cannot be embedded."""
     missing = []
     for image in document.tree.get("images", []):
         uri = image.get("uri")
@@ -235,7 +236,7 @@ def embed_pictures(document: Document, folder: Path) -> list[str]:
 
 
 def whole(value: object) -> int:
-    """A number that counts something, from a document; `ValueError` for anything else."""
+    """Return a non-negative integer of a document; raise `ValueError` for anything else."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
         raise ValueError(f"{ascii(value)[:40]} where a whole number should be")
     return value
@@ -255,7 +256,7 @@ def _no_number(word: str) -> float:
 
 
 def _check_lists(tree: dict[str, Any]) -> None:
-    """Raise a ValueError where what should be lists of objects is not."""
+    """Raise a ValueError if an entry that must be a list of objects is not."""
     for name in _LISTS:
         there = tree.get(name, [])
         if not isinstance(there, list) or not all(isinstance(one, dict) for one in there):
@@ -263,7 +264,7 @@ def _check_lists(tree: dict[str, Any]) -> None:
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """The JSON and the bytes of a binary file."""
+    """Return the JSON and the binary chunk of a binary file."""
     if data[4:8] != b"\2\0\0\0":
         raise ValueError("its binary version is not 2")
     found: dict[bytes, bytes] = {}
@@ -278,7 +279,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes | None) -> bytes:
-    """The bytes of a buffer."""
+    """Return the bytes of a buffer."""
     size, uri = whole(buffer["byteLength"]), buffer.get("uri")
     if uri is None:
         data = chunk
@@ -298,7 +299,7 @@ def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes |
 
 
 def _beside(folder: Path, uri: str) -> Path:
-    """A file in the folder of the document or in one below."""
+    """Return the path of a file in the document's folder or in a folder below it."""
     name = unquote(uri)
     inside = Path(os.path.normpath(folder / name))
     if ":" in name or "\\" in name or name.startswith("/") or ".." in Path(name).parts:
@@ -311,5 +312,5 @@ def _view(view: dict[str, Any], buffers: list[bytes]) -> bytes | memoryview:
     buffer = buffers[whole(view["buffer"])]
     if begin + size > len(buffer):
         raise ValueError("a buffer view ends behind its buffer")
-    # Not a copy: many views of one buffer shall not cost more than it.
+    # No copy, so that many views of one buffer need no more memory than the buffer.
     return memoryview(buffer)[begin : begin + size]

@@ -1,4 +1,4 @@
-"""Surfaces in glTF documents: one vertex for every place at a seam, made one surface again by equal positions."""
+"""Surfaces in glTF documents. glTF repeats vertices along seams; vertices at equal positions are merged."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Pool:
     Attributes
     ----------
     attributes : dict
-        From names to accessors.
+        Accessors by name.
     targets : list of dict
-        Likewise, for each morph target.
+        Accessors by name, for each morph target.
     mesh : int
-        The mesh of which they are.
+        Index of the mesh.
     first, count : int
-        The number of the first among the vertices of all pools, and how many there are.
+        Index of the first vertex among those of all pools, and number of vertices.
     """
 
     attributes: dict[str, int]
@@ -47,7 +47,7 @@ class Pool:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A primitive: of which mesh it is, which one of it, from which pool, and its triangles' first and end."""
+    """A primitive: its mesh, its index in the mesh, its pool, and the range of its triangles."""
 
     mesh: int
     primitive: int
@@ -57,13 +57,13 @@ class Part:
 
 
 class CarriedGltf(Carried):
-    """A glTF document and how the surface in it is made up.
+    """A glTF document, and the relation of the surface to its primitives.
 
     Attributes
     ----------
     document : Document
     folder : Path
-        Where pictures may stand that it refers to.
+        The folder of the document, with the image files that it refers to.
     pools : list of Pool
     parts : list of Part
     rows : (f, 3) int64
@@ -88,30 +88,30 @@ class CarriedGltf(Carried):
 def read_gltf(path: str | os.PathLike[str]) -> MeshData:
     """Read the triangles of a glTF 2.0 file, binary (.glb) or JSON (.gltf).
 
-    A vertex in such a file has one place, so it is there repeatedly along seams. Here vertices of one mesh at positions
-    that are equal to the last bit are one again, and the seams are in the places. Positions are those in the scene;
-    of a mesh that is there several times the first.
+    A vertex of a glTF file has one texture coordinate, so vertices are repeated along seams. Vertices of one mesh at
+    exactly equal positions are merged, and the texture coordinates keep the seams. Positions are those in the scene. If
+    a mesh occurs several times, its first occurrence is used.
 
     Parameters
     ----------
     path : str or path-like
-        The file. Its buffers are in it or in its folder; nothing else is opened.
+        The file. Its buffers are in the file or in its folder; no other file is opened.
 
     Returns
     -------
     MeshData
-        Triangles in the order of the file, vertices in that in which they come first. Places are ``TEXCOORD_0``
-        with v upwards, 1 - v; a vertex has the colour of the first one at its position; objects and materials are
-        statements. Its ``carried`` has all else, for `write_gltf`.
+        Triangles in the order of the file, vertices in the order of their first occurrence. Texture coordinates are
+        ``TEXCOORD_0`` with v upwards, 1 - v. A merged vertex has the colour of the first vertex at its position.
+        Objects and materials become statements. Its ``carried`` has all other data, for `write_gltf`.
 
     Raises
     ------
     MeshFileError
-        When it is no glTF 2.0 file, is damaged, compressed by an extension, or holds no triangles.
+        If the file is not glTF 2.0, is damaged, is compressed by an extension, or has no triangles.
     """
     document = load(path)
     try:
-        # What is beyond all numbers is told where it is found.
+        # Overflow is reported later, by the checks for finite numbers.
         with np.errstate(over="ignore", invalid="ignore"):
             mesh = _mesh(document, os.fspath(path))
     except (*DAMAGE, RecursionError) as error:
@@ -122,12 +122,12 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
 
 
 def _mesh(document: Document, source: str) -> MeshData | None:
-    """The surface, with what else is in the file; None where there are no triangles."""
+    """Return the surface with all other data of the file; None if there are no triangles."""
     pools, parts, rows, statements = _parts(document)
     if not len(rows):
         return None
     points, kind = _positions(document, pools)
-    # Equal positions of one mesh.
+    # Merge equal positions within each mesh.
     V, which = welded(np.column_stack([kind, points]))
     F = which[rows]
     vt, known = _attribute(document, pools, PLACES, 2)
@@ -153,7 +153,7 @@ def _mesh(document: Document, source: str) -> MeshData | None:
 
 
 def _parts(document: Document) -> tuple[list[Pool], list[Part], IntArray, list[tuple[bytes, int]]]:
-    """Pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
+    """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[Pool](), list[Part](), dict[str, int]()
     triangles, statements, vertices, faces = [np.empty((0, 3), dtype=np.int64)], [], 0, 0
     for m, mesh in enumerate(tree.get("meshes", [])):
@@ -183,7 +183,7 @@ def _parts(document: Document) -> tuple[list[Pool], list[Part], IntArray, list[t
                 statements.append((_statement("o", mesh["name"]), faces))
             if "material" in primitive:
                 material = tree["materials"][whole(primitive["material"])]
-                # One without a name, and the only one, need not be told from others.
+                # A single material without a name needs no statement.
                 if "name" in material or len(tree["materials"]) > 1:
                     name = str(material.get("name", primitive["material"]))
                     statements.append((_statement("usemtl", name), faces))
@@ -193,7 +193,7 @@ def _parts(document: Document) -> tuple[list[Pool], list[Part], IntArray, list[t
 
 
 def _common_count(document: Document, of: list[dict[str, int]]) -> int:
-    """How many vertices some attributes have, which are read, since a count may say anything."""
+    """Return the common number of vertices of some attributes; the accessors are read, as their counts may be wrong."""
     count = len(document.numbers(of[0]["POSITION"]))
     for name, accessor in (pair for attributes in of for pair in attributes.items()):
         if len(document.numbers(accessor)) != count:
@@ -202,7 +202,7 @@ def _common_count(document: Document, of: list[dict[str, int]]) -> int:
 
 
 def _triangles(corners: IntArray, mode: int) -> IntArray:
-    """Triangles (k, 3) of a list, a strip or a fan."""
+    """Return the triangles (k, 3) of a list, a strip or a fan."""
     if mode == _TRIANGLES:
         if len(corners) % 3:
             raise ValueError(f"{len(corners)} indices make no triangles")
@@ -211,17 +211,17 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
     if mode == _FAN:
         return np.stack([corners[i + 1], corners[i + 2], corners[np.zeros_like(i)]], axis=1)
     strip = np.stack([corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]], axis=1)
-    # Strips are joined by triangles that are none.
+    # Degenerate triangles only join strips; drop them.
     return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
 
 
 def _statement(keyword: str, name: str) -> bytes:
-    # A name may hold anything, and a line of OBJ must not.
+    # Remove line breaks and backslashes from names, which would damage a line of OBJ.
     return f"{keyword} {' '.join(name.split()) or '-'}".encode("utf-8", "replace").replace(b"\\", b"/") + b"\n"
 
 
 def _attribute(document: Document, pools: list[Pool], name: str, width: int | None) -> tuple[FloatArray, BoolArray]:
-    """Numbers at the vertices of all pools, (v, width), and at which there are any."""
+    """Return numbers at the vertices of all pools, (v, width), and which vertices have the attribute, (v,) bool."""
     tables = [document.reals(pool.attributes[name]) if name in pool.attributes else None for pool in pools]
     if width is None:
         width = max((table.shape[1] for table in tables if table is not None), default=3)
@@ -240,7 +240,7 @@ def _attribute(document: Document, pools: list[Pool], name: str, width: int | No
 
 
 def _positions(document: Document, pools: list[Pool]) -> tuple[FloatArray, FloatArray]:
-    """Positions (v, 3) in the scene, and the mesh (v,) of each."""
+    """Return positions (v, 3) in the scene, and the mesh (v,) of each."""
     points, _ = _attribute(document, pools, "POSITION", 3)
     placed = _placements(document.tree)
     for pool in pools:
@@ -252,13 +252,13 @@ def _positions(document: Document, pools: list[Pool]) -> tuple[FloatArray, Float
 
 
 def _turned(document: Document, pools: list[Pool], normals: FloatArray) -> FloatArray:
-    """Normals (v, 3) in the scene, of unit length where they were turned."""
+    """Return normals (v, 3) in the scene, of unit length if a transformation was applied."""
     placed = _placements(document.tree)
     for pool in pools:
         if pool.mesh in placed:
             rows = slice(pool.first, pool.first + pool.count)
             linear = placed[pool.mesh][:3, :3]
-            # The matrix of cofactors: that of surface elements, whatever the matrix.
+            # Normals transform by the cofactor matrix, which also exists for singular matrices.
             cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
             turned = normals[rows] @ cofactors.T
             length = np.linalg.norm(turned, axis=1, keepdims=True)
@@ -267,7 +267,7 @@ def _turned(document: Document, pools: list[Pool], normals: FloatArray) -> Float
 
 
 def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
-    """Where meshes are in the scene: matrices (4, 4) of those that are moved at all, each by its first node."""
+    """Return the transformation (4, 4) of each mesh in the scene by its first node, without identities."""
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes", [])
     roots = scenes[whole(tree.get("scene", 0))].get("nodes", []) if scenes else []
@@ -282,14 +282,14 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
         node = nodes[index]
         here = above @ _local(node, index)
         if "mesh" in node:
-            # A skin says where its vertices are, and the node does not.
+            # The transformation of a node with a skin is ignored, as glTF specifies.
             placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
         waiting += [(whole(child), here) for child in reversed(node.get("children", []))]
     return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
 
 
 def _local(node: dict[str, Any], index: int) -> FloatArray:
-    """The matrix of a node."""
+    """Return the matrix of a node."""
     if "matrix" in node:
         return _numbers(node, "matrix", [0] * 16, index).reshape(4, 4).T
     matrix = np.eye(4)

@@ -1,4 +1,4 @@
-"""glTF written: the file that was read with other places, or a new one; vertices are split along seams."""
+"""Write glTF: the file that was read with a new map, or a new file; vertices are split along seams."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ _EXACT = 2.0**-53
 
 
 def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
-    """Write a mesh as a glTF 2.0 file, binary if its name ends in .glb, whole or not at all.
+    """Write a mesh as a glTF 2.0 file, binary if its name ends in .glb, atomically.
 
-    Places and new positions are in single precision. Vertices keep their order; where one has several places, further
-    ones follow at the end of its pool. A mesh that was read from a glTF file keeps all else that was in it, byte for
-    byte where nothing had to be split; pictures that stood in files beside it are taken in. Of another one, runs of
-    faces with one material are a primitive each, and polygons are written as triangles.
+    Texture coordinates and new positions are in single precision. Vertices keep their order. A vertex with several
+    texture coordinates gets copies at the end of its pool. A mesh that was read from a glTF file keeps all other data
+    of that file, unchanged where no vertex was split; images from files beside it are embedded. For other meshes, each
+    run of faces with one material becomes a primitive, and polygons are written as triangles.
 
     Parameters
     ----------
     path : str or path-like
-        Where to.
+        The file to write.
     mesh : MeshData
-        What to write.
+        The mesh.
 
     Raises
     ------
     ValueError
-        When a number is beyond single precision, or there is more than a glTF file can hold.
+        If a number exceeds single precision, or the data exceed the limits of glTF.
     OutputError
-        When it cannot be written; the old file is then untouched.
+        If the file cannot be written. An existing file is then unchanged.
     """
     carried = mesh.carried
     if isinstance(carried, CarriedGltf) and carried.fits(mesh):
@@ -56,7 +56,7 @@ def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
 
 
 def not_in_gltf(mesh: MeshData) -> list[str]:
-    """What a mesh has that a glTF file written of it will not have."""
+    """Return descriptions of the mesh data that a glTF file will not contain."""
     carried = mesh.carried
     if isinstance(carried, CarriedGltf) and carried.fits(mesh):
         missing = embed_pictures(carried.document.copy(), carried.folder)
@@ -82,7 +82,7 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
 
 
 def _refilled(carried: CarriedGltf, mesh: MeshData) -> Document:
-    """The document that was read, with the places of a mesh."""
+    """Return the document that was read, with the texture coordinates of a mesh."""
     document = carried.document.copy()
     users = _users(carried)
     for number, pool in enumerate(carried.pools):
@@ -111,7 +111,7 @@ def _refilled(carried: CarriedGltf, mesh: MeshData) -> Document:
 
 
 def _paint(document: Document, texture: Texture) -> None:
-    """Have all triangles with places show a picture."""
+    """Show a texture on all triangles with texture coordinates."""
     tree = document.tree
     colour = {"index": len(tree.setdefault("textures", []))}
     tree["textures"].append({"source": len(tree.setdefault("images", []))})
@@ -125,7 +125,7 @@ def _paint(document: Document, texture: Texture) -> None:
 
 
 def _users(carried: CarriedGltf) -> dict[int, int]:
-    """How many attributes refer to each accessor."""
+    """Return the number of attributes that refer to each accessor."""
     users: dict[int, int] = {}
     for pool in carried.pools:
         for accessor in (*pool.attributes.values(), *(a for target in pool.targets for a in target.values())):
@@ -134,28 +134,28 @@ def _users(carried: CarriedGltf) -> dict[int, int]:
 
 
 def _split(rows: IntArray, keys: IntArray, count: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Give vertices whose corners differ a vertex for each kind of corner.
+    """Split vertices whose corners differ, one vertex for each kind of corner.
 
     Parameters
     ----------
     rows : (k, 3) int64
         Triangles among ``count`` vertices.
     keys : (k, 3, d) int64
-        What tells their corners apart.
+        Keys of the corners; corners of one kind have equal keys.
 
     Returns
     -------
     rows : (k, 3) int64
-        The triangles by vertices of which each is one kind: the old number for the kind that is first in the file,
-        further ones at the end.
+        The triangles in terms of the split vertices. The first kind in the file keeps the old index; further kinds get
+        indices at the end.
     origin : (count + c,) int64
-        The old vertex that each is.
+        The old vertex of each vertex.
     corner : (count + c,) int64
-        One of its corners, as an index into the flattened triangles; -1 where no triangle is.
+        A corner at each vertex, as an index into the flattened triangles; -1 for a vertex of no triangle.
     """
     kinds = np.column_stack([rows.ravel(), keys.reshape(rows.size, -1)])
     unique, first, which = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
-    # Those of one vertex side by side, as they come in the file.
+    # Sort by vertex, then by first occurrence in the file.
     order = np.lexsort((first, unique[:, 0]))
     vertex = unique[order, 0]
     further = np.diff(vertex, prepend=-1) == 0
@@ -169,14 +169,14 @@ def _split(rows: IntArray, keys: IntArray, count: int) -> tuple[IntArray, IntArr
 
 
 def _bits(places: NDArray[np.float32]) -> IntArray:
-    """Places (..., 2) such that equal ones are equal integers."""
+    """Return texture coordinates (..., 2) as integers that are equal where the coordinates are."""
     return (places + np.float32(0)).view(np.int32).astype(np.int64)
 
 
 def _extend(
     document: Document, pool: Pool, primitives: list[dict[str, Any]], origin: IntArray, users: dict[int, int]
 ) -> None:
-    """Repeat whatever a pool's vertices have for further ones."""
+    """Copy the attributes of a pool's vertices to their copies."""
     for name in pool.attributes:
         if name != PLACES:
             table = document.numbers(pool.attributes[name])[origin]
@@ -205,7 +205,7 @@ def _set_attribute(
 
 
 def _other(document: Document, accessor: int, table: NDArray[Any], users: dict[int, int], *, repeated: bool) -> int:
-    """Numbers in place of an accessor's: by itself where nothing else refers to it, else by a new one like it."""
+    """Replace the numbers of an accessor, or of a copy of it if something else refers to it; return the index."""
     if users[accessor] > 1:
         document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
         accessor = len(document.tree["accessors"]) - 1
@@ -215,9 +215,9 @@ def _other(document: Document, accessor: int, table: NDArray[Any], users: dict[i
 
 
 def _stored(vt: FloatArray) -> NDArray[np.float32]:
-    """Places (m, 2) as glTF has them: v downwards, in single precision."""
+    """Return texture coordinates (m, 2) in glTF's convention: v downwards, in single precision."""
     v = 1 - vt[:, 1]
-    # Whoever takes it from 1 again shall not have to round.
+    # Round v so that 1 - v is exact in double precision, and readers lose nothing.
     v = np.where(np.abs(v) < 2.0**-29, np.rint(v / _EXACT) * _EXACT, v)
     return _single("a place", np.stack([vt[:, 0], v], axis=1))
 
@@ -231,12 +231,12 @@ def _single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
 
 
 def _indices(rows: IntArray, count: int) -> NDArray[Any]:
-    """Triangles as a column of indices, of 16 bits where these reach."""
+    """Return triangles as a column of indices, in 16 bits if possible."""
     return rows.reshape(-1, 1).astype(np.uint16 if count < 1 << 16 else np.uint32)
 
 
 def _new(mesh: MeshData) -> Document:
-    """A document of one mesh."""
+    """Return a document of one mesh."""
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "quasiharmonic"},
         "scene": 0,
@@ -276,7 +276,7 @@ def _new(mesh: MeshData) -> Document:
         tree["meshes"][0]["primitives"].append(primitive)
     tree["materials"] = [{"name": name} for name in names]
     if any("material" not in primitive for primitive in tree["meshes"][0]["primitives"]):
-        # Some readers look for places only where there is a material.
+        # Some readers use texture coordinates only with a material.
         tree["materials"].append({})
         for primitive in tree["meshes"][0]["primitives"]:
             primitive.setdefault("material", len(names))
@@ -284,7 +284,10 @@ def _new(mesh: MeshData) -> Document:
 
 
 def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | None, bool]]:
-    """Runs of triangles with one material, all with places or all without: first, end, material, whether without."""
+    """Yield runs of triangles with one material, all with texture coordinates or all without.
+
+    Each run is its first triangle, its end, its material, and whether it has no texture coordinates.
+    """
     lines = mesh.statements.split(b"\n")[:-1]
     uses = [(line, int(at)) for line, at in zip(lines, mesh.statement_faces, strict=True) if line.startswith(b"usemtl")]
     first = np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.first_triangle
@@ -300,7 +303,7 @@ def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | Non
 
 
 def _colours(mesh: MeshData) -> FloatArray | None:
-    """Colours of vertices, with or without opacity; None where they have none or not all."""
+    """Return colours of vertices, with or without opacity; None unless all vertices have one."""
     extra = mesh.extra
     if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
         return None
@@ -308,5 +311,5 @@ def _colours(mesh: MeshData) -> FloatArray | None:
 
 
 def _normals(mesh: MeshData) -> FloatArray | None:
-    """All normals; None where a corner has none."""
+    """Return all normals; None if a corner has none."""
     return None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)

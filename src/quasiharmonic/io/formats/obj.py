@@ -1,4 +1,4 @@
-"""Wavefront OBJ, read and written such that nothing but the map changes."""
+"""Read and write Wavefront OBJ; writing a mesh that was read changes only its map."""
 
 from __future__ import annotations
 
@@ -17,28 +17,26 @@ from quasiharmonic.io.materials import companions, with_libraries, write_materia
 from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
 from quasiharmonic.io.textual import integer_table, number_table, read_text
 
-# Kinds of line, for the reader that takes all lines of a kind at once.
+# Kinds of line, for the reader that parses all lines of a kind at once.
 _BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)
-# Lines that look like statements to that reader and want the careful one.
+# Lines that this reader would take for statements, but that need the line-by-line reader.
 _CAREFUL = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
 _NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _CAREFUL + rb")\s)", re.MULTILINE)
-# What a corner of each form refers to: 0 vertices, 1 texture coordinates, 2 normals.
+# References of a corner of each form: 0 vertices, 1 texture coordinates, 2 normals.
 _FORMS = {b"1": (0,), b"1/1": (0, 1), b"1//1": (0, 2), b"1/1/1": (0, 1, 2)}
 _CHUNK = 100_000
-# How a file ends its lines shows in its first bytes.
+# Number of first bytes in which the line ending is detected.
 _HEAD = 4096
 
 
 def read_obj(path: str | os.PathLike[str]) -> MeshData:
     """Read a mesh of triangles and other polygons from an OBJ file.
 
-    Vertices, faces and the statements between faces keep their order. Faces may refer to vertices
-    in any form (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative). Every ``v`` and ``vt`` must be
-    finite, used or not. Of ``vt`` the first two numbers are read; what stands behind the
-    coordinates of a ``v`` is kept. Normals are kept without being looked at, and so is every
-    statement that is not geometry: groups, materials, comments, and ones not known here. Blank
-    lines and comments behind data are dropped. A comment that ends in a backslash ends there;
-    other lines go on.
+    Vertices, faces and the statements between faces keep their order. Faces may refer to vertices in any form (``a``,
+    ``a/b``, ``a//c``, ``a/b/c``, negative). Every ``v`` and ``vt`` must be finite, used or not. Of ``vt`` the first two
+    numbers are read. Further numbers after the coordinates of a ``v`` are kept. Normals are kept unparsed, and so is
+    every statement that is not geometry: groups, materials, comments and unknown statements. Blank lines and comments
+    after data are dropped. A backslash at the end of a line continues it, except in a comment.
 
     Parameters
     ----------
@@ -53,10 +51,9 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
     Raises
     ------
     MeshFileError
-        With the line, for a face of fewer than three corners or a polygon with a vertex twice, an
-        index that refers to nothing, a number that is none or not finite, free-form geometry, and
-        ``l`` or ``p`` elements whose indices are not plain (they could not be kept); for a file
-        without vertices or faces, one that is not text, or none at all.
+        With the line, for a face of fewer than three corners, a polygon with a repeated vertex, an index out of range,
+        text that is not a finite number, free-form geometry, and ``l`` or ``p`` elements whose indices are not plain
+        (they cannot be kept). Also for a file that has no vertices or no faces, is missing, or is not text.
     """
     data = read_text(path)
     mesh = read_regular(path, data) or read_obj_lines(path, data)
@@ -65,26 +62,26 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
 
 
 def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
-    """Write a mesh as an OBJ file, whole or not at all.
+    """Write a mesh as an OBJ file, atomically.
 
-    Numbers are written such that reading them gives the same double. A material library (``mtllib``) is named such
-    that it is found from the new file where it was found from the old one. With a texture there are two files more,
-    a library and a picture (`quasiharmonic.io.materials.companions`).
+    Numbers are written so that reading them returns the same doubles. The name of a material library (``mtllib``) is
+    changed so that the new file refers to the same library. With a texture, two more files are written: a library and
+    an image (`quasiharmonic.io.materials.companions`).
 
     Parameters
     ----------
     path : str or path-like
-        Where to.
+        The file to write.
     mesh : MeshData
-        What to write: statements before the first vertex, then vertices, texture coordinates,
-        normals, and the faces with the other statements in between where they were.
+        The mesh. The order is: statements before the first vertex, vertices, texture coordinates, normals, then faces
+        with the other statements at their original positions.
     durable : bool
-        As for `write_whole`.
+        As in `write_whole`.
 
     Raises
     ------
     OutputError
-        When it cannot be written; the old file is then untouched.
+        If the file cannot be written. An existing file is then unchanged.
     """
     beside = () if mesh.texture is None else companions(path, mesh.texture)
     with no_remains(*beside):
@@ -96,9 +93,9 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
-    """Read a file whose lines of one kind all have one form; None when it is not so."""
+    """Read a file whose lines of one kind all have the same form; return None for other files."""
     lines = data.count(b"\n")
-    # Shorter lines than any vertex or face has would cost more memory than the file is worth.
+    # Lines shorter than any vertex or face would need too much memory for the size of the file.
     if not lines or 4 * lines > len(data) or b"\\\n" in data:
         return None
     ends, kinds = _classify(data)
@@ -142,11 +139,11 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
 
 
 def _classify(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """Find the end of every line, counting its newline, and its kind by its first letters."""
+    """Return the end of every line, newline included, and its kind by its first letters."""
     text = np.frombuffer(data, dtype=np.uint8)
     ends = np.flatnonzero(text == ord("\n")) + 1
     starts = np.concatenate(([0], ends[:-1]))
-    # A line may be shorter than three letters, but these are then not asked for.
+    # A line may have fewer than three letters; the further ones are then not used.
     first, second, third = (text.take(starts + i, mode="clip") for i in range(3))
 
     def blank(letter: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -170,8 +167,8 @@ def _lines_of(kind: int, data: bytes, ends: NDArray[np.int64], kinds: NDArray[np
 
 
 def _regular_faces(block: bytes, counts: NDArray[np.int64]) -> dict[int, NDArray[np.int64]] | None:
-    """Return the indices (p, k) of faces with k corners each, by what they refer to (see `_FORMS`)."""
-    # No more of a line is taken apart than the longest regular face has, twelve indices.
+    """Return the indices (p, k) of faces with k corners each, by kind of reference (see `_FORMS`)."""
+    # The longest regular face has twelve indices, so a part of the line is enough.
     first = re.sub(rb"[0-9]+", b"1", block[: min(block.index(b"\n"), 250)]).split()
     corners = first[1:]
     if len(corners) not in (3, 4) or corners[0] not in _FORMS or len(set(corners)) > 1:
@@ -187,7 +184,7 @@ def _regular_faces(block: bytes, counts: NDArray[np.int64]) -> dict[int, NDArray
             return None
         parts[part] = indices
     ring = np.sort(parts[0], axis=1)
-    # Polygons with a vertex twice are refused with their line.
+    # The line-by-line reader reports polygons with a repeated vertex, with their line.
     return None if len(corners) > 3 and (ring[:, 1:] == ring[:, :-1]).any() else parts
 
 
@@ -215,13 +212,13 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
 
 
 def _lines(keyword: str, kept: KeptLines | None, rows: NDArray[np.float64]) -> Iterator[bytes]:
-    """Rows of numbers, as they stood where they still say what they said."""
+    """Yield rows of numbers as text; unchanged rows keep their original lines."""
     same = np.zeros(len(rows), dtype=np.bool_) if kept is None else kept.unchanged(rows)
     if kept is None or not same.any():
         yield from _number_lines(keyword, rows)
         return
     texts = kept.text.split(b"\n")
-    # In runs of what stays and what does not.
+    # Yield runs of unchanged and of changed rows.
     ends = [*(np.flatnonzero(same[1:] != same[:-1]) + 1).tolist(), len(rows)]
     begin = 0
     for end in ends:
@@ -240,18 +237,18 @@ def _number_lines(keyword: str, rows: NDArray[np.float64]) -> Iterator[bytes]:
     form = keyword + " %r" * rows.shape[1] + "\n"
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]
-        # repr() is the shortest text that reads back as the same double.
+        # repr() returns the shortest text that reads back as the same double.
         yield (form * len(part) % tuple(part.ravel().tolist())).encode()
 
 
 def _corner_texts(mesh: MeshData) -> list[str]:
-    """Text of every corner of every face, one after another."""
+    """Return the text of every corner of every face, one after another."""
     ring = slice(None) if mesh.polygons is None else mesh.polygons.corners
     parts = [None if part is None else part.ravel()[ring] for part in (mesh.F, mesh.FT, mesh.FN)]
     F, FT, FN = parts
     assert F is not None
     if FN is None and (FT is None or np.array_equal(F, FT)):
-        # Each vertex always looks the same: made once and looked up.
+        # All corners at a vertex have the same text, so make it once per vertex.
         texts = [f"{i}" if FT is None else f"{i}/{i}" for i in range(1, len(mesh.V) + 1)]
         return list(map(texts.__getitem__, F.tolist()))
     absent = [-1] * F.size

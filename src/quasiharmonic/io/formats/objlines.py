@@ -1,4 +1,4 @@
-"""OBJ read line by line: every form of it, and every fault with its line."""
+"""Read OBJ files line by line: every form of OBJ, with the line of every error."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
 from quasiharmonic.io.textual import integer, number, shown
 
-# Statements whose geometry would be lost, and elements that point to vertices in ways not kept.
+# Statements that are refused: reading would lose their geometry.
 REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"call"}
 _PLAIN_ELEMENT = re.compile(rb"[lp][ \t0-9]*")
-# Weight and colour with opacity: what can stand behind the coordinates of a vertex.
+# Most numbers after the coordinates of a vertex: weight and colour with opacity.
 _MOST_EXTRA = 5
-# A polygon of more is no polygon but a fault.
+# More corners indicate a damaged file.
 _MOST_CORNERS = 1000
 
 
 def read_obj_lines(path: str | os.PathLike[str], data: bytes) -> MeshData:
-    """Read the text of an OBJ file; what it takes and raises is said at `read_obj`."""
+    """Read the text of an OBJ file; `read_obj` documents the input and the errors."""
     return _Reader(path, data).read()
 
 
 class _Reader:
-    """The state of reading one file. Compact arrays, so that memory stays a few times the file's."""
+    """The state of reading one file; compact arrays limit memory to a few times the file size."""
 
     def __init__(self, path: str | os.PathLike[str], data: bytes) -> None:
         self.path = path
@@ -83,7 +83,7 @@ class _Reader:
         self.normal_count += 1
 
     def face(self, line: int, text: bytes) -> None:
-        # However long the line, no more of it is taken apart than an error message needs.
+        # Split only as many corners as the error message needs, because a line may be very long.
         corners = _uncommented(text).split(None, _MOST_CORNERS + 1)[1:]
         if len(corners) < 3:
             raise _FaultError(f"face with {_count(corners, 'corner')}", "a triangle has 3")
@@ -141,7 +141,7 @@ class _Reader:
         )
 
     def vertices(self) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Coordinates, and what stood behind them."""
+        """Return the coordinates, and further numbers after them."""
         width = np.array(self.width, dtype=np.int64)
         rows = np.full((width.size, int(width.max())), np.nan)
         rows[np.arange(rows.shape[1]) < width[:, None]] = self.coordinates
@@ -150,7 +150,7 @@ class _Reader:
 
 
 class _FaultError(Exception):
-    """A fault on the line being read, with what the user can do."""
+    """A fault on the current line, with the remedy for the user."""
 
     def __init__(self, what: str, remedy: str) -> None:
         self.what = what
@@ -158,12 +158,12 @@ class _FaultError(Exception):
 
 
 def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Lines that say something, each with its number; continued ones joined under their first."""
-    # Growing in place, because a hostile file may continue one line a million times.
+    """Yield non-empty lines, each with its number; continued lines are joined under the first number."""
+    # The buffer grows in place, because a hostile file may continue one line a million times.
     joined, start = bytearray(), 0
     for line, raw in enumerate(io.BytesIO(data), 1):
         text = raw[:-1]
-        # A comment that ends in a backslash (a path, often) does not swallow the next line.
+        # A comment that ends in a backslash (often a path) does not continue on the next line.
         if text.endswith(b"\\") and (joined or not text.lstrip().startswith(b"#")):
             joined += text[:-1] + b" "
             start = start or line
@@ -190,7 +190,7 @@ def _numbers(text: bytes, most: int) -> list[float]:
 
 
 def _corner(text: bytes, counts: tuple[int, int, int]) -> list[int]:
-    """0-based references of ``a``, ``a/b``, ``a//c`` or ``a/b/c``; -1 for one that is not there."""
+    """Return the 0-based references of ``a``, ``a/b``, ``a//c`` or ``a/b/c``; -1 for an absent one."""
     parts = text.split(b"/", 3)
     if len(parts) > 3 or not parts[0]:
         raise ValueError(f"{shown(text)} is not a corner of a face")

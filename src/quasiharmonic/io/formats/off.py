@@ -1,4 +1,4 @@
-"""OFF, the Object File Format of Geomview, as far as surfaces go."""
+"""Read and write surfaces in OFF, the Object File Format of Geomview."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from quasiharmonic.io.meshdata import MeshData, polygon_mesh
 from quasiharmonic.io.textual import integer, integer_table, number, number_table, read_text, shown
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Texture coordinates, colours and normals stand behind the coordinates, so they can be passed over.
+# Texture coordinates, colours and normals follow the coordinates, so the reader can skip them.
 _HEADER = re.compile(rb"(?:ST)?C?N?OFF")
-# A polygon of more is no polygon but a fault.
+# More corners indicate a damaged file.
 _MOST_CORNERS = 1000
 
 
 def read_off(path: str | os.PathLike[str]) -> MeshData:
     """Read a mesh of triangles and other polygons from an OFF file.
 
-    The counts may share the line of the header. Comments, and what stands behind the coordinates of
-    a vertex or the corners of a face (colours, normals), are ignored.
+    The counts may follow the header on the same line. Comments are ignored, and so are further numbers after the
+    coordinates of a vertex or the corners of a face (colours, normals).
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
     Raises
     ------
     MeshFileError
-        With the line, for a face of fewer than three corners or a polygon with a vertex twice, an
-        index that refers to nothing, a number that is none or not finite, counts that the file does
-        not keep; for another kind of OFF (binary, four-dimensional), a file that is not text, or none at all.
+        With the line, for a face of fewer than three corners, a polygon with a repeated vertex, an index out of range,
+        text that is not a finite number, or wrong counts. Also for another kind of OFF (binary, four-dimensional), and
+        for a file that is missing or not text.
     """
     data = read_text(path)
     lines = _content(data)
@@ -68,21 +68,21 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
 
 
 def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
-    """Write a mesh as an OFF file, whole or not at all.
+    """Write a mesh as an OFF file, atomically.
 
-    Numbers are written such that reading them gives the same double.
+    Numbers are written so that reading them returns the same doubles.
 
     Parameters
     ----------
     path : str or path-like
-        Where to.
+        The file to write.
     mesh : MeshData
-        What to write; OFF takes its vertices and faces.
+        The mesh; OFF stores its vertices and faces.
 
     Raises
     ------
     OutputError
-        When it cannot be written; the old file is then untouched.
+        If the file cannot be written. An existing file is then unchanged.
     """
     head = f"OFF\n{len(mesh.V)} {mesh.faces} 0\n"
     points = "%r %r %r\n" * len(mesh.V) % tuple(mesh.V.ravel().tolist())
@@ -95,7 +95,7 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
 
 
 def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray, IntArray] | None:
-    """Read triangles that follow ``line`` when it is all of one form; None when it is not."""
+    """Read the vertices and triangles after ``line`` if all lines have the regular form; otherwise return None."""
     if data.count(b"\n") != line + vertices + faces:
         return None
     ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
@@ -110,8 +110,8 @@ def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[Flo
 def _read_lines(
     path: str | os.PathLike[str], lines: Iterator[tuple[int, bytes]], vertices: int, faces: int
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Read vertices and faces line by line: positions, corners ring after ring, where rings begin."""
-    # Never sized by the counts, which may say anything.
+    """Read vertices and faces line by line; return positions, corners ring after ring, and starts of the rings."""
+    # The sizes do not come from the counts, which may be wrong.
     V, corners, starts = array("d"), array("q"), array("q", [0])
     line = 0
     for line, text in lines:
@@ -141,7 +141,7 @@ def _read_lines(
 
 
 def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -> list[int]:
-    """The corners of the face on a line."""
+    """Return the corners of the face on a line."""
     count, *rest = text.split(None, _MOST_CORNERS + 1)
     size = integer(count)
     if not 3 <= size <= _MOST_CORNERS:
@@ -159,7 +159,7 @@ def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -
 
 
 def _content(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Lines that say something, without comments, each with its number."""
+    """Yield non-empty lines without comments, each with its number."""
     for line, raw in enumerate(io.BytesIO(data), 1):
         if text := raw.split(b"#", 1)[0].strip():
             yield line, text

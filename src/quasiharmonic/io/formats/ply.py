@@ -1,4 +1,4 @@
-"""PLY, the polygon file format: positions and places in double precision, polygons, seams, and all else in it."""
+"""Read and write PLY, the polygon file format: double precision, polygons, seams, and all other data of a file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quasiharmonic.io.meshdata import Carried, MeshData, polygon_mesh, vertex_pl
 from quasiharmonic.io.textual import read_bytes
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# What programs call places, at vertices and at the corners of faces.
+# Property names of texture coordinates, at vertices and at the corners of faces.
 _PLACES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
 _CORNER_PLACES = "texcoord"
 _RINGS = "vertex_indices", "vertex_index"
@@ -59,8 +59,8 @@ class CarriedPly(Carried):
 def read_ply(path: str | os.PathLike[str]) -> MeshData:
     """Read a mesh of triangles and other polygons from a PLY file, text or binary.
 
-    Places are read from the faces' ``texcoord`` (a pair for each corner, so that there can be seams), else from the
-    vertices' ``s`` and ``t``, ``u`` and ``v``, or ``texture_u`` and ``texture_v``.
+    Texture coordinates are read from the faces' ``texcoord`` (a pair for each corner, so that seams are possible).
+    Without it, they are read from the vertices' ``s`` and ``t``, ``u`` and ``v``, or ``texture_u`` and ``texture_v``.
 
     Parameters
     ----------
@@ -70,16 +70,16 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
     Returns
     -------
     MeshData
-        Vertices and faces in the order of the file. Its ``carried`` has all else, for `write_ply`.
+        Vertices and faces in the order of the file. Its ``carried`` has all other data, for `write_ply`.
 
     Raises
     ------
     MeshFileError
-        When it is no PLY file, is damaged, or holds no faces.
+        If the file is not PLY, is damaged, or has no faces.
     """
     data = read_bytes(path)
     try:
-        # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+        # Converting a signalling NaN is invalid; it is reported later as not finite.
         with np.errstate(invalid="ignore"):
             return _mesh(decoded(data), os.fspath(path))
     except ValueError as error:
@@ -87,23 +87,24 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
 
 
 def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
-    """Write a mesh as a binary PLY file, whole or not at all.
+    """Write a mesh as a binary PLY file, atomically.
 
-    Positions and places are doubles. Places are the vertices' ``s`` and ``t`` where each has one, and the faces'
-    ``texcoord`` where there are seams or faces without. A mesh that was read from a PLY file keeps all else
-    that was in it, its positions as they were; another one its normals and colours, as far as vertices have one each.
+    Positions and texture coordinates are doubles. Texture coordinates are the vertices' ``s`` and ``t``, or the faces'
+    ``texcoord`` if there are seams or corners without texture coordinates. A mesh that was read from a PLY file keeps
+    all other data of that file, and its positions unchanged. Other meshes keep normals and colours that are unique per
+    vertex.
 
     Parameters
     ----------
     path : str or path-like
-        Where to.
+        The file to write.
     mesh : MeshData
-        What to write.
+        The mesh.
 
     Raises
     ------
     OutputError
-        When it cannot be written; the old file is then untouched.
+        If the file cannot be written. An existing file is then unchanged.
     """
     carried = mesh.carried
     if isinstance(carried, CarriedPly) and carried.fits(mesh):
@@ -114,7 +115,7 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
 
 
 def not_in_ply(mesh: MeshData) -> list[str]:
-    """What a mesh has that a PLY file written of it will not have."""
+    """Return descriptions of the mesh data that a PLY file will not contain."""
     if isinstance(mesh.carried, CarriedPly) and mesh.carried.fits(mesh):
         return []
     lost = [] if mesh.carried is None else [*mesh.carried.further()]
@@ -156,14 +157,14 @@ def _mesh(tables: PlyTables, source: str) -> MeshData:
 
 
 def _table(element: Element, *names: str) -> FloatArray | None:
-    """Columns of numbers side by side; None where one is not there."""
+    """Return columns of numbers side by side; None if one is missing."""
     found = [element.find(name) for name in names]
     columns = [column.values.astype(np.float64) for column in found if column is not None and column.sizes is None]
     return np.stack(columns, axis=1) if len(columns) == len(names) else None
 
 
 def _read_colours(vertex: Element) -> FloatArray | None:
-    """Red, green, blue and perhaps opacity of vertices, 0 to 1."""
+    """Return red, green, blue and optionally opacity of vertices, from 0 to 1."""
     found = [column for name in _COLOUR if (column := vertex.find(name)) is not None and column.sizes is None]
     if [column.name for column in found] not in (list(_COLOUR), list(_COLOUR[:3])):
         return None
@@ -174,7 +175,7 @@ def _read_colours(vertex: Element) -> FloatArray | None:
 def _read_places(
     vertex: Element, face: Element, corners: IntArray, sizes: IntArray
 ) -> tuple[FloatArray | None, IntArray | None]:
-    """Places, and for every corner of every face its row of them or -1; None where there are none."""
+    """Return texture coordinates, and for every corner of every face its row of them or -1; None if there are none."""
     of_faces = face.find(_CORNER_PLACES)
     if of_faces is not None and of_faces.sizes is not None:
         odd = np.flatnonzero((of_faces.sizes != 2 * sizes) & (of_faces.sizes != 0))
@@ -184,7 +185,7 @@ def _read_places(
                 f"and {sizes[odd[0]]} corners"
             )
         has = np.repeat(of_faces.sizes > 0, sizes)
-        # A row for each vertex and place of it.
+        # One row for each vertex and texture coordinate of it.
         pairs = np.column_stack([corners[has], of_faces.values.astype(np.float64).reshape(-1, 2) + 0.0])
         rows, which = np.unique(pairs, axis=0, return_inverse=True)
         places = np.full(len(corners), -1)
@@ -198,7 +199,7 @@ def _read_places(
 
 
 def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
-    """The tables with other places."""
+    """Return the tables with the texture coordinates of a mesh."""
     elements = []
     vt, seam = vertex_places(mesh)
     scattered = bool(seam.any()) or (mesh.FT is not None and bool((mesh.FT < 0).any()))
@@ -208,7 +209,7 @@ def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
             old = {name for names in _PLACES for name in names if _table(element, *names) is not None}
             columns = [column for column in columns if column.name not in old]
             if mesh.FT is not None and not scattered:
-                # Vertices that no face uses have none, which no reader would understand.
+                # Vertices that no face uses have NaN, which readers may not accept.
                 columns += [Column(name, np.nan_to_num(vt[:, i])) for i, name in enumerate(_PLACES[0])]
         elif element.name == "face":
             columns = [column for column in columns if column.name != _CORNER_PLACES]
@@ -219,7 +220,7 @@ def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
 
 
 def _corner_places(mesh: MeshData) -> Column:
-    """A pair for each corner of the faces that have places."""
+    """Return a pair for each corner of the faces that have texture coordinates."""
     assert mesh.FT is not None
     assert mesh.vt is not None
     ring, sizes = _rings(mesh)
@@ -233,14 +234,14 @@ def _corner_places(mesh: MeshData) -> Column:
 
 
 def _rings(mesh: MeshData) -> tuple[IntArray, IntArray]:
-    """The corners of faces, as indices into the flattened triangles, and how many each has."""
+    """Return the corners of faces, as indices into the flattened triangles, and the number of corners of each face."""
     if mesh.polygons is None:
         return np.arange(mesh.F.size), np.full(len(mesh.F), 3)
     return mesh.polygons.corners, mesh.polygons.sizes
 
 
 def _vertices(mesh: MeshData) -> Element:
-    """The table of the vertices of a mesh that is from no PLY file."""
+    """Return the vertex table of a mesh that was not read from a PLY file."""
     names = ["x", "y", "z"]
     tables: list[NDArray[Any]] = [mesh.V]
     normals, colours = _normals(mesh), _colours(mesh)
@@ -255,13 +256,13 @@ def _vertices(mesh: MeshData) -> Element:
 
 
 def _faces(mesh: MeshData) -> Element:
-    """The table of the faces of a mesh that is from no PLY file."""
+    """Return the face table of a mesh that was not read from a PLY file."""
     ring, sizes = _rings(mesh)
     return Element("face", len(sizes), (Column(_RINGS[0], mesh.F.ravel()[ring].astype(np.int32), sizes),))
 
 
 def _colours(mesh: MeshData) -> NDArray[Any] | None:
-    """Colours of vertices, as bytes where they are such; None where they have none or not all."""
+    """Return colours of vertices, as bytes if they are multiples of 1/255; None unless all vertices have one."""
     extra = mesh.extra
     if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
         return None
@@ -270,7 +271,7 @@ def _colours(mesh: MeshData) -> NDArray[Any] | None:
 
 
 def _normals(mesh: MeshData) -> FloatArray | None:
-    """The normal of every vertex; None where one has several or none."""
+    """Return the normal of every vertex; None if a vertex has several normals or a corner has none."""
     rows = None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)
     if rows is None or mesh.FN is None:
         return None

@@ -29,15 +29,15 @@ _FIRST = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """What all rows of an element have under one name.
+    """One property of all rows of an element.
 
     Attributes
     ----------
     name : str
     values : (k,) array
-        The numbers, of the type that they have in the file; of lists one after another.
+        The numbers, in the type of the file; the lists of all rows one after another.
     sizes : (r,) int64 or None
-        How long each row's list is; None where a row has one number.
+        Length of each row's list; None if each row has one number.
     """
 
     name: str
@@ -47,32 +47,32 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """A table: its name, how many rows it has, and its columns in their order."""
+    """A table: its name, its number of rows, and its columns in order."""
 
     name: str
     rows: int
     columns: tuple[Column, ...]
 
     def find(self, *names: str) -> Column | None:
-        """The first column that has one of some names."""
+        """Return the first column that has one of the names, or None."""
         return next((column for column in self.columns if column.name in names), None)
 
 
 @dataclass(frozen=True, eq=False)
 class PlyTables:
-    """All tables of a file, and the lines of its header that tell something else."""
+    """All tables of a file, and the remaining lines of its header."""
 
     elements: tuple[Element, ...]
     remarks: tuple[bytes, ...] = ()
 
     def find(self, name: str) -> Element | None:
-        """The element of some name."""
+        """Return the element with this name, or None."""
         return next((element for element in self.elements if element.name == name), None)
 
 
 @dataclass(frozen=True)
 class _Property:
-    """A column as the header declares it: the types of its numbers and, if these are lists, of their lengths."""
+    """A column as the header declares it: the type of its numbers and, for lists, of their lengths."""
 
     name: str
     kind: str
@@ -80,12 +80,14 @@ class _Property:
 
 
 def decoded(data: bytes) -> PlyTables:
-    """Take a PLY file apart, be it text or binary.
+    """Parse a PLY file, text or binary.
+
+    Memory is limited to a few times the file size.
 
     Raises
     ------
     ValueError
-        When it is none, is damaged, or ends too early. No more memory is taken than a few times the file's.
+        If the file is not PLY, is damaged, or ends too early.
     """
     first = _FIRST.match(data)
     if first is None:
@@ -100,7 +102,7 @@ def decoded(data: bytes) -> PlyTables:
 
 
 def encoded(tables: PlyTables) -> bytes:
-    """The bytes of a PLY file, binary and little-endian."""
+    """Return the bytes of a PLY file, binary and little-endian."""
     lines = [b"ply", b"format binary_little_endian 1.0", *tables.remarks]
     for element in tables.elements:
         lines.append(f"element {element.name} {element.rows}".encode())
@@ -113,7 +115,7 @@ def encoded(tables: PlyTables) -> bytes:
 
 
 def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Property]]], tuple[bytes, ...]]:
-    """Byte order (none of a text), the elements and their properties, and other lines."""
+    """Return the byte order (empty for text), the elements with their properties, and the other lines."""
     order: str | None = None
     declared: list[tuple[str, int, list[_Property]]] = []
     remarks = []
@@ -146,17 +148,17 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
 
 
 class _BinaryReader:
-    """Tables of bytes."""
+    """Reads the tables of a binary file."""
 
     def __init__(self, data: bytes, at: int, order: str) -> None:
         self._data, self._at, self._order = data, at, order
 
     def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """The next table."""
+        """Return the next table."""
         return self._alike(rows, properties) or self._one_by_one(rows, properties)
 
     def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
-        """The next table if its lists are all as long as those of its first row."""
+        """Return the next table if all its lists are as long as those of its first row, else None."""
         sizes = self._first_sizes(properties) if rows else [0] * len(properties)
         fields: list[Any] = []
         for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
@@ -179,7 +181,7 @@ class _BinaryReader:
         return tuple(columns)
 
     def _first_sizes(self, properties: list[_Property]) -> list[int]:
-        """How long each list of the next row is."""
+        """Return the length of each list of the next row."""
         at, sizes = self._at, []
         for of in properties:
             size, at = self._size(of, at)
@@ -188,7 +190,7 @@ class _BinaryReader:
         return sizes
 
     def _size(self, of: _Property, at: int) -> tuple[int, int]:
-        """How long the list at a place is, and where its numbers begin."""
+        """Return the length of the list at a byte, and the byte at which its numbers start."""
         if of.count is None:
             return 0, at
         width = np.dtype(of.count).itemsize
@@ -202,7 +204,7 @@ class _BinaryReader:
         return size, at + width
 
     def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """The next table, row by row."""
+        """Return the next table, read row by row."""
         parts: list[list[bytes]] = [[] for _ in properties]
         sizes: list[list[int]] = [[] for _ in properties]
         widths = [np.dtype(of.kind).itemsize for of in properties]
@@ -227,7 +229,7 @@ class _BinaryReader:
 
 
 class _TextReader:
-    """Tables of text."""
+    """Reads the tables of a text file."""
 
     def __init__(self, text: bytes) -> None:
         if b"_" in text:
@@ -236,14 +238,14 @@ class _TextReader:
         self._at = 0
 
     def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """The next table."""
+        """Return the next table."""
         if all(of.count is None for of in properties):
             table = self._take(rows * len(properties)).reshape(rows, -1)
             return tuple(Column(of.name, _typed(table[:, i], of.kind)) for i, of in enumerate(properties))
         return self._alike(rows, properties) or self._one_by_one(rows, properties)
 
     def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
-        """The next table if it has one column, of lists that are all as long as the first."""
+        """Return the next table if it has a single column of lists that are all as long as the first, else None."""
         if not rows or len(properties) > 1 or self._at == len(self._numbers):
             return None
         (of,), size = properties, self._numbers[self._at]
@@ -255,7 +257,7 @@ class _TextReader:
         return (Column(of.name, _typed(lists[:, 1:].ravel(), of.kind), _typed(lists[:, 0], "i4").astype(np.int64)),)
 
     def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """The next table, row by row."""
+        """Return the next table, read row by row."""
         parts: list[list[NDArray[np.float64]]] = [[] for _ in properties]
         sizes: list[list[int]] = [[] for _ in properties]
         for _ in range(rows):
@@ -277,7 +279,7 @@ class _TextReader:
         )
 
     def _take(self, count: int) -> NDArray[np.float64]:
-        """The next numbers."""
+        """Return the next numbers."""
         if self._at + count > len(self._numbers):
             raise ValueError("it ends too early")
         self._at += count
@@ -285,7 +287,7 @@ class _TextReader:
 
 
 def _typed(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:
-    """Numbers of a text as what the header says they are."""
+    """Convert numbers of a text file to the type in the header."""
     if kind[0] == "f":
         with np.errstate(over="ignore"):
             return numbers.astype(kind)
@@ -300,7 +302,7 @@ def _count_kind(sizes: IntArray) -> str:
 
 
 def _rows(element: Element) -> bytes:
-    """The bytes of a table."""
+    """Return the bytes of a table."""
     width = np.zeros(element.rows, dtype=np.int64)
     fields: list[tuple[IntArray, NDArray[Any], IntArray | None]] = []
     for column in element.columns:

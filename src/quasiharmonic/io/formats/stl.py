@@ -1,4 +1,4 @@
-"""STL: triangles without a word on how they are joined, which equal positions tell; read only."""
+"""Read STL files. STL stores triangles without shared vertices, so vertices at equal positions are merged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from quasiharmonic.util.arrays import FloatArray
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
-# Loops of three vertices; blanks are any.
+# Loops of three vertices, separated by any white space.
 _NUMBER = rb"\s+([-+.0-9eE]+)"
 _LOOP = re.compile(rb"outer\s+loop" + 3 * (rb"\s+vertex" + 3 * _NUMBER) + rb"\s+endloop\s+endfacet", re.IGNORECASE)
 _FACET_WORD = re.compile(rb"^\s*facet\s", re.IGNORECASE | re.MULTILINE)
@@ -24,7 +24,7 @@ _FACET_WORD = re.compile(rb"^\s*facet\s", re.IGNORECASE | re.MULTILINE)
 def read_stl(path: str | os.PathLike[str]) -> MeshData:
     """Read a surface from an STL file, text or binary.
 
-    Corners at equal positions, to the last bit, are one vertex.
+    Corners at exactly equal positions become one vertex.
 
     Parameters
     ----------
@@ -34,16 +34,16 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     Returns
     -------
     MeshData
-        Triangles in the order of the file, vertices in that in which they come first. Of normals, names of solids and
-        attributes nothing is kept.
+        Triangles in the order of the file, vertices in the order of their first occurrence. Normals, names of solids
+        and attributes are dropped.
 
     Raises
     ------
     MeshFileError
-        When it is no STL file, is damaged, or has no triangles.
+        If the file is not STL, is damaged, or has no triangles.
     """
     data = read_bytes(path)
-    # The header of a binary file may say anything, "solid" too; its length does not lie.
+    # The header of a binary file may start with "solid" too, so its length decides.
     corners = _binary(data)
     if corners is None:
         corners = _text(data)
@@ -59,17 +59,17 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
 
 
 def _binary(data: bytes) -> FloatArray | None:
-    """Corners (f, 3, 3) in a binary file; None where its length is not what its header says."""
+    """Return the corners (f, 3, 3) of a binary file; None if its length does not match its header."""
     count = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     if len(data) < _HEADER or len(data) != _HEADER + count * _FACET.itemsize:
         return None
-    # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+    # Converting a signalling NaN is invalid; it is reported later as not finite.
     with np.errstate(invalid="ignore"):
         return np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64)
 
 
 def _text(data: bytes) -> FloatArray | None:
-    """Corners (f, 3, 3) in a text; None where it is none, or a facet is not what it should be."""
+    """Return the corners (f, 3, 3) of a text file; None if it is not STL text or a facet is malformed."""
     if data[:512].lstrip()[:5].lower() != b"solid" or b"endsolid" not in data.lower():
         return None
     facets = _LOOP.findall(data)

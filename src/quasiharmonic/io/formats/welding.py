@@ -1,4 +1,4 @@
-"""Surfaces of files that do not say how triangles are joined, which equal positions tell."""
+"""Merge vertices at equal positions, for files that store triangles without shared vertices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def welded(points: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Make one of points that are equal.
+    """Merge equal points.
 
     Parameters
     ----------
@@ -17,7 +17,7 @@ def welded(points: FloatArray) -> tuple[FloatArray, IntArray]:
     Returns
     -------
     unique : (n, d) float64
-        In the order in which they come first.
+        The distinct points, in the order of their first occurrence.
     which : (k,) int64
         For each point its row of ``unique``.
     """
