@@ -1,7 +1,7 @@
 """Planar meshes of finite-element programs: Gmsh's MSH, VTK's legacy and XML files.
 
-Only positions are ever changed, where they stand in the file. Every other byte stays: cells, data, several times,
-physical groups and their names, numbering.
+Writing changes only the positions, in place. Every other byte is unchanged: cells, data, several times, physical groups
+and their names, numbering.
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ from quasiharmonic.io.meshdata import is_planar
 from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, named
 
 _READERS = {".msh": read_gmsh, ".vtk": read_legacy_vtk, ".vtu": read_vtu}
-# What readers meet in files that are damaged.
+# Errors that readers may raise on damaged files.
 _DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
 
 
 @dataclass(frozen=True, eq=False)
 class FemMesh:
-    """A planar mesh and all else that its file holds.
+    """A planar mesh and all other data of its file.
 
     Attributes
     ----------
     points : (n, 2) float64
         Every point of the file, in its order.
     F : (f, 3), (f, 4) or (f, 6) int64
-        Triangles of three or six nodes and quadrilaterals of all blocks of the file, in their order, as
-        `quasiharmonic.geometry.mesh.elements` has them.
+        Triangles of three or six nodes and quadrilaterals of all blocks of the file, in order, in the format of
+        `quasiharmonic.geometry.mesh.elements`.
     source : Path
+        The file.
     parts : MeshParts
-        The file taken apart.
+        The parsed file.
     """
 
     points: FloatArray
@@ -49,20 +50,19 @@ class FemMesh:
     parts: MeshParts
 
     def point_field(self, name: str, vertices: ArrayLike) -> FloatArray:
-        """Vectors at some points, (k, 2) float64, from the file's point data; of several times the last.
+        """Return vectors at some points, (k, 2) float64, from the file's point data at the last time.
 
         Raises
         ------
         MeshFileError
-            When there are no such data, they are no vectors in the plane, or one at these points is missing or not
-            finite.
+            If the data do not exist, are not vectors in the plane, or a value at these points is missing or not finite.
         """
         which, fields = np.asarray(vertices, dtype=np.int64), self.parts.fields
         if name not in fields:
             there = ", ".join(map(repr, sorted(fields))) or "none"
             raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"there are: {there}")
         try:
-            # A NaN of single precision may be one that signals when it is made double.
+            # Converting a signalling NaN to double raises a warning.
             with np.errstate(invalid="ignore"):
                 values = fields[name]()[which]
         except _DAMAGE as error:
@@ -90,14 +90,15 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
     Parameters
     ----------
     path : str or path-like
-        A ``.msh`` of version 2 or 4, a legacy ``.vtk`` of an unstructured grid or polygons, or a ``.vtu``, each
-        as text or binary.
+        A ``.msh`` of version 2 or 4, a legacy ``.vtk`` of an unstructured grid or polygons, or a ``.vtu``, each as text
+        or binary.
 
     Raises
     ------
     MeshFileError
-        When the file is another, cannot be read, has cells with area other than triangles of three or six nodes and
-        quadrilaterals of four, none of these, or is not planar.
+        If the format is not supported, the file cannot be read, or the mesh is not planar. Also if the file has no
+        triangles or quadrilaterals, or has other cells with area. Supported are triangles of three or six nodes and
+        quadrilaterals of four.
     """
     source = Path(path)
     try:
@@ -108,14 +109,14 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
 
 
 def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str]) -> None:
-    """Say early whether a mesh could be written.
+    """Check before a computation whether a mesh could be written.
 
     Raises
     ------
     MeshFileError
-        When the suffix is not that of the source: converting would lose data.
+        If the suffix differs from that of the source, because a conversion would lose data.
     OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     there, here = Path(path).suffix.lower(), Path(source).suffix.lower()
     if here in _READERS and there != here:
@@ -129,22 +130,22 @@ def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str
 
 
 def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) -> None:
-    """Write a mesh that was read, with other positions in the plane and every other byte as it was.
+    """Write a mesh with new positions in the plane; every other byte of its file is unchanged.
 
     Parameters
     ----------
     path : str or path-like
-        With the suffix that was read. Replaced as a whole once the file is complete.
+        The file to write, with the suffix of the source. An existing file is replaced when the new one is complete.
     mesh : FemMesh
     points : (n, 2) array
-        Rounded to single precision where that is what the file has.
+        New positions, rounded to single precision if the file has single precision.
 
     Raises
     ------
     ValueError
-        When ``points`` has another shape or is not finite.
+        If ``points`` has the wrong shape or is not finite.
     MeshFileError, OutputError
-        As for `check_fem_output`; or when positions are too large for the file's precision.
+        As for `check_fem_output`. Also if positions are too large for the file's precision.
     """
     points = map_array("points", points, len(mesh.points))
     check_fem_output(path, mesh.source)
@@ -164,7 +165,7 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
 
 
 def _mesh(source: Path, data: bytes) -> FemMesh:
-    """Take a file apart and check it."""
+    """Parse a file and check it."""
     reader = _READERS.get(source.suffix.lower())
     if reader is None:
         raise MeshFileError(

@@ -1,4 +1,4 @@
-"""Gmsh's MSH files, versions 2 and 4, text and binary: nodes, triangles, and data of nodes."""
+"""Gmsh's MSH files, versions 2 and 4, text and binary: nodes, elements, and data of nodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.fem.tables import Table, TableReader, replaced, stacked
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Nodes of each kind of element that is read, and of those that are passed over: lines and points.
+# Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
 _ELEMENTS = {2: 3, 3: 4, 9: 6}
 _NODES = {**_ELEMENTS, 1: 2, 8: 3, 15: 1}
 _NAMES = {
@@ -28,7 +28,7 @@ _NAMES = {
 
 
 def read_gmsh(data: bytes) -> MeshParts:
-    """Take an MSH file apart.
+    """Parse an MSH file.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ def read_gmsh(data: bytes) -> MeshParts:
     Raises
     ------
     ValueError
-        When it is not an MSH file of version 2 or 4, ends early, or has elements other than points, lines,
-        triangles of three or six nodes and quadrilaterals of four.
+        If the file is not MSH of version 2 or 4, ends early, or has other elements than points, lines, triangles of
+        three or six nodes and quadrilaterals of four.
     """
     version, order, position = _format(data)
     nodes: list[tuple[IntArray, Table]] = []
@@ -58,7 +58,7 @@ def read_gmsh(data: bytes) -> MeshParts:
     if not (nodes and elements):
         raise ValueError(f"there is no section ${'Elements' if nodes else 'Nodes'}")
     tags, numbers = nodes[0][0], elements[0]
-    # Gmsh repeats the mesh with every view that it appends.
+    # Gmsh writes the same mesh again with every view that it appends.
     if not (
         all(np.array_equal(t, tags) and np.array_equal(p.values, nodes[0][1].values) for t, p in nodes[1:])
         and all(np.array_equal(other, numbers) for other in elements[1:])
@@ -72,9 +72,9 @@ def read_gmsh(data: bytes) -> MeshParts:
     if wrong.size:
         raise ValueError(f"an element refers to node {wrong[0]}, which is not there")
     if version == "2":
-        # An element in several physical groups is there once for each.
+        # Version 2 repeats an element for each of its physical groups.
         F = F[np.sort(np.unique(np.sort(F, axis=1), axis=0, return_index=True)[1])]
-    # Of several time steps the last.
+    # Use the last time step.
     fields = {
         title: partial(_node_data, data, *places[-1], order, tags[known], known) for title, places in later.items()
     }
@@ -88,7 +88,7 @@ def read_gmsh(data: bytes) -> MeshParts:
 
 
 def _format(data: bytes) -> tuple[str, str | None, int]:
-    """Version ("2", "4.0" or "4.1"), byte order (None for text), and what comes behind."""
+    """Return the version ("2", "4.0" or "4.1"), the byte order (None for text), and the end of the section."""
     begin = data.find(b"$MeshFormat")
     reader = TableReader(data, max(begin, 0), len(data), "<")
     reader.line()
@@ -112,7 +112,7 @@ def _format(data: bytes) -> tuple[str, str | None, int]:
 
 
 def _sections(data: bytes, position: int) -> Iterator[tuple[bytes, int, int]]:
-    """Names of the sections, where their contents begin and end."""
+    """Yield the name, the start and the end of each section."""
     while (position := data.find(b"$", position)) >= 0:
         stop = data.find(b"\n", position)
         name = data[position + 1 : stop].strip()
@@ -124,7 +124,7 @@ def _sections(data: bytes, position: int) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -> tuple[IntArray, Table]:
-    """Tags of nodes and where their positions stand."""
+    """Return the tags of nodes and the table of their positions."""
     if version == "2":
         head = TableReader(data, begin, end, "<")
         count = int(head.words()[0])
@@ -136,7 +136,7 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
     for _ in range(blocks):
         first, second, parametric = reader.take("i4", 3).tolist()
         count = int(reader.take("u8", 1)[0])
-        # Behind a node's position may stand its parameters on its curve or surface.
+        # The parameters of a node on its curve or surface may follow its position.
         width = 3 + (parametric and (first if version == "4.1" else second))
         if version == "4.1":
             numbers.append(reader.take("u8", count).astype(np.int64))
@@ -151,7 +151,7 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
 
 
 def _elements(data: bytes, begin: int, end: int, version: str, order: str | None) -> IntArray:
-    """Tags of the elements' nodes, (f, 3), (f, 4) or (f, 6)."""
+    """Return the tags of the elements' nodes, (f, 3), (f, 4) or (f, 6)."""
     found: list[IntArray] = []
     if version == "2":
         head = TableReader(data, begin, end, "<")
@@ -177,7 +177,7 @@ def _elements(data: bytes, begin: int, end: int, version: str, order: str | None
 
 
 def _element_lines(numbers: list[int], count: int) -> IntArray:
-    """Elements of lines "number kind tags … nodes …" of version 2."""
+    """Return the elements of lines "number kind tags … nodes …" of version 2."""
     found: list[list[int]] = []
     at = 0
     for _ in range(count):
@@ -202,9 +202,9 @@ def _nodes_of(kind: int) -> int:
 
 
 def _node_data(data: bytes, begin: int, end: int, order: str | None, tags: IntArray, which: IntArray) -> FloatArray:
-    """Values at every node, NaN at those that have none; (n, k)."""
+    """Return values at every node, NaN at nodes without value; (n, k)."""
     head = TableReader(data, begin, end, "<")
-    for _ in range(2):  # names, then real numbers
+    for _ in range(2):  # Skip the names, then the real numbers.
         for _ in range(int(head.words()[0])):
             head.line()
     integers = [int(head.words()[0]) for _ in range(int(head.words()[0]))]

@@ -28,14 +28,14 @@ _KINDS = {
     b"vtktypeint64": "i8",
     b"vtktypeuint64": "u8",
 }
-# Values at a point of the attributes that have their number in their name.
+# Number of values per point of the attributes whose name determines it.
 _COMPONENTS = {b"VECTORS": 3, b"NORMALS": 3, b"TENSORS": 9, b"TENSORS6": 6, b"GLOBAL_IDS": 1, b"PEDIGREE_IDS": 1}
-# Kinds of cells of the sections of polygons: vertices, lines, polygons, strips.
+# VTK's kinds of cells by section of a polygon data set.
 _POLY = {b"VERTICES": 2, b"LINES": 4, b"POLYGONS": 7, b"TRIANGLE_STRIPS": 6}
 
 
 def read_legacy_vtk(data: bytes) -> MeshParts:
-    """Take a legacy VTK file apart.
+    """Parse a legacy VTK file.
 
     Parameters
     ----------
@@ -44,14 +44,14 @@ def read_legacy_vtk(data: bytes) -> MeshParts:
     Raises
     ------
     ValueError
-        When it is no such file, ends early, has cells with area other than triangles and quadrilaterals, or something
-        in it is not known.
+        If the file is not legacy VTK, ends early, has other cells with area than triangles and quadrilaterals, or has
+        an unknown section or type.
     """
     return _Walk(data).parts()
 
 
 class _Walk:
-    """A way through a file, section by section."""
+    """A parser that reads a file section by section."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -67,11 +67,11 @@ class _Walk:
         self._lists: list[tuple[IntArray, IntArray, int]] = []
         self._kinds: IntArray | None = None
         self._fields: dict[str, Callable[[], FloatArray]] = {}
-        # What arrays belong to: points or something else, and how many there are.
+        # Whether the following arrays belong to points, and their length.
         self._of_points, self._count = False, 0
 
     def parts(self) -> MeshParts:
-        """Walk to the end."""
+        """Read all sections and return the mesh."""
         while words := self._reader.words():
             self._section(words[0].upper(), words[1:])
         if self._points is None:
@@ -127,7 +127,7 @@ class _Walk:
             raise ValueError(f"the section {_text([name])} is not known")
 
     def _cells(self, count: int, size: int, kind: int) -> None:
-        """A list of cells, in the way of version 5.1 or of those before."""
+        """Read a list of cells, in the format of version 5.1 or of earlier versions."""
         reader = self._reader
         begin = reader.position
         words = reader.words()
@@ -155,7 +155,7 @@ class _Walk:
         self._lists.append((starts - np.arange(count + 1), corners, kind))
 
     def _field(self) -> None:
-        """An array of a field: name, components, tuples, kind."""
+        """Read an array of a field: name, components, tuples, kind."""
         words = self._reader.words()
         while words[:1] == [b"METADATA"]:
             self._section(b"METADATA", [])
@@ -169,7 +169,7 @@ class _Walk:
             raise ValueError(f"{_text(words)[:60]!r} stands where an array of a field should")
 
     def _array(self, name: bytes, kind: bytes, components: int) -> None:
-        """Values at the points, cells or neither; those at points are kept."""
+        """Read past values at points, cells or neither; register those at points."""
         start = self._reader.position
         self._skip(kind, self._count * components)
         if self._of_points and kind.lower() in _KINDS:
@@ -181,7 +181,7 @@ class _Walk:
         return reader.tables(count, (_KINDS[kind], components))[0].values.astype(np.float64)
 
     def _skip(self, kind: bytes, count: int) -> None:
-        """Go past numbers or strings."""
+        """Skip numbers or strings."""
         reader, kind = self._reader, kind.lower()
         if kind == b"string":
             for _ in range(count):
@@ -194,7 +194,7 @@ class _Walk:
             reader.skip(_KINDS[kind], count)
 
     def _skip_string(self) -> None:
-        """Go past a string, whose first two bits say how many bytes its length takes."""
+        """Skip a string; the first two bits encode the number of bytes of its length."""
         first = int(self._reader.take("u1", 1)[0])
         more = {3: 0, 2: 1, 1: 3, 0: 7}[first >> 6]
         length = first & 63
@@ -204,7 +204,7 @@ class _Walk:
 
 
 def _decoded(name: bytes) -> str:
-    """A name, in which %20 stands for a space."""
+    """Decode a name, in which %20 stands for a space."""
     from urllib.parse import unquote_to_bytes
 
     return unquote_to_bytes(name).decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""What a file in another program's format has of a planar mesh."""
+"""The common result of the finite-element readers."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class MeshParts:
-    """Positions and elements of a file, and a way to change the positions alone.
+    """Positions and elements of a file, and a function that changes only the positions.
 
     Attributes
     ----------
     points : (n, 3) float64
-        As a reader gets them.
+        Positions, converted to double.
     F : (f, 3), (f, 4) or (f, 6) int64
-        As `quasiharmonic.geometry.mesh.elements` has them.
+        Elements in the format of `quasiharmonic.geometry.mesh.elements`.
     precision : dtype
-        Of the positions in the file.
+        Precision of the positions in the file.
     fields : mapping of str to callable
-        Each reads values at all points, (n, k) float64, NaN where there are none; `ValueError` where it cannot.
+        Each callable returns values at all points, (n, k) float64, NaN at points without value. It raises `ValueError`
+        if the data are damaged.
     replaced : callable
-        The file with the first two coordinates of its points, (n, 2) float64, changed and all else as it was.
+        Returns the bytes of the file with the first two coordinates of its points replaced by (n, 2) float64.
     """
 
     points: FloatArray

@@ -1,6 +1,6 @@
-"""Tables of numbers in a file, as text or as bytes, and where they stand.
+"""Tables of numbers in a file, text or binary, with the byte position of each number.
 
-What knows where each number stands can put others in their places and leave every other byte alone.
+With these positions, numbers can be replaced without changing any other byte.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Numbers and where they stand.
+    """Numbers and their byte positions.
 
     Attributes
     ----------
     values : (m, k) array
-        In the file's own precision and byte order.
+        The numbers, in the file's own precision and byte order.
     start : (m, k) int64
-        The first byte of each, row after row ascending.
+        The first byte of each number, ascending row by row.
     end : (m, k) int64 or None
-        Behind the last byte of each; None where they are not text.
+        The byte after each number; None in binary files.
     """
 
     values: NDArray[Any]
@@ -42,16 +42,16 @@ class TableReader:
     data : bytes
         The file.
     position : int
-        Where to begin.
+        The first byte to read.
     end : int
-        Where to end.
+        The byte after the last one to read.
     order : {"<", ">"} or None
         Byte order; None for text.
 
     Attributes
     ----------
     position : int
-        The next byte.
+        The next byte to read.
     """
 
     def __init__(self, data: bytes, position: int, end: int, order: str | None) -> None:
@@ -64,11 +64,11 @@ class TableReader:
 
     @property
     def text(self) -> bool:
-        """Whether numbers are text."""
+        """Whether the numbers are text."""
         return self._order is None
 
     def line(self) -> bytes:
-        """The rest of the line, or b"" at the end."""
+        """Return the rest of the line, or b"" at the end."""
         stop = self.data.find(b"\n", self.position, self._end)
         stop = self._end if stop < 0 else stop
         found = self.data[self.position : stop]
@@ -76,7 +76,7 @@ class TableReader:
         return found.strip()
 
     def words(self) -> list[bytes]:
-        """The words of the next line that has any; none at the end."""
+        """Return the words of the next non-empty line, or an empty list at the end."""
         while self.position < self._end:
             found = self.line().split()
             if found:
@@ -84,7 +84,7 @@ class TableReader:
         return []
 
     def take(self, kind: str, count: int) -> NDArray[Any]:
-        """The next numbers; (count,).
+        """Return the next numbers; (count,).
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class TableReader:
         return self.tables(count, (kind, 1))[0].values[:, 0]
 
     def skip(self, kind: str, count: int) -> None:
-        """Go past numbers without looking at them."""
+        """Skip numbers without parsing them."""
         if self._order is None:
             if not count:
                 return
@@ -109,12 +109,18 @@ class TableReader:
                 raise ValueError("it ends too early")
 
     def tables(self, rows: int, *columns: tuple[str, int]) -> list[Table]:
-        """The next rows, each of some columns of one kind and then some of others.
+        """Return the next rows as one table for each group of columns.
+
+        Parameters
+        ----------
+        rows : int
+        *columns : (str, int)
+            Type code and number of columns of each group.
 
         Raises
         ------
         ValueError
-            When the file ends before, or what stands there is no number.
+            If the file ends before, or contains anything but numbers there.
         """
         if rows < 0 or any(count < 1 for _, count in columns):
             raise ValueError("a number of things below what is possible")
@@ -150,7 +156,7 @@ class TableReader:
         for kind, count in columns:
             here = slice(column, column + count)
             with np.errstate(over="ignore"):
-                # Through double, as readers do.
+                # Convert to double first, as other readers do.
                 numbers = text[:, here].astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)
             found.append(Table(numbers, starts[:, here], ends[:, here]))
             column += count
@@ -158,10 +164,10 @@ class TableReader:
 
 
 def stacked(tables: Sequence[Table], columns: int) -> Table:
-    """Tables one below the other, the first columns of each."""
+    """Stack the first columns of tables vertically."""
     ends = [table.end[:, :columns] for table in tables if table.end is not None]
     return Table(
-        # Concatenating alone would lose the byte order.
+        # np.concatenate alone would lose the byte order.
         np.concatenate([table.values[:, :columns] for table in tables]).astype(tables[0].values.dtype),
         np.concatenate([table.start[:, :columns] for table in tables]),
         np.concatenate(ends) if ends else None,
@@ -169,7 +175,7 @@ def stacked(tables: Sequence[Table], columns: int) -> Table:
 
 
 def replaced(data: bytes, table: Table, values: FloatArray) -> bytes:
-    """The file with other numbers in a table; those that are equal stay as they are written.
+    """Return the file with new numbers in a table; equal numbers keep their bytes.
 
     Parameters
     ----------
@@ -177,8 +183,8 @@ def replaced(data: bytes, table: Table, values: FloatArray) -> bytes:
         The file.
     table : Table
     values : (m, j) float64
-        For the first columns of the table. Text gets the fewest digits that tell the number from its neighbours in
-        the table's precision.
+        New numbers for the first columns of the table. Text uses the shortest decimal that is unique in the table's
+        precision.
     """
     columns = values.shape[1]
     with np.errstate(over="ignore"):

@@ -1,4 +1,4 @@
-"""Cells as VTK's formats have them: lists of points, one after another, and a kind for each."""
+"""Cells in VTK's formats: a concatenated list of points, and a kind for each cell."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 from quasiharmonic.geometry.mesh.elements import joined
 from quasiharmonic.util.arrays import IntArray
 
-#: Kinds without area: vertices and lines, one or several, and lines of the second order.
+#: Kinds without area: vertices, lines, lists of them, and second-order lines.
 _LOWER = (1, 2, 3, 4, 21)
-# Kinds that are elements, and how many nodes they have; a polygon may be one.
+# Number of nodes of the kinds that are elements. Polygons of three or four corners are elements too.
 _ELEMENTS = {5: 3, 9: 4, 22: 6}
 _POLYGON = 7
 _NAMES = {
@@ -24,24 +24,24 @@ _NAMES = {
 
 
 def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int) -> IntArray:
-    """Pick the triangles and quadrilaterals; (f, 3), (f, 4) or (f, 6) int64, as in `geometry.mesh.elements`.
+    """Return the triangles and quadrilaterals; (f, 3), (f, 4) or (f, 6) int64, as in `geometry.mesh.elements`.
 
     Parameters
     ----------
     connectivity : (m,) int64
         Points of all cells, one cell after another.
     starts : (c + 1,) int64
-        Where each cell begins, and the end.
+        Index in ``connectivity`` at which each cell starts, then the end.
     kinds : (c,) int64
-        VTK's number of each cell's kind. A polygon with three corners is a triangle, one with four a quadrilateral.
+        VTK's kind of each cell. A polygon with three corners is a triangle, one with four a quadrilateral.
     points : int
-        How many there are.
+        Number of points.
 
     Raises
     ------
     ValueError
-        When a cell with area is none of these, six-node triangles stand beside others, or cells refer to points that
-        are not there.
+        If a cell with area is of another kind, six-node triangles occur with other elements, or a point index is out of
+        range.
     """
     if len(starts) != len(kinds) + 1 or (np.diff(starts) < 0).any() or starts[-1] > len(connectivity):
         raise ValueError("its lists of cells contradict each other")

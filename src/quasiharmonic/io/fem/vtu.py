@@ -1,7 +1,7 @@
-"""VTK's XML files of unstructured grids (.vtu): positions, triangles, and data of points.
+"""VTK's XML files of unstructured grids (.vtu): positions, elements, and data of points.
 
-Arrays stand between their tags, as text or as base64, or behind all of them, as base64 or as they are; either may be
-compressed::
+Arrays are either between their tags, as text or base64, or appended at the end of the file, as base64 or raw bytes.
+Base64 and raw arrays may be compressed::
 
     <DataArray format="ascii">0 0 0 …</DataArray>      <DataArray format="appended" offset="84"/>
     <DataArray format="binary">AAAB…</DataArray>       <AppendedData encoding="raw">_ ▯▯▯▯▯▯▯ </AppendedData>
@@ -37,9 +37,9 @@ _KINDS = {
 _APPENDED = re.compile(rb"<AppendedData[^>]*>")
 _OFFSET = re.compile(rb"""(\soffset\s*=\s*["'])\s*(\d+)\s*(["'])""")
 _TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
-# What unpacking may take beside what is unpacked, bytes; the densest preset takes half of it.
+# Memory limit of LZMA decompression besides the output, in bytes; the densest preset needs half of it.
 _LZMA_MEMORY = 128 << 20
-# From bytes to packed ones, and what takes a part of the way back.
+# A function that compresses bytes, and a factory of decompressors.
 _Coder = tuple[Callable[[bytes], bytes], Callable[[], Any]]
 _CODERS: dict[str, _Coder] = {
     "vtkZLibDataCompressor": (zlib.compress, zlib.decompressobj),
@@ -49,7 +49,7 @@ _CODERS: dict[str, _Coder] = {
 
 @dataclass(frozen=True)
 class _Array:
-    """A DataArray: its attributes, where its tag begins and where its text does and ends."""
+    """A DataArray: its attributes, the start of its tag, and the start and the end of its text."""
 
     attributes: dict[str, str]
     tag: int
@@ -58,7 +58,7 @@ class _Array:
 
 
 def read_vtu(data: bytes) -> MeshParts:
-    """Take a VTU file apart.
+    """Parse a VTU file.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def read_vtu(data: bytes) -> MeshParts:
     Raises
     ------
     ValueError
-        When it is no such file, has several pieces or times, an encoding that is not known, or cells with area
-        other than triangles and quadrilaterals.
+        If the file is not VTU, has several pieces or times, an unknown encoding, or other cells with area than
+        triangles and quadrilaterals.
     """
     file = _VtuFile(data)
     points = file.only("Points", None)
@@ -90,7 +90,7 @@ def _rows(file: _VtuFile, array: _Array) -> FloatArray:
 
 
 class _VtuFile:
-    """A file taken apart at its tags."""
+    """A VTU file, parsed into its arrays."""
 
     def __init__(self, data: bytes) -> None:
         from xml.parsers.expat import ExpatError, ParserCreate
@@ -103,7 +103,7 @@ class _VtuFile:
         self._file: dict[str, str] = {}
         self._pieces: list[dict[str, str]] = []
         tag = _APPENDED.search(data)
-        # What is appended need not be XML.
+        # Appended data need not be XML, so parse only the part before.
         head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
         self._parser = ParserCreate()
         self._parser.StartElementHandler = self._begins
@@ -130,11 +130,11 @@ class _VtuFile:
 
     @property
     def point_data(self) -> dict[str, _Array]:
-        """Arrays at points by name; of several times the last."""
+        """Arrays at points by name; the last one for several times."""
         return {name: arrays[-1] for (parent, name), arrays in self._arrays.items() if parent == "PointData"}
 
     def only(self, parent: str, name: str | None) -> _Array:
-        """The array of an element, by its name if it has several."""
+        """Return the only array of an element, or the only one with this name."""
         found = [a for (p, n), arrays in self._arrays.items() if p == parent and name in (None, n) for a in arrays]
         if len(found) != 1:
             what = parent if name is None else f"{parent} called {name}"
@@ -142,7 +142,7 @@ class _VtuFile:
         return found[0]
 
     def values(self, array: _Array, most: int) -> NDArray[Any]:
-        """The numbers of an array, of which there may be so many."""
+        """Return the numbers of an array, at most ``most`` of them if compressed."""
         kind = _KINDS.get(array.attributes.get("type", ""))
         if kind is None:
             raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are no numbers")
@@ -153,7 +153,7 @@ class _VtuFile:
         return np.frombuffer(self._block(array, most * number.itemsize)[0], number)
 
     def replaced(self, array: _Array, points: FloatArray) -> bytes:
-        """The file with the first two of every three numbers of an array changed."""
+        """Return the file with the first two of every three numbers of an array replaced."""
         if array.attributes.get("format") == "ascii":
             reader = TableReader(self._data, array.begin, array.end, None)
             table = reader.tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
@@ -170,7 +170,7 @@ class _VtuFile:
         longer = len(coded) - (end - begin)
         if not longer or array.attributes.get("format") == "binary":
             return whole
-        # What is appended behind these numbers has moved.
+        # Correct the offsets of the arrays after this one.
         for other in sorted(self._all, key=lambda a: -a.tag):
             offset = int(other.attributes.get("offset", "-1"))
             if offset + self._appended > begin:
@@ -192,14 +192,17 @@ class _VtuFile:
         if name in ("DataArray", "Array") and self._open is not None:
             attributes, tag = self._open
             begin = _tag_end(self._data, tag)
-            # What describes the array further may follow its numbers.
+            # Child elements with further information may follow the numbers.
             array = _Array(attributes, tag, begin, self._data.find(b"<", begin))
             self._all.append(array)
             self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
             self._open = None
 
     def _block(self, array: _Array, most: int) -> tuple[bytes, int, int]:
-        """The bytes of an array, so many at most, and where they stand in the file, coded as they are there."""
+        """Return the bytes of an array, and the start and end of their encoded form in the file.
+
+        Compressed data of more than ``most`` bytes raise a `ValueError`.
+        """
         begin, raw = self._where(array)
         take = _take_raw if raw else _take_base64
         size = self._word.itemsize
@@ -219,11 +222,11 @@ class _VtuFile:
         return whole, begin, end
 
     def _unpacked(self, packed: bytes, size: int) -> bytes:
-        """Bytes as they were before they were compressed to those given."""
+        """Decompress bytes to a given size."""
         assert self._coder is not None
         coder = self._coder[1]()
         try:
-            # One byte more would be one too many, and what it is does not matter.
+            # Ask for one more byte, to detect data that are too long.
             whole: bytes = coder.decompress(packed, size + 1)
         except (zlib.error, lzma.LZMAError, OverflowError) as error:
             raise ValueError(f"compressed data are damaged: {error}") from error
@@ -232,13 +235,13 @@ class _VtuFile:
         return whole
 
     def _coded(self, block: bytes, array: _Array) -> bytes:
-        """Bytes coded as those of an array of the same length are in the file."""
+        """Encode bytes in the same way as an array of the same length in the file."""
         begin, raw = self._where(array)
         code: Callable[[bytes], bytes] = bytes if raw else base64.b64encode
         if self._coder is None:
             return code(np.array([len(block)], dtype=self._word).tobytes() + block)
         take = _take_raw if raw else _take_base64
-        # How many parts, their size, and the last one's if it is shorter.
+        # Number of parts, their size, and the size of the last part if it is shorter.
         head = np.frombuffer(take(self._data, begin, 3 * self._word.itemsize)[0], self._word)
         count, size, _ = head.tolist()
         packed = [self._coder[0](block[i * size : (i + 1) * size]) for i in range(count)]
@@ -246,7 +249,7 @@ class _VtuFile:
         return code(header.astype(self._word).tobytes()) + code(b"".join(packed))
 
     def _where(self, array: _Array) -> tuple[int, bool]:
-        """Where the bytes of an array begin, and whether they are there as they are."""
+        """Return the start of an array's bytes, and whether they are raw."""
         if array.attributes.get("format") != "appended":
             inline = self._data[array.begin : array.end]
             return array.begin + len(inline) - len(inline.lstrip()), False
@@ -257,14 +260,14 @@ class _VtuFile:
 
 
 def _take_raw(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
-    """So many bytes, and where the next are."""
+    """Return a number of bytes, and the position after them."""
     if begin + length > len(data):
         raise ValueError("it ends too early")
     return data[begin : begin + length], begin + length
 
 
 def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
-    """As `_take_raw`, of base64."""
+    """Return a number of bytes decoded from base64, and the position after them."""
     end = begin + 4 * -(-length // 3)
     try:
         found = base64.b64decode(data[begin:end], validate=True)[:length]
@@ -276,6 +279,6 @@ def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
 
 
 def _tag_end(data: bytes, tag: int) -> int:
-    """Where the text of an element begins, given where its tag does."""
+    """Return the position after a tag, given the start of the tag."""
     quoted = _TAG.match(data, tag)
     return tag if quoted is None else quoted.end()
