@@ -1,7 +1,7 @@
-"""Why a problem has no map: necessary conditions, and the elements that violate each.
+"""Diagnose why a problem has no map: necessary conditions, and the elements that violate each.
 
-The package builds on `problem` and `geometry.exact`. Start reading in `examine`; each other module is one kind of
-obstruction or a tool of it.
+The package builds on `problem` and `geometry.exact`. Start reading in `examine`. Each other module has one kind of
+obstruction or a tool for it.
 """
 
 from quasiharmonic.problem.diagnosis.examine import diagnose

@@ -1,4 +1,4 @@
-"""Whether segments pass between walls, for many at once."""
+"""Check whether many segments avoid walls."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from quasiharmonic.geometry.exact.predicates import SegmentRelation, box_pairs_b
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# Segments that are taken at a time.
+# Number of segments per batch.
 _SEGMENTS = 1 << 14
 
 
 def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positions: FloatArray, most: int) -> BoolArray:
-    """Whether segments are known to meet no wall but those that end where they do.
+    """Return which segments provably meet no wall, except walls that share an end with them.
 
     Parameters
     ----------
     p, q : (k, 2) float64
         Ends of the segments.
     ends : (k, 2) int64
-        The points that these are, -1 for none.
+        Indices of the ends among the points, -1 for other positions.
     walls : (m, 2) int64
-        As pairs of points.
+        Walls as pairs of points.
     positions : (n, 2) float64
         The points.
     most : int
-        How many pairs of a segment and a wall near it are looked at, about.
+        Approximate limit on the pairs of a segment and a nearby wall to check.
 
     Returns
     -------
     (k,) bool
-        Decided exactly where True. False also for segments that were not looked at.
+        True is exact. False may also mean that the segment was not checked.
     """
     result = np.zeros(len(p), dtype=bool)
-    # Neighbours in the plane next to each other, so that few boxes have to be compared.
+    # Sort along a space-filling curve, so that few boxes overlap.
     order = _curve(p / 2 + q / 2)
     walls = walls[_curve(positions[walls[:, 0]] / 2 + positions[walls[:, 1]] / 2)]
     r, s = positions[walls.T]
@@ -60,13 +60,13 @@ def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positio
 
 
 def _curve(points: FloatArray) -> IntArray:
-    """The order in which a curve that fills the plane comes by points (Morton 1966); (k,) int64."""
+    """Return the order of points along a space-filling curve (Morton 1966); (k,) int64."""
     if not len(points):
         return np.empty(0, dtype=np.int64)
     low, high = points.min(axis=0) / 2, points.max(axis=0) / 2
     size = np.max(high - low)
     cell = ((points / 2 - low) / (size if size > 0 else 1) * 0xFFFF).astype(np.int64)
-    # Each bit moves to twice its place.
+    # Move each bit k to bit 2k.
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         cell = (cell | cell << shift) & mask
     return np.argsort(cell[:, 0] | cell[:, 1] << 1, kind="stable")

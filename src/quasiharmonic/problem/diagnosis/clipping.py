@@ -1,9 +1,8 @@
 """Exact convex polygons in the plane, and the part of one that sees given points.
 
-All lines here pass through two points of the target, all points are where two such lines meet.
-Both are kept in homogeneous integers, so that every sign is exact and no number grows with the
-length of a computation: a corner is always the meeting point of two of the first lines, however
-often a polygon was cut.
+All lines pass through two points of the target, and all points are intersections of two of these lines. Both have
+homogeneous integer coordinates, so every sign is exact. The size of the numbers is bounded: after any number of cuts, a
+corner is the intersection of two of the original lines.
 """
 
 from __future__ import annotations
@@ -21,25 +20,25 @@ Point = tuple[int, int]
 Line = tuple[int, int, int]
 """``a, b, c``: the point (x, y) lies to the left where ``a x + b y + c > 0``."""
 
-# Coordinates below are at most 1 and rounded once, so that a product of two differences is wrong by
-# less than this; what the filter cannot decide by this margin is decided in integers.
+# Coordinates below are at most 1 and rounded once, so the error of a product of two differences is below this margin.
+# Values within the margin are computed again in integers.
 MARGIN = 2.0**-48
 
 
 def line(p: Point, q: Point) -> Line:
-    """The line from ``p`` to ``q``, positive to its left."""
+    """Return the line from ``p`` to ``q``, positive to its left."""
     a, b = p[1] - q[1], q[0] - p[0]
     return a, b, -(a * p[0] + b * p[1])
 
 
 def reverse(along: Line) -> Line:
-    """The same line, positive on the other side."""
+    """Return the same line, positive on the other side."""
     a, b, c = along
     return -a, -b, -c
 
 
 def _meet(first: Line, second: Line) -> Line:
-    """Where two lines meet, in homogeneous coordinates."""
+    """Return the intersection of two lines, in homogeneous coordinates."""
     a, b, c = first
     d, e, f = second
     return b * f - c * e, c * d - a * f, a * e - b * d
@@ -54,7 +53,7 @@ class Convex:
     lines : list of Line
         Its sides in counterclockwise order, the polygon to their left.
     corners : list of (int, int, int)
-        Homogeneous coordinates of where each side starts, the last one positive.
+        Homogeneous coordinates of the start of each side, the last coordinate positive.
     """
 
     lines: list[Line]
@@ -62,14 +61,14 @@ class Convex:
 
     @staticmethod
     def box(low: Point, high: Point) -> Convex:
-        """The axis-parallel rectangle between two points."""
+        """Return the axis-parallel rectangle between two points."""
         (x0, y0), (x1, y1) = low, high
         corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
         sides = [line(corners[i], corners[(i + 1) % 4]) for i in range(4)]
         return Convex(sides, [_meet(sides[i - 1], sides[i]) for i in range(4)])
 
     def cut(self, along: Line) -> Convex | None:
-        """What lies to the left of a line, or None if that has no area."""
+        """Return the part to the left of a line, or None if it has no area."""
         a, b, c = along
         sides = [a * x + b * y + c * w for x, y, w in self.corners]
         if min(sides) >= 0:
@@ -93,12 +92,12 @@ class Convex:
 
 
 class Lattice:
-    """Positions as integers: the doubles of a target over their smallest unit.
+    """Positions as integers: the doubles of a target divided by their smallest unit.
 
     Parameters
     ----------
     positions : (k, 2) float64
-        Finite.
+        Finite positions.
 
     Attributes
     ----------
@@ -124,15 +123,15 @@ class Lattice:
 
     def _near(self, points: Sequence[tuple[int, int, int]]) -> FloatArray:
         (cx, cy), unit = self._centre, self._unit
-        # Quotients of integers are rounded once, whatever their size.
+        # Python rounds quotients of integers once, for any size.
         return np.array([((x - cx * w) / (unit * w), (y - cy * w) / (unit * w)) for x, y, w in points])
 
     def corners(self, area: Convex) -> FloatArray:
-        """Corners of a polygon in the coordinates of ``near``; (r, 2) float64."""
+        """Return corners of a polygon in the coordinates of ``near``; (r, 2) float64."""
         return self._near(area.corners)
 
     def middle(self, area: Convex) -> tuple[float, float]:
-        """A position in the middle of a polygon, rounded only once: that of three corners far apart."""
+        """Return a position in the middle of a polygon: the mean of three distant corners, rounded once."""
         r, unit = len(area.corners), Fraction(2) ** self._lowest
         three = [area.corners[k] for k in (0, r // 3, 2 * r // 3)]
         x, y = (sum(Fraction(corner[axis], corner[2]) for corner in three) * unit / 3 for axis in (0, 1))
@@ -140,7 +139,7 @@ class Lattice:
 
 
 class Walls:
-    """Segments that block the view, and what can be seen past them.
+    """Segments that block the view between points.
 
     Parameters
     ----------
@@ -148,7 +147,7 @@ class Walls:
         The segments, as pairs of points of the lattice.
     lattice : Lattice
     effort : Effort
-        Of which looking takes.
+        Budget for the checks.
     """
 
     def __init__(self, ends: IntArray, lattice: Lattice, effort: Effort) -> None:
@@ -157,27 +156,27 @@ class Walls:
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
 
     def seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
-        """A part of ``area`` from which all ``eyes`` are seen, or None if there is no such point.
+        """Return a part of ``area`` that sees all ``eyes``, or None if there is no such point.
 
-        A point sees an eye when the open segment between them meets no wall (walls that lie on the
-        line, or end in the eye, take nothing away from an open set). The area is cut along the
-        shadow of one wall after another, the shadow dropped, and the parts looked at one by one.
+        A point sees an eye if the open segment between them meets no wall. Walls on the same line, or with an end at
+        the eye, remove nothing from an open set. The search cuts the area along the shadow of one wall after another,
+        removes the shadow, and examines the remaining parts.
 
         Parameters
         ----------
         area : Convex
-            Where to look for points; of positive area.
+            The area to search, of positive area.
         eyes : sequence of int
-            Points to be seen.
+            Points that must be seen.
 
         Returns
         -------
         Convex or None
-            A polygon of positive area all of which sees every eye.
+            A polygon of positive area, all points of which see every eye.
         """
         near = self._lattice.corners(area)
         met = self._met(np.concatenate([near, self._lattice.near[list(eyes)]]))
-        # Which walls may hide an area from the first eyes; none for those that are known to see it all.
+        # Each entry has the walls that may hide the area from the first eyes; empty lists for eyes that see all of it.
         waiting: list[tuple[Convex, FloatArray, list[IntArray]]] = [(area, near, [])]
         while waiting:
             area, near, blocking = waiting.pop()
@@ -196,13 +195,13 @@ class Walls:
         return None
 
     def _met(self, points: FloatArray) -> IntArray:
-        """Walls that reach into the box around some points, (m, 2) int64."""
+        """Return walls that reach into the bounding box of some points, (m, 2) int64."""
         (x0, y0), (x1, y1) = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
         inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
         return self._ends[inside]
 
     def _facing(self, eye: int, walls: IntArray) -> IntArray:
-        """Walls as an eye sees them from right to left, without those that end in it; (m, 2) int64."""
+        """Return walls ordered from right to left as seen from an eye, without those that end at it; (m, 2) int64."""
         ends = walls[(walls[:, 0] != eye) & (walls[:, 1] != eye)]
         p, q = self._lattice.near[ends.T] - self._lattice.near[eye]
         turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
@@ -214,9 +213,9 @@ class Walls:
         Returns
         -------
         parts : list of Convex or None
-            What the wall leaves to be seen, the most promising last; None when no wall is in the way.
+            The visible parts, the most promising last; None if no wall hides any of the area.
         walls : (m, 2) int64
-            The walls that may still be in the way of these parts.
+            The walls that may still hide some of these parts.
         """
         self._effort.spend(100 + len(walls) * len(near) // 20)
         here = self._lattice.near[eye]
@@ -224,7 +223,7 @@ class Walls:
         right, left = cross((p - here)[:, None], near - here), cross((q - here)[:, None], near - here)
         front = cross((q - p)[:, None], near - p[:, None])
         in_the_way = (right.max(axis=1) > -MARGIN) & (left.min(axis=1) < MARGIN) & (front.min(axis=1) < MARGIN)
-        # The walls that hide most corners first: one that hides them all leaves nothing to look at.
+        # Start with the walls that hide most corners: a wall that hides all of them ends the search.
         hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
         walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]
         points = self._lattice.points
@@ -236,7 +235,7 @@ class Walls:
 
 
 def _past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
-    """The parts of an area that are not in the shadow of a wall, or None if the whole area is not."""
+    """Return the parts of an area outside the shadow of a wall, or None if the wall hides no part of it."""
     across = line(p, q)
     side = across[0] * eye[0] + across[1] * eye[1] + across[2]
     if side == 0:
@@ -253,6 +252,6 @@ def _past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
 
 
 def cross(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Cross products along the last axis, of which the others are broadcast."""
+    """Return cross products along the last axis; the other axes are broadcast."""
     product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     return product

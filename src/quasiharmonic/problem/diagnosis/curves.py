@@ -1,11 +1,13 @@
-"""The curves onto which the boundary goes: where they meet, how they turn, how often they wind.
+"""The curves of the boundary in the target: intersections, turning numbers and winding numbers.
 
-Everything is decided exactly. It rests on three facts. A map without inverted triangles covers
-every point off its boundary curves as often as they wind around it, so they never wind a negative
-number of times. The exterior angles of its boundary add up to at least 2π times the Euler
-characteristic of the surface, and to exactly that unless the map winds more than once around a
-vertex (count the angles of all triangles in two ways). And where the curves wind at most once
-around every point, such a map is injective.
+All results are exact. The conditions rest on three facts:
+
+1. A map without inverted triangles covers every point off its boundary curves as often as they wind around it. So
+   winding numbers are never negative.
+2. The exterior angles of its boundary add up to at least 2π times the Euler characteristic of the surface. The sum
+   equals this bound unless the map winds more than once around a vertex (count the angles of all triangles in two
+   ways).
+3. If the curves wind at most once around every point, the map is injective.
 """
 
 from __future__ import annotations
@@ -20,15 +22,15 @@ from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# More meeting pairs than this are not collected: a target that is this entangled needs no full list.
+# Limit on the pairs of meeting edges to collect; a longer list would not help the user.
 MOST_CONTACTS = 10_000
 
 
 def turning_number(loop: FloatArray) -> int:
-    """How often the direction of a closed polygon turns around, counterclockwise.
+    """Return how often the direction of a closed polygon turns around, counterclockwise.
 
-    A fold, where an edge goes back along the one before, counts as a turn by -π: the only angle
-    between 0 and 2π that triangles can fill there is 2π.
+    A fold, where an edge reverses the direction of the previous one, counts as a turn by -π: the interior angle that
+    triangles can fill there is 2π.
 
     Parameters
     ----------
@@ -36,31 +38,31 @@ def turning_number(loop: FloatArray) -> int:
         Corners, no two consecutive ones equal.
     """
     after = np.roll(loop, -1, axis=0)
-    # Comparing coordinates is exact, subtracting them is not.
+    # Compare coordinates, which is exact, instead of subtracting them.
     # Directions of angle 0 ≤ θ < π are up, the others down; each full turn passes from down to up.
     up = (after[:, 1] > loop[:, 1]) | ((after[:, 1] == loop[:, 1]) & (after[:, 0] > loop[:, 0]))
     turn = orientation(loop, after, np.roll(after, -1, axis=0))
     up_after = np.roll(up, -1)
-    # A turn of zero from one to the other is a fold, and goes to the right.
+    # A turn of zero between up and down is a fold, and counts as a right turn.
     passes = np.where(turn > 0, ~up & up_after, False).astype(np.int64)
     passes -= np.where(turn <= 0, up & ~up_after, False)
     return int(passes.sum())
 
 
 class TargetCurves:
-    """The boundary loops of a surface at their positions in the plane.
+    """The boundary loops of a surface at their target positions.
 
     Parameters
     ----------
     positions : (n, 2) float64
         Positions of vertices, finite on the boundary.
     loops : list of (l,) int64
-        The surface lies to the left of each.
+        Boundary loops, with the surface to their left.
 
     Attributes
     ----------
     loops : list of (l,) int64
-        The same loops, each from its lowest corner on (of several, the leftmost).
+        The same loops, each starting at its lowest corner (the leftmost of several).
     ends : (m, 2) int64
         Boundary edges, loop by loop, in order.
     loop_of : (m,) int64
@@ -80,22 +82,22 @@ class TargetCurves:
 
     @property
     def tails(self) -> FloatArray:
-        """Where the edges start, (m, 2) float64."""
+        """Starts of the edges, (m, 2) float64."""
         return self.positions[self.ends[:, 0]]
 
     @property
     def heads(self) -> FloatArray:
-        """Where the edges end, (m, 2) float64."""
+        """Ends of the edges, (m, 2) float64."""
         return self.positions[self.ends[:, 1]]
 
     @cached_property
     def folds(self) -> IntArray:
-        """Vertices at which the curve goes back the way it came."""
+        """Vertices at which the curve reverses its direction."""
         folded = []
         for loop in self.loops:
             here, before, after = (self.positions[np.roll(loop, k)] for k in (0, 1, -1))
             flat = orientation(before, here, after) == 0
-            # On one line: a fold unless the vertex lies between its neighbours.
+            # Three collinear vertices form a fold unless the middle one lies between the others.
             low, high = np.minimum(before, after), np.maximum(before, after)
             distinct = (here != before).any(axis=1) & (here != after).any(axis=1)
             outside = ((here < low) | (here > high)).any(axis=1)
@@ -104,17 +106,17 @@ class TargetCurves:
 
     @cached_property
     def contacts(self) -> Contacts:
-        """Where the curves meet themselves or each other, as pairs of edges."""
+        """Pairs of edges at which the curves meet themselves or each other."""
         return contacts(self.positions, self.ends, MOST_CONTACTS)
 
     @property
     def simple(self) -> bool:
-        """Whether every loop is simple and none meets another."""
+        """Whether every loop is simple and no two loops meet."""
         return not self.degenerate.size and not len(self.contacts.pairs)
 
     @cached_property
     def turning(self) -> list[int] | None:
-        """Turning number of each loop; None where edges of length zero have no direction."""
+        """Turning number of each loop; None if there are edges of length zero, which have no direction."""
         if self.degenerate.size:
             return None
         return [turning_number(self.positions[loop]) for loop in self.loops]
@@ -123,22 +125,21 @@ class TargetCurves:
     def winding_range(self) -> IntArray | None:
         """Smallest winding number right of each loop, largest one left of it; (loops, 2) int64.
 
-        The numbers are those of all curves together, and every region of the plane but the outermost
-        lies beside some loop. None where curves touch or overlap instead of crossing, or meet too
-        often to be followed.
+        The numbers are those of all curves together, and every region of the plane except the outermost is next to a
+        loop. None if curves touch or overlap instead of crossing, or if the list of contacts is incomplete.
         """
         meet = self.contacts
         if self.degenerate.size or not meet.complete or (meet.relation != SegmentRelation.CROSSING).any():
             return None
         edge, other = np.concatenate([meet.pairs, meet.pairs[:, ::-1]]).T
-        # Who crosses a curve from its right to its left comes to where it winds once more.
+        # Crossing a curve from its right to its left increases the winding number by one.
         step = orientation(self.tails[other], self.heads[other], self.heads[edge])
         several = np.bincount(edge, minlength=len(self.ends))[edge] > 1
         when = [self._when(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)]
         steps: list[dict[tuple[int, Fraction], int]] = [{} for _ in self.loops]
         for k in sorted(range(len(edge)), key=lambda k: (edge[k], when[k])):
             heartbeat()
-            # What is crossed at the same point is crossed at once.
+            # Add up all crossings at the same point.
             along = steps[self.loop_of[edge[k]]]
             at = (int(edge[k]), when[k])
             along[at] = along.get(at, 0) + int(step[k])
@@ -149,7 +150,7 @@ class TargetCurves:
         return np.array(ranges, dtype=np.int64)
 
     def _when(self, edge: int, other: int) -> Fraction:
-        """Where along an edge another crosses it, from 0 at its tail to 1 at its head."""
+        """Return the position along an edge where another crosses it, from 0 at its tail to 1 at its head."""
         heartbeat()
         (px, py), (qx, qy), (rx, ry), (sx, sy) = (
             tuple(map(Fraction, self.positions[vertex].tolist())) for vertex in (*self.ends[edge], *self.ends[other])
@@ -159,11 +160,11 @@ class TargetCurves:
         return tail / (tail - head)
 
     def _left_at_start(self, index: int) -> int:
-        """Winding number just left of the lowest corner of a loop."""
+        """Return the winding number just left of the lowest corner of a loop."""
         own = self.loop_of == index
         before, here, after = (self.positions[self.loops[index][k]] for k in (-1, 0, 1))
         others, _ = winding(here[None], self.tails[~own], self.heads[~own])
-        # Below its lowest corner a loop does not wind; the corner's inner side is left of a left turn.
+        # A loop has winding number zero below its lowest corner. At a left turn, the inner side is the left one.
         return int(others[0]) + int(orientation(before, here, after) > 0)
 
 
@@ -173,7 +174,9 @@ class Corners:
     Attributes
     ----------
     known : (n,) bool
-        Boundary vertices.
+        Whether a vertex is on the boundary.
+    before, after : (n,) int64
+        The previous and the next boundary vertex, -1 at other vertices.
     """
 
     def __init__(self, curves: TargetCurves) -> None:
@@ -185,12 +188,12 @@ class Corners:
         self.before[heads], self.after[tails] = tails, heads
 
     def reflex(self, vertices: IntArray, where: FloatArray) -> BoolArray:
-        """Whether the angle inside is larger than π; (k,) bool."""
+        """Return whether the interior angle is larger than π; (k,) bool."""
         turns: BoolArray = orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
         return turns
 
     def opens_to(self, vertices: IntArray, points: FloatArray, where: FloatArray) -> BoolArray:
-        """Whether the way to a point starts strictly inside the angle; (k,) bool, False at pins."""
+        """Return whether the segment to a point starts strictly inside the interior angle; (k,) bool, False at pins."""
         result = np.zeros(len(vertices), dtype=bool)
         known = np.flatnonzero(self.known[vertices])
         v, x = vertices[known], points[known]
@@ -202,5 +205,5 @@ class Corners:
 
 
 def _from_lowest(positions: FloatArray, loop: IntArray) -> IntArray:
-    """A loop from its lowest corner on; of several, the leftmost."""
+    """Return a loop rotated to start at its lowest corner (the leftmost of several)."""
     return np.roll(loop, -int(np.lexsort(positions[loop].T)[0]))

@@ -1,4 +1,4 @@
-"""What is spent on looking, and when there is no more of it."""
+"""A budget for the time that a diagnosis takes."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from quasiharmonic.util.progress import heartbeat
 
 
 class EffortSpentError(Exception):
-    """More would be spent than may be."""
+    """The budget is exhausted."""
 
 
 @dataclass
 class Effort:
-    """A measure of the time spent, in about microseconds.
+    """A budget of time, in units of about a microsecond.
 
     Attributes
     ----------
     most : int
-        What may be spent.
+        The budget.
     spent : int
-        What has been.
+        The amount spent so far.
     """
 
     most: int
     spent: int = 0
 
     def spend(self, amount: int) -> None:
-        """Spend an amount, before what it is spent on.
+        """Spend an amount; call this before the work.
 
         Raises
         ------
         EffortSpentError
-            When there is not so much left; from then on at every call.
+            If the budget is exhausted; then every later call raises it too.
         """
         heartbeat()
         self.spent += amount

@@ -1,7 +1,7 @@
 """Conditions on single elements that hold for every map without inverted triangles.
 
-None of them asks whether the target overlaps itself: the triangles of an element must be positive
-however the rest is laid out.
+They do not depend on whether the target overlaps itself: the triangles of an element must be positive for any positions
+of the other vertices.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from quasiharmonic.util.arrays import named, named_edges
 
 
 def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
-    """Edges whose two ends are fixed at the same position."""
+    """Yield edges whose two ends are fixed at the same position."""
     every = np.concatenate([problem.domain.edges.boundary, fixture.chords])
     where = fixture.positions
     for edge in every[(where[every[:, 0]] == where[every[:, 1]]).all(axis=1)]:
@@ -30,7 +30,7 @@ def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]
 
 
 def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
-    """Triangles with three fixed vertices that the target itself inverts or flattens."""
+    """Yield triangles of three fixed vertices that the target makes inverted or degenerate."""
     whole = np.flatnonzero(fixture.fixed[problem.F].all(axis=1))
     corners = problem.F[whole]
     sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
@@ -46,16 +46,16 @@ def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obs
 
 
 def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
-    """Parts of the mesh that fixed edges cut off, and to which the target leaves no positive area.
+    """Yield parts of the mesh, cut off by fixed edges, whose area in the target is not positive.
 
-    The areas of a patch's triangles add up to what its fixed border encloses.
+    The areas of a patch's triangles add up to the area that its fixed border encloses.
     """
     if not len(fixture.chords):
         return
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    # Triangles around a free vertex belong together, and so do those of two free vertices joined.
+    # Triangles that share a free vertex belong to one patch, and so do those at two joined free vertices.
     free = ~fixture.fixed
     interior = problem.domain.edges.interior
     inner = interior[free[interior].all(axis=1)]
@@ -69,7 +69,7 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
     of, edge = patch[np.nonzero(border)[0]], sides[border]
 
     if len(open_) == len(problem.F) and (patch == patch[0]).all():
-        return  # fixed edges that cut nothing off
+        return  # The fixed edges do not divide the mesh.
 
     twice_area: dict[int, int] = {}
     for k, (px, py), (qx, qy) in zip(of.tolist(), fixture.points(edge[:, 0]), fixture.points(edge[:, 1]), strict=True):
@@ -90,10 +90,10 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
 
 
 def misplaced_pins(problem: Problem, fixture: Fixture, curves: TargetCurves, proper: bool) -> Iterator[Obstruction]:
-    """Pins that the map cannot reach.
+    """Yield pins whose positions no map can reach.
 
-    As many interior vertices can be pinned to a position as the boundary winds around it; where it
-    winds at most once, pins must lie inside, each at a position of its own.
+    The number of pins at a position must not exceed the winding number of the boundary there. If the boundary winds at
+    most once, pins must lie inside, at distinct positions.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def misplaced_pins(problem: Problem, fixture: Fixture, curves: TargetCurves, pro
 
 
 def half_planes(star: Star, fixture: Fixture) -> Obstruction | None:
-    """Whether no point lies to the left of all the fixed edges that form triangles with a vertex."""
+    """Return an obstruction if no point lies to the left of all fixed edges that form triangles with a vertex."""
     area = fixture.extent()
     if fixture.left_of(area, star.opposite) is not None:
         return None

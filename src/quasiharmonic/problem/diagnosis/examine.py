@@ -1,4 +1,4 @@
-"""Look for reasons why a problem has no map, the general ones first."""
+"""Find obstructions to a map of a problem, the global ones first."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from quasiharmonic.problem.diagnosis.sight import Sight, bad_chords
 from quasiharmonic.problem.diagnosis.witness import unplaced
 from quasiharmonic.util.arrays import IntArray, named, named_edges
 
-# What is spent on vertices that see too little, in about microseconds; where it ends, the rest are passed over.
+# Budget for the visibility checks of free vertices, in about microseconds. Vertices beyond it are not checked.
 MOST_EFFORT = 3_000_000
 
 
 def diagnose(problem: Problem) -> Diagnosis:
-    """Check the known conditions that a problem must meet to have a map.
+    """Check the known necessary conditions for a map.
 
-    Every obstruction is proven, in exact arithmetic on the coordinates as stored: where one is
-    reported there is no map of the kind it forbids, not even with real numbers. The reverse does not
-    hold: a problem without known obstruction may still have no map.
+    Every obstruction is proven, in exact arithmetic on the coordinates as stored. A reported obstruction excludes all
+    maps of the class that it forbids, even with real coordinates. The converse does not hold: a problem without known
+    obstruction may still have no map.
 
     Parameters
     ----------
@@ -45,30 +45,27 @@ def diagnose(problem: Problem) -> Diagnosis:
 
     Notes
     -----
-    Write χ for the Euler characteristic of the surface. For any target, a map without inverted
-    triangles needs
+    Let χ be the Euler characteristic of the surface. For any target, a map without inverted triangles requires
 
-    - no edge collapsed, no triangle or patch of the mesh inverted by what is fixed around it;
-    - a signed area above zero, turning numbers that add up to χ or more (to exactly χ if no vertex
-      may be wound around twice), and a boundary that winds nowhere a negative number of times;
-    - for each free vertex a point to the left of all fixed edges that it forms triangles with;
-    - as many windings around a pin as there are pins at this position.
+    - no collapsed edge, and no triangle or patch that the fixed vertices around it invert;
+    - a positive signed area, turning numbers whose sum is at least χ (exactly χ if the map winds at most once around
+      every vertex), and no negative winding number of the boundary;
+    - for each free vertex a point to the left of all fixed edges of its triangles;
+    - for each position at most as many pins as the winding number there.
 
-    A bijective map also needs loops that are simple, disjoint and nested as holes in one outer loop,
-    and a surface without handles. Where the loops are, every map without inverted triangles is
-    injective on the whole interior, and further needs
+    A bijective map also requires loops that are simple, disjoint and nested as holes in one outer loop, and a surface
+    without handles. For a target with such loops, every map without inverted triangles is injective on the whole
+    interior, and also requires
 
-    - edges between fixed vertices strictly inside the target, clear of the boundary and each other;
+    - edges between fixed vertices strictly inside the target, which do not meet the boundary or each other;
     - pins strictly inside;
-    - for each free vertex a point that sees all fixed vertices it is joined to, from the left of
-      the edges above;
-    - for any two boundary vertices no fewer edges from one to the other than the link distance of
-      their positions, the number of segments that it takes inside the target [2]_.
+    - for each free vertex a point that sees all fixed neighbours, to the left of the fixed edges of its triangles;
+    - for any two boundary vertices, at least as many edges between them as the link distance of their positions, the
+      smallest number of segments of a path inside the target [2]_.
 
-    Link distances are compared for targets with one loop and vertices up to eight edges apart. Both
-    these and sight are given up where they would take more than some seconds, which ``unchecked`` then
-    says. Not checked is whether a curve that crosses itself bounds an immersed surface at all (for a
-    disk, Blank's theorem [1]_ decides).
+    Link distances are compared for targets with one loop and vertices up to eight edges apart. These checks and those
+    of visibility stop after some seconds; ``unchecked`` then lists the rest. Whether a curve that crosses itself bounds
+    an immersed surface is not checked (for a disk, Blank's theorem [1]_ decides).
 
     References
     ----------
@@ -101,7 +98,7 @@ def diagnose(problem: Problem) -> Diagnosis:
         found += bad
         wrong = {tuple(o.split[0].tolist()) for o in bad}
         chords = np.array([c for c in chords.tolist() if tuple(c) not in wrong], dtype=np.int64).reshape(-1, 2)
-    # Nothing has a place in a target on a line parallel to an axis, and nothing more need be said.
+    # A target on a line parallel to an axis has no area; the checks above report that.
     if all(low < high for low, high in zip(fixture.lattice.low, fixture.lattice.high, strict=True)):
         hidden, passed_over = _unplaced(problem, fixture, curves, corners, np.concatenate([curves.ends, chords]))
         found += hidden
@@ -118,7 +115,7 @@ def diagnose(problem: Problem) -> Diagnosis:
 def _unplaced(
     problem: Problem, fixture: Fixture, curves: TargetCurves, corners: Corners | None, walls: IntArray
 ) -> tuple[list[Obstruction], list[str]]:
-    """Free vertices for which there is no place, and what was left unchecked about them."""
+    """Return obstructions of free vertices without a valid position, and descriptions of unchecked vertices."""
     around = stars(problem, fixture, curves.folds)
     around = around.take(unplaced(around, fixture, corners, walls))
     sight = None if corners is None else Sight(problem, fixture, corners, walls, Effort(MOST_EFFORT))
@@ -138,13 +135,13 @@ def _unplaced(
 
 
 def _twice_area(fixture: Fixture, curves: TargetCurves) -> int:
-    """Twice the signed area around which the boundary winds, in squared units of the lattice."""
+    """Return twice the signed area that the boundary encloses, in squared units of the lattice."""
     tails, heads = fixture.points(curves.ends[:, 0]), fixture.points(curves.ends[:, 1])
     return sum(px * qy - py * qx for (px, py), (qx, qy) in zip(tails, heads, strict=True))
 
 
 def _fits_mirrored(curves: TargetCurves, euler: int) -> bool:
-    """Whether the reflected target passes the conditions on whole curves."""
+    """Return whether the reflected target meets the conditions on whole curves."""
     mirrored = TargetCurves(curves.positions * [-1.0, 1.0], curves.loops)
     if mirrored.turning is None or sum(mirrored.turning) < euler:
         return False
@@ -152,7 +149,7 @@ def _fits_mirrored(curves: TargetCurves, euler: int) -> bool:
 
 
 def _proper(curves: TargetCurves) -> bool:
-    """Whether the loops are simple, disjoint, and nested as holes in one outer loop."""
+    """Return whether the loops are simple, disjoint, and nested as holes in one outer loop."""
     if not curves.simple or curves.turning is None or curves.winding_range is None:
         return False
     low, high = curves.winding_range.T
@@ -160,7 +157,7 @@ def _proper(curves: TargetCurves) -> bool:
 
 
 def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> Iterator[Obstruction]:
-    """Obstructions by the loops as a whole.
+    """Yield obstructions by the loops as a whole.
 
     Parameters
     ----------
@@ -169,7 +166,7 @@ def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> It
     euler : int
         Euler characteristic of the surface.
     area : int
-        Any number of the sign of the area that the loops wind around.
+        Any number with the sign of the area that the loops enclose.
     """
     every = np.arange(len(problem.domain.loops))
     turning, ranges = curves.turning, curves.winding_range
@@ -202,15 +199,15 @@ def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> It
 
 
 def _misnested(curves: TargetCurves, euler: int) -> Obstruction:
-    """Simple disjoint loops that are not holes in one outer loop."""
+    """Return the obstruction of simple disjoint loops that are not holes in one outer loop."""
     assert curves.winding_range is not None
     assert curves.turning is not None
     low, high = curves.winding_range.T
     wrong = np.flatnonzero((low < 0) | (high > 1))
     if not wrong.size:
         wrong = np.flatnonzero(np.array(curves.turning) == 1)
-    # Where the curves wind at most once, a map would be injective onto what they enclose, and that
-    # is not this surface; where they wind more often, it would cover a part repeatedly.
+    # If the curves wind at most once, a map would be injective onto the enclosed region, which is not this surface. If
+    # they wind more often, a map would cover a part repeatedly.
     hopeless = low.min() < 0 or high.max() <= 1
     forbids = Forbids.INJECTIVE if hopeless else Forbids.UNBRANCHED
     if not hopeless and sum(curves.turning) == euler:
@@ -220,7 +217,7 @@ def _misnested(curves: TargetCurves, euler: int) -> Obstruction:
 
 
 def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
-    """Where the curves fold, cross or touch; forbids bijective maps only."""
+    """Yield obstructions where the curves fold, cross or touch; they forbid bijective maps only."""
     if curves.folds.size:
         message = f"At the boundary {named_vertices(curves.folds)} the target goes back the way it came."
         yield Obstruction(Kind.FOLD, Forbids.BIJECTIVE, message, vertices=curves.folds)
@@ -245,7 +242,7 @@ def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
 
 
 def _unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
-    """Conditions that were left out, and why."""
+    """Yield descriptions of the conditions that were not checked, and why."""
     if proper:
         return
     yield "edges between fixed vertices and what vertices see, which matters where the target is simple"
@@ -256,5 +253,5 @@ def _unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
 
 
 def _named_loops(loops: IntArray) -> str:
-    """Name the first few of some boundary loops."""
+    """Return text that names the first few of some boundary loops."""
     return named("loop", "loops", loops)

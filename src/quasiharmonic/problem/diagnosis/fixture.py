@@ -1,4 +1,4 @@
-"""What a problem fixes: positions, edges between them, and what is fixed around each free vertex."""
+"""The fixed elements of a problem: positions, edges between them, and the fixed elements around each free vertex."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from quasiharmonic.util.progress import heartbeat
 
 @dataclass(frozen=True)
 class Fixture:
-    """Which elements of a mesh have given positions.
+    """The elements of a mesh with fixed positions.
 
     Attributes
     ----------
     positions : (n, 2) float64
         Target positions, NaN at free vertices.
     fixed : (n,) bool
+        Whether a vertex is fixed.
     chords : (c, 2) int64
         Interior edges with both ends fixed.
     lattice : Lattice
-        The fixed positions as integers, in the order of ``Problem.fixed``.
+        The target positions as integers, in the order of ``Problem.fixed``.
     row : (n,) int64
-        Where in ``Problem.fixed`` a vertex is, -1 for free ones.
+        Index of a vertex in ``Problem.fixed``, -1 for free vertices.
     """
 
     positions: FloatArray
@@ -37,7 +38,7 @@ class Fixture:
 
     @staticmethod
     def of(problem: Problem) -> Fixture:
-        """Collect what is fixed in a problem."""
+        """Return the fixed elements of a problem."""
         positions = np.full((problem.n, 2), np.nan)
         positions[problem.fixed] = problem.target
         row = np.full(problem.n, -1)
@@ -47,17 +48,17 @@ class Fixture:
         return Fixture(positions, row >= 0, chords, Lattice(problem.target), row)
 
     def points(self, vertices: IntArray) -> list[tuple[int, int]]:
-        """Integer positions of fixed vertices."""
+        """Return integer positions of fixed vertices."""
         return [self.lattice.points[k] for k in self.row[vertices].tolist()]
 
     def extent(self) -> Convex:
-        """The open box around all fixed vertices, which contains the image of every free one."""
+        """Return the open bounding box of all fixed vertices, which contains the image of every free vertex."""
         return Convex.box(self.lattice.low, self.lattice.high)
 
     def left_of(self, area: Convex | None, edges: IntArray) -> Convex | None:
-        """The part of an area to the left of fixed edges (k, 2), or None if there is none.
+        """Return the part of an area to the left of fixed edges (k, 2), or None if it is empty.
 
-        Edges of length zero have no left side and are passed over.
+        Edges of length zero have no left side and are skipped.
         """
         for p, q in zip(self.points(edges[:, 0]), self.points(edges[:, 1]), strict=True):
             heartbeat()
@@ -70,7 +71,7 @@ class Fixture:
 
 @dataclass(frozen=True)
 class Star:
-    """A free vertex and what is fixed around it.
+    """A free vertex and the fixed elements around it.
 
     Attributes
     ----------
@@ -78,7 +79,7 @@ class Star:
     neighbours : (k,) int64
         Fixed vertices joined to it.
     opposite : (h, 2) int64
-        Fixed edges that form a triangle with it, which lies to their left.
+        Fixed edges that form a triangle with it; the vertex must be to their left.
     """
 
     vertex: int
@@ -117,7 +118,7 @@ class Stars:
         return Star(int(self.vertices[k]), self.neighbours[near], self.opposite[beyond])
 
     def take(self, chosen: IntArray) -> Stars:
-        """Some of the stars, named in ascending order."""
+        """Return some of the stars, given their indices in ascending order."""
         at = np.full(len(self), -1)
         at[chosen] = np.arange(len(chosen))
         near, beyond = at[self.of_neighbour], at[self.of_opposite]
@@ -126,25 +127,26 @@ class Stars:
 
 
 def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
-    """Free vertices whose fixed surroundings could leave them no place.
+    """Return the stars of free vertices that may have no valid position.
 
-    Left out are those that always find one: with a single fixed neighbour, or with those of one or
-    two consecutive boundary edges, which are all seen from near the middle one.
+    Two kinds of free vertices always have one and are left out: those with a single fixed neighbour, and those whose
+    fixed neighbours are the vertices of one or two consecutive boundary edges. The latter see all of these from a point
+    near the middle one.
 
     Parameters
     ----------
     problem : Problem
     fixture : Fixture
     folds : (k,) int64
-        Vertices at which the boundary goes back along itself: nothing is near these.
+        Vertices at which the boundary reverses its direction. There is no valid position near them.
     """
     fixed = fixture.fixed
     interior = problem.domain.edges.interior
     joined = interior[fixed[interior[:, 0]] != fixed[interior[:, 1]]]
-    joined = np.where(fixed[joined[:, :1]], joined[:, ::-1], joined)  # free, fixed
+    joined = np.where(fixed[joined[:, :1]], joined[:, ::-1], joined)  # columns: free, fixed
     two = np.flatnonzero(fixed[problem.F].sum(axis=1) == 2)
     free = np.argmin(fixed[problem.F[two]], axis=1)
-    corner = problem.F[two[:, None], (free[:, None] + [0, 1, 2]) % 3]  # free, then the fixed edge
+    corner = problem.F[two[:, None], (free[:, None] + [0, 1, 2]) % 3]  # columns: free, fixed edge
 
     neighbours = np.bincount(joined[:, 0], minlength=problem.n)
     opposite = np.bincount(corner[:, 0], minlength=problem.n)

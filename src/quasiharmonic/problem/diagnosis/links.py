@@ -1,9 +1,9 @@
-"""Link distance in a simple polygon: how few straight segments lead from one corner to another.
+"""Link distance in a simple polygon: the smallest number of segments of a path between two corners.
 
-The polygon is triangulated once. From a corner one sees as far as a window: the first edge of the
-shortest path, drawn on past the corner around which that path bends. From the window one sees as far
-as the next, and so on, greedily [1]_. All this in exact arithmetic: a window passes through a corner
-and one point found before, so that the integers grow by a fixed number of digits a step.
+The polygon is triangulated once. The part of the polygon visible from a corner ends at a window. The window is the
+first edge of the shortest path, extended past the corner at which that path bends. From this window the next one is
+found, and so on, greedily [1]_. All arithmetic is exact: a window passes through a corner and one point found before,
+so the integers grow by a fixed number of digits per step.
 
 Segments may touch the boundary. A path of segments strictly inside may need more of them, never fewer.
 
@@ -31,9 +31,9 @@ from quasiharmonic.util.progress import heartbeat
 Point = tuple[int, int, int]
 """Homogeneous coordinates, the last positive."""
 
-# The line through a point and itself, of which every point lies on neither side.
+# The degenerate line through a point and itself; every point is on it.
 _NOWHERE: Point = (0, 0, 0)
-# Corners that are compared with a line in about the time of one step through a triangle.
+# Number of corners whose comparison with a line costs as much as one step through a triangle.
 _AT_ONCE = 100
 
 
@@ -43,15 +43,15 @@ class Polygon:
     Parameters
     ----------
     corners : list of (int, int)
-        Counterclockwise, no two equal.
+        Corners in counterclockwise order, all distinct.
 
     Attributes
     ----------
     triangles : list of (int, int, int)
-        As corners, counterclockwise. They form a tree, and the side from the last to the first
-        corner of each but the root leads to its parent.
+        Triangles by their corners, counterclockwise. They form a tree. In each triangle except the root, the side from
+        the last to the first corner leads to its parent.
     work : int
-        Triangles and crossings gone through so far, a measure of the time spent.
+        Number of triangles and crossings processed so far, a measure of the time spent.
     """
 
     def __init__(self, corners: list[tuple[int, int]]) -> None:
@@ -70,7 +70,7 @@ class Polygon:
         self.work = len(corners)
 
     def _plant(self) -> None:
-        """Make the triangles a tree."""
+        """Arrange the triangles as a tree."""
         reached = deque([0])
         while reached:
             t = reached.popleft()
@@ -83,19 +83,19 @@ class Polygon:
                     reached.append(child)
 
     def link_distance(self, start: int, goal: int, limit: int) -> int:
-        """Number of segments that it takes from one corner to another.
+        """Return the smallest number of segments of a path from one corner to another.
 
         Parameters
         ----------
         start, goal : int
             Two corners.
         limit : int
-            Where to stop counting.
+            Largest number to count.
 
         Returns
         -------
         int
-            The number, or ``limit + 1`` when it is larger than the limit.
+            The number, or ``limit + 1`` if it exceeds the limit.
         """
         window = [(self._points[start], self._at[start])]
         for count in range(1, limit + 1):
@@ -103,9 +103,9 @@ class Polygon:
             ways = [self._shortest(point, t, goal) for point, t in window]
             common = _common_end(ways)
             if common == 1 or any(len(way) == common for way in ways):
-                return count  # the ways part at the goal: it is seen from between them
+                return count  # The paths meet only at the goal, so a point of the window sees it.
             bend, after = ways[0][-common], ways[0][1 - common]
-            # Of all lines from the window past the bend, the one that has turned furthest already.
+            # Of all lines from the window past the bend, take the one that has turned furthest.
             before, other = ways[0][-common - 1], ways[-1][-common - 1]
             if _turn(bend, before, other) == _turn(before, bend, after):
                 before = other
@@ -113,10 +113,10 @@ class Polygon:
         return limit + 1
 
     def _shortest(self, start: Point, t: int, goal: int) -> list[Point]:
-        """The shortest path from a point in a triangle to a corner: start, bends, goal [2]_."""
+        """Return the shortest path from a point in a triangle to a corner: start, bends, goal [2]_."""
         left, right = self._portals(start, t, goal)
         path, k = [start], 0
-        # What is seen from the last bend through all doors so far lies between these two corners.
+        # The view from the last bend through all sides crossed so far is between these two corners.
         at_left = at_right = 0
         to_left = to_right = _NOWHERE
         while (k := k + 1) < len(left):
@@ -136,11 +136,11 @@ class Polygon:
                     continue
                 at_left, to_left = k, _cross(path[-1], left[k])
         path.append(self._points[goal])
-        # A bend that the path touches without turning is none.
+        # Drop corners at which the path does not turn.
         return [p for k, p in enumerate(path) if k in (0, len(path) - 1) or _turn(path[k - 1], p, path[k + 1])]
 
     def _portals(self, start: Point, t: int, goal: int) -> tuple[list[Point], list[Point]]:
-        """Left and right ends of the sides crossed between a point and a corner, both points included."""
+        """Return left and right ends of the sides crossed between a point and a corner, including both points."""
         up, down = [t], [self._at[goal]]
         while up[-1] != down[-1]:
             if self._depth[up[-1]] >= self._depth[down[-1]]:
@@ -148,7 +148,7 @@ class Polygon:
             else:
                 down.append(self._parent[down[-1]])
         sleeve = up + down[-2::-1]
-        # Triangles around the two ends need not be crossed.
+        # Skip the triangles around the two ends.
         corner = self._corner.get(start, -1)
         first = max((k for k, t in enumerate(sleeve) if corner in self.triangles[t]), default=0)
         last = next(k for k in range(first, len(sleeve)) if goal in self.triangles[sleeve[k]])
@@ -163,10 +163,10 @@ class Polygon:
         return [*left, self._points[goal]], [*right, self._points[goal]]
 
     def _hit(self, before: Point, bend: Point) -> tuple[Point, int]:
-        """Where the way from a point through a corner leaves the polygon, and a triangle there."""
+        """Return where the ray from a point through a corner leaves the polygon, and a triangle there."""
         along = _cross(before, bend)
         sides = self._sides(along)
-        # The distance from the bend, up to a positive factor.
+        # `distance` is the distance from the bend, up to a positive factor.
         x, y, w = before
         dx, dy = bend[0] * w - x, bend[1] * w - y
         origin = dx * bend[0] + dy * bend[1]
@@ -179,7 +179,8 @@ class Polygon:
         crossed = np.flatnonzero(sides[beside] != np.roll(sides[beside], -1))
         self.work += crossed.size + len(sides) // _AT_ONCE
         n = len(sides)
-        # From one corner beside the line to the next: across a side, or along corners on the line.
+        # The line crosses the boundary between corners on different sides of it: through a side, or through corners on
+        # it.
         for start, end in zip(beside[crossed].tolist(), np.roll(beside, -1)[crossed].tolist(), strict=True):
             if end == (start + 1) % n:
                 p = _cross(along, _cross(self._points[start], self._points[end]))
@@ -193,10 +194,10 @@ class Polygon:
         return point, t
 
     def _sides(self, line: Point) -> IntArray:
-        """On which side of a line each corner lies: 1 for its left, -1 for its right, 0 on it."""
+        """Return the side of a line of each corner: 1 for left, -1 for right, 0 on the line."""
         a, b, c = line
         (x, y), unit, size = self._centre, self._unit, max(abs(a), abs(b))
-        # Quotients of integers are rounded once, whatever their size.
+        # Python rounds quotients of integers once, for any size.
         value = self._near @ (a / size, b / size) + (a * x + b * y + c) / (size * unit)
         sides = np.where(value > 0, 1, -1)
         for k in np.flatnonzero(np.abs(value) < MARGIN).tolist():
@@ -205,24 +206,24 @@ class Polygon:
 
 
 def _with_last(triangle: tuple[int, int, int], corner: int) -> tuple[int, int, int]:
-    """The same triangle with a corner as the last."""
+    """Return the same triangle, rotated so that a corner is the last."""
     a, b, c = triangle
     return (b, c, a) if corner == a else (c, a, b) if corner == b else triangle
 
 
 def _cross(p: Point, q: Point) -> Point:
-    """The line through two points, positive to the left of the way from one to the other."""
+    """Return the line through two points, positive to the left of the direction from the first to the second."""
     return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
 
 
 def _side(line: Point, p: Point) -> int:
-    """1 for a point to the left of a line, -1 for one to its right, 0 on it."""
+    """Return 1 for a point to the left of a line, -1 for one to its right, 0 on it."""
     value = line[0] * p[0] + line[1] * p[1] + line[2] * p[2]
     return (value > 0) - (value < 0)
 
 
 def _turn(p: Point, q: Point, r: Point) -> int:
-    """1 where the way from p over q to r turns left, -1 where it turns right, 0 where it goes straight."""
+    """Return 1 if the path from p over q to r turns left, -1 if it turns right, 0 if it is straight."""
     if p[2] == q[2] == r[2] == 1:
         value = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
         return (value > 0) - (value < 0)
@@ -230,7 +231,7 @@ def _turn(p: Point, q: Point, r: Point) -> int:
 
 
 def _common_end(ways: list[list[Point]]) -> int:
-    """Number of points that paths share at their ends, not counting the start of a single one."""
+    """Return the number of points that paths share at their ends; a single path is counted without its start."""
     if len(ways) == 1:
         return len(ways[0]) - 1
     count = 0

@@ -1,4 +1,4 @@
-"""What a diagnosis says: obstructions, each with its kind, its elements and what would help."""
+"""The result of a diagnosis: obstructions, each with its kind, its elements and advice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Forbids(Enum):
-    """The largest class of maps in which an obstruction leaves none; the value says so in words."""
+    """The largest class of maps that an obstruction excludes; the value is a message."""
 
     INJECTIVE = "no map without inverted triangles exists"
     UNBRANCHED = "a map without inverted triangles winds more than once around one of its vertices"
@@ -29,7 +29,7 @@ class Forbids(Enum):
 
 
 class Kind(Enum):
-    """What stands in the way; the value is what would help."""
+    """The kind of an obstruction; the value is advice for the user."""
 
     COLLAPSED_EDGE = "Give the two vertices different positions."
     INVERTED_TRIANGLE = "Split the triangle's interior edges, or move one of its vertices."
@@ -55,27 +55,26 @@ def _ints(values: ArrayLike, *shape: int) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Obstruction(ReadOnly):
-    """One reason why there is no map.
+    """One proven reason why there is no map.
 
     Attributes
     ----------
     kind : Kind
-        Which condition is violated.
+        The violated condition.
     forbids : Forbids
-        Whether this rules out every injective map or only the bijective ones.
+        Whether it excludes every injective map or only the bijective ones.
     message : str
         A sentence that names the elements.
     vertices : (a,) int64
-        Vertices of the mesh; the one that finds no place comes first.
+        Vertices of the mesh. A vertex without valid position comes first.
     edges : (b, 2) int64
         Edges of the mesh, by their vertices.
     triangles : (c,) int64
         Triangles of the mesh.
     loops : (d,) int64
-        Boundary loops, as indices into ``Problem.loops``.
+        Boundary loops, as indices into ``Domain.loops``.
     split : (s, 2) int64
-        Interior edges that would no longer be in the way if they had a vertex in the middle. Empty
-        where no refinement of the mesh helps.
+        Interior edges whose split would remove the obstruction. Empty if no refinement of the mesh helps.
     """
 
     kind: Kind
@@ -99,11 +98,11 @@ class Obstruction(ReadOnly):
 
     @property
     def advice(self) -> str:
-        """What would help, in a sentence."""
+        """Advice for the user, in one sentence."""
         return self.kind.value
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: names in lower case, arrays as lists."""
+        """Return a dictionary for JSON: names in lower case, arrays as lists."""
         return {
             "kind": self.kind.name.lower(),
             "forbids": self.forbids.name.lower(),
@@ -119,17 +118,17 @@ class Obstruction(ReadOnly):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Displayable):
-    """All obstructions found, and what was not looked for.
+    """All obstructions found, and the conditions that were not checked.
 
     Attributes
     ----------
     obstructions : tuple of Obstruction
-        Those of the whole target first, then those of single elements. Empty when none is known,
-        which does not prove that a map exists.
+        Obstructions of the whole target first, then those of single elements. An empty tuple does not prove that a map
+        exists.
     unchecked : tuple of str
-        Conditions that do not apply or were not decided for this problem, and why.
+        Conditions that do not apply to this problem or were not decided, and why.
     problem : Problem or None
-        What was examined, where it is a whole problem.
+        The examined problem, if there is one.
     """
 
     obstructions: tuple[Obstruction, ...]
@@ -148,17 +147,17 @@ class Diagnosis(Displayable):
 
     @property
     def split(self) -> IntArray:
-        """Edges that the obstructions would have split, each once; (s, 2) int64, smaller index first."""
+        """Edges that the obstructions advise to split, each once; (s, 2) int64, smaller index first."""
         every = [np.sort(o.split, axis=1) for o in self.obstructions]
         return np.unique(np.concatenate([_ints([], -1, 2), *every]), axis=0)
 
     def summary(self, most: int = 5) -> str:
-        """The diagnosis as text.
+        """Return the diagnosis as text.
 
         Parameters
         ----------
         most : int
-            Obstructions of one kind that are spelled out before the rest is only counted.
+            Number of obstructions of one kind to list; further ones are only counted.
         """
         if self.forbids_injective:
             lines = ["No injective map exists: every map with these positions inverts a triangle."]
@@ -187,7 +186,7 @@ class Diagnosis(Displayable):
         return f"no {'injective' if self.forbids_injective else 'bijective'} map: {found}"
 
     def plot(self) -> Figure:
-        """Draw the surface and where its fixed vertices go, what forbids a map in red.
+        """Draw the surface and the target positions of its fixed vertices, with the obstructions in red.
 
         Returns
         -------
@@ -196,13 +195,13 @@ class Diagnosis(Displayable):
         Raises
         ------
         ValueError
-            When the problem is not known.
+            If ``problem`` is None.
         """
         figure: Figure = self._draw("diagnosis")
         return figure
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: the verdicts, every obstruction, the edges to split."""
+        """Return a dictionary for JSON: the forbidden classes, every obstruction, the edges to split."""
         return {
             "forbids_injective": self.forbids_injective,
             "forbids_bijective": self.forbids_bijective,
@@ -213,24 +212,24 @@ class Diagnosis(Displayable):
 
 
 def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list[int]:
-    """Of conditions that cannot all hold, some that cannot either, but could if any one were left out.
+    """Return a minimal conflict: conditions that cannot all hold, but can without any one of them.
 
     Parameters
     ----------
     count : int
         Number of conditions.
     possible : callable
-        Whether those of given indices can hold together; False for all of them.
+        Returns whether the conditions with given indices can hold together; False for all of them.
 
     Returns
     -------
     list of int
-        Indices, ascending. Found with about ``log2(count)`` calls for each.
+        Indices, ascending. Each costs about ``log2(count)`` calls.
     """
     chosen: list[int] = []
     end = count
     while possible(chosen):
-        # The first condition that is too much, on top of the chosen ones and those before it.
+        # Find the first condition that contradicts the chosen ones and those before it.
         low, high = 1, end
         while low < high:
             middle = (low + high) // 2
@@ -244,5 +243,5 @@ def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list
 
 
 def named_vertices(vertices: IntArray) -> str:
-    """Name the first few of some vertices."""
+    """Return text that names the first few of some vertices."""
     return named("vertex", "vertices", vertices)

@@ -1,7 +1,7 @@
-"""Paths through the mesh with fewer edges than the target leaves room for.
+"""Find paths in the mesh with fewer edges than the target permits.
 
-A path from one boundary vertex to another becomes a path of as many segments inside the target, so
-two vertices cannot be fewer edges apart than their link distance.
+A map takes a path between two boundary vertices to a path of as many segments inside the target. So the number of edges
+between two vertices cannot be smaller than their link distance.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from quasiharmonic.problem.diagnosis.links import Polygon
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# Pairs this many edges apart and more are not looked at.
+# Largest number of edges between the vertices of a pair to check.
 LONGEST = 8
-# Steps in the triangulated target, some microseconds each, after which the search ends: so many at
-# least, and more by so many for each boundary vertex.
+# Limit on the steps in the triangulated target, of some microseconds each: a constant, and a number per boundary
+# vertex.
 _WORK, _WORK_PER_VERTEX = 50_000, 10
-# More pairs than this are not collected.
+# Limit on the pairs to collect.
 _MOST_PAIRS = 10_000_000
-# How far beside the middle between two corners both are looked for, in halves of their distance.
+# Offsets of trial points from the midpoint of two corners, as multiples of half their distance.
 _BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
-# Pairs of a line of sight and an edge near it that are looked at for each length.
+# Limit on the pairs of a segment and a nearby edge to check, for each call of `clear`.
 _MOST_NEAR = 1_000_000
 
 
 class Shortcuts:
-    """Looks for boundary vertices that are closer in the mesh than inside the target.
+    """Finds boundary vertices that are closer in the mesh than inside the target.
 
     Parameters
     ----------
     problem : Problem
-        With a single boundary loop, simple and counterclockwise in the target.
+        A problem with a single boundary loop, simple and counterclockwise in the target.
     fixture : Fixture
     corners : Corners
 
     Attributes
     ----------
     unchecked : int
-        Pairs so many edges apart or more were not, or not all, looked at. Known after `find`.
+        Not all pairs this many edges apart or more were checked. Valid after `find`.
     """
 
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
@@ -54,7 +54,7 @@ class Shortcuts:
         interior = problem.domain.edges.interior
         inner = interior[free[interior].all(axis=1)]
         mixed = interior[free[interior[:, 0]] != free[interior[:, 1]]]
-        mixed = np.where(free[mixed[:, :1]], mixed[:, ::-1], mixed)  # fixed, free
+        mixed = np.where(free[mixed[:, :1]], mixed[:, ::-1], mixed)  # columns: fixed, free
         place = np.full(problem.n, -1)
         place[self._loop] = np.arange(len(self._loop))
         mixed = mixed[place[mixed[:, 0]] >= 0]
@@ -70,7 +70,7 @@ class Shortcuts:
         self.unchecked = LONGEST + 1
 
     def find(self) -> Iterator[Obstruction]:
-        """Pairs of vertices that are fewer edges apart than segments, nearest ones first."""
+        """Yield obstructions of vertex pairs with fewer edges than segments between them, nearest pairs first."""
         n = len(self._loop)
         budget = _WORK + _WORK_PER_VERTEX * n
         reached, known = self._ends, np.empty(0, dtype=np.int64)
@@ -86,8 +86,8 @@ class Shortcuts:
             reached = reached @ self._inner + reached
             reached.data[:] = 1
             i, j = np.divmod(keys, n)
-            # Along the boundary it takes no more segments than edges, two where there is but one, and
-            # what a vertex sees of its neighbours has been looked at without this.
+            # A path along the boundary needs no more segments than edges, or two for a single edge. `Sight` checks
+            # neighbours of a common vertex.
             far = (np.minimum((i - j) % n, (j - i) % n) > k) & (k > 2)
             i, j = i[far], j[far]
             if not i.size:
@@ -101,10 +101,10 @@ class Shortcuts:
                     yield self._obstruction(a, b, k)
 
     def within(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
-        """Whether corners are known to be no more than k > 2 segments apart.
+        """Return whether corners are provably at most k > 2 segments apart.
 
-        Known is whether one sees the other, or a third one that is less than k sides from it, and
-        whether both see one of a few points between them.
+        True if one corner sees the other, if one sees a third corner less than k sides from the other, or if both see
+        one of a few points between them.
         """
         n, tails, heads = len(self._loop), self._loop[i], self._loop[j]
         where = self._fixture.positions
@@ -115,7 +115,7 @@ class Shortcuts:
             at = np.searchsorted(seen, here * n + there)
             for nearest in (seen[np.minimum(at, seen.size - 1)], seen[np.maximum(at - 1, 0)]):
                 result |= (nearest // n == here) & (np.abs(nearest % n - there) < k)
-        # Round a bend the two see one another from a place beside it, towards the inside of the bend.
+        # At a bend, try points beside the midpoint, first towards the inside of the bend.
         inward = np.where((j - i) % n < (i - j) % n, 1.0, -1.0)
         dx, dy = (q / 2 - p / 2).T
         left = np.stack([-dy * inward, dx * inward], axis=1)
@@ -129,7 +129,7 @@ class Shortcuts:
         return result
 
     def _clear(self, tails: IntArray, heads: IntArray | None, p: FloatArray, q: FloatArray) -> BoolArray:
-        """Whether segments that start at corners, and end at others or inside, are known to run inside."""
+        """Return whether segments from corners to other corners, or to points inside, provably lie inside."""
         where = self._fixture.positions
         inside: BoolArray = np.all(np.isfinite(q), axis=1)
         inside[inside] = self._corners.opens_to(tails[inside], q[inside], where)
@@ -149,7 +149,7 @@ class Shortcuts:
         return Obstruction(Kind.LINK_DISTANCE, Forbids.INJECTIVE, message, vertices=ends, edges=path, split=path)
 
     def _paths(self, a: int, b: int, k: int) -> IntArray:
-        """All edges on shortest paths between two boundary vertices, (e, 2) int64."""
+        """Return all edges on shortest paths between two boundary vertices, (e, 2) int64."""
         forth, back = self._rings(a, k), self._rings(b, k)
         start, end = self._loop[[a, b]]
         edges = [np.array([(start, v) for v in np.intersect1d(forth[0], back[k - 2])])]
@@ -161,7 +161,7 @@ class Shortcuts:
         return np.concatenate(edges)
 
     def _rings(self, corner: int, k: int) -> list[IntArray]:
-        """Free vertices that are exactly 1, 2, … k - 1 edges away from a boundary vertex."""
+        """Return free vertices that are exactly 1, 2, … k - 1 edges away from a boundary vertex."""
         rings = [_row(self._ends, corner)]
         inside = rings[0]
         for _ in range(k - 2):
@@ -172,6 +172,6 @@ class Shortcuts:
 
 
 def _row(matrix: csr_array, k: int) -> IntArray:
-    """Column indices of the entries in a row."""
+    """Return column indices of the entries in a row."""
     columns: IntArray = matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)
     return columns

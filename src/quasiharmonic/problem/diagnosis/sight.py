@@ -1,8 +1,8 @@
 """Conditions on targets whose loops are simple, disjoint and properly nested.
 
-A map without inverted triangles is then injective, onto the region between the loops, and takes
-interior points to interior points. So no two edges cross and every open edge lies strictly inside:
-an edge between fixed vertices where it is given, any other where its free end sees the fixed one.
+A map without inverted triangles is then injective onto the region between the loops, and maps interior points to
+interior points. So no two edges cross, and every open edge lies strictly inside. For an edge between fixed vertices
+this is checked directly. For other edges the free end must see the fixed end.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstructi
 from quasiharmonic.problem.diagnosis.views import Views
 from quasiharmonic.util.arrays import IntArray, named_edges
 
-# So many vertices are looked at before all others, however many have to be seen.
+# Number of fixed vertices, far apart from each other, that are checked first.
 _APART = 8
 
 
 def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner: Corners) -> Iterator[Obstruction]:
-    """Interior edges with both ends fixed that do not lie strictly inside, free of all else that is fixed."""
+    """Yield obstructions of interior edges with fixed ends that leave the target or meet other fixed elements."""
     chords, where = fixture.chords, fixture.positions
     if not len(chords):
         return
@@ -36,7 +36,7 @@ def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner:
     met: dict[int, list[IntArray]] = {}
     for i, j in contacts(where, segments, MOST_CONTACTS).pairs.tolist():
         if j >= first:
-            # Of two edges that cross one another it is enough to name one.
+            # Of two edges that cross each other, report one.
             met.setdefault(j - first, []).append(segments[i])
     outside = np.zeros(len(chords), dtype=bool)
     for end, other in (chords.T, chords[:, ::-1].T):
@@ -59,18 +59,18 @@ def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner:
 
 
 class Sight:
-    """Looks for a place from which a vertex sees all its fixed neighbours.
+    """Checks whether a free vertex has a position that sees all its fixed neighbours.
 
     Parameters
     ----------
     problem : Problem
     fixture : Fixture
     corners : Corners
-        Of a target that is simple and properly nested.
+        Corners of a target that is simple and properly nested.
     walls : (m, 2) int64
-        Edges that nothing sees through: of the boundary, and interior ones with both ends fixed.
+        Edges that block the view: boundary edges, and interior edges with both ends fixed.
     effort : Effort
-        What may be spent on all that is asked.
+        Budget for all checks.
     """
 
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray, effort: Effort) -> None:
@@ -82,21 +82,21 @@ class Sight:
         self._views = Views(ends, problem.target, fixture.lattice, beside, effort)
 
     def hidden(self, star: Star) -> Obstruction | None:
-        """Whether no point sees all fixed neighbours of a vertex from the left of the edges around it.
+        """Return an obstruction if no point sees all fixed neighbours to the left of the fixed edges, else None.
 
         Raises
         ------
         EffortSpentError
-            When to decide it takes more than may be spent.
+            If the budget is exhausted before a decision.
         """
         neighbours, opposite = self._apart_first(star.neighbours), star.opposite
         if self._place(neighbours, opposite):
             return None
         edges, seen = opposite, neighbours
-        # Where the effort ends before a smallest reason is found, a larger one is as true.
+        # If the budget ends before the conflict is minimal, a larger conflict is still valid.
         with suppress(EffortSpentError):
             edges = opposite[smallest_conflict(len(opposite), lambda some: self._place(neighbours, opposite[some]))]
-            # Without anything to be seen, half-planes alone leave room: otherwise they were the reason.
+            # Without neighbours to see, a position exists: otherwise `half_planes` has reported the edges.
             seen = neighbours[
                 smallest_conflict(len(neighbours), lambda some: not some or self._place(neighbours[some], edges))
             ]
@@ -114,9 +114,9 @@ class Sight:
         )
 
     def _apart_first(self, vertices: IntArray) -> IntArray:
-        """Fixed vertices in an order in which each of the first few is far from those before it.
+        """Sort fixed vertices so that each of the first few is far from those before it.
 
-        What they cannot all see is then found out before many small pieces of it are looked at.
+        If they cannot all be seen, the check then fails early, before the area is cut into many small parts.
         """
         near = self._fixture.lattice.near[self._fixture.row[vertices]]
         distance = np.full(len(vertices), np.inf)
@@ -128,7 +128,7 @@ class Sight:
         return np.concatenate([vertices[first], np.delete(vertices, first)])
 
     def _place(self, neighbours: IntArray, edges: IntArray) -> bool:
-        """Whether some point inside sees the neighbours and lies to the left of the edges."""
+        """Return whether a point inside sees the neighbours and lies to the left of the edges."""
         eyes, overlaps = self._least_in_common(self._fixture.row[neighbours].tolist())
         if overlaps is not None and not len(overlaps):
             return False
@@ -138,7 +138,7 @@ class Sight:
         )
 
     def _least_in_common(self, eyes: list[int]) -> tuple[list[int], IntArray | None]:
-        """Eyes in an order in which the first two have little in common, and their wedges that may overlap."""
+        """Return eyes, the first two with few overlapping wedges, and the pairs of their wedges that may overlap."""
         order, least = eyes, None
         for k in range(1, len(eyes)):
             if least is not None and not len(least):
@@ -149,11 +149,14 @@ class Sight:
         return order, least
 
     def _in_view(self, area: Convex, eyes: list[int], overlaps: IntArray | None) -> Iterator[Convex]:
-        """The parts of an area in wedges of all eyes; ``overlaps`` are those of the first two that may overlap."""
+        """Yield the parts of an area in wedges of all eyes.
+
+        ``overlaps`` are the pairs of wedges of the first two eyes that may overlap.
+        """
         if not eyes:
             yield area
             return
-        # One eye within the other, however many there are.
+        # Depth-first search without recursion, one level per eye.
         ways = [self._parts(area, eyes[0], None if overlaps is None else overlaps[:, 0])]
         while ways:
             k, part = next(ways[-1], (-1, None))
@@ -166,7 +169,7 @@ class Sight:
                 ways.append(self._parts(part, eyes[len(ways)], few))
 
     def _parts(self, area: Convex, eye: int, wedges: IntArray | None) -> Iterator[tuple[int, Convex]]:
-        """The parts of an area in the wedges of an eye, or some of them, each with the index of its wedge."""
+        """Return an iterator of the parts of an area in all or some wedges of an eye, with the index of the wedge."""
         view = self._views.wedges(eye)
         if wedges is None:
             return view.parts(area)

@@ -1,9 +1,9 @@
-"""What can be seen past walls from a point, in all directions.
+"""The view from a point past walls, in all directions.
 
-From an eye, every direction ends at a wall, the nearest one. Directions that end at the same wall make
-a wedge between two rays through ends of walls. Which walls cover which directions is decided exactly;
-which of them is nearest by rounded distances. Where that errs the wedge reaches behind a nearer wall, so
-that wedges contain all that is seen, and may contain more.
+From an eye, the view in every direction ends at the nearest wall. Consecutive directions that end at the same wall form
+a wedge, between two rays through ends of walls. The directions that each wall covers are computed exactly, and the
+nearest wall from rounded distances. A rounding error makes a wedge extend behind a nearer wall. So wedges contain all
+visible points, and may contain more.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 SignArray = NDArray[np.int8]
 
-# Views that are kept, for eyes that are looked from again.
+# Number of cached views.
 _MOST_KEPT = 200
 
 
 class Views:
-    """What is seen from points among walls.
+    """The views from points among walls.
 
     Parameters
     ----------
@@ -37,26 +37,26 @@ class Views:
     positions : (k, 2) float64
         The points.
     lattice : Lattice
-        The same.
+        The same points as integers.
     corner : (k, 2) int64
-        For each point that is a corner of the target the next one and the one before, else -1.
+        For each point that is a corner of the target the next corner and the one before, else -1.
     effort : Effort
-        Of which looking, and what is done with the views, takes.
+        Budget for the views and for all work with them.
     """
 
     def __init__(
         self, ends: IntArray, positions: FloatArray, lattice: Lattice, corner: IntArray, effort: Effort
     ) -> None:
         self._ends, self._positions, self._lattice, self._corner = ends, positions, lattice, corner
-        # For what need not be exact: of magnitude one, so that nothing is too large.
+        # For inexact computations: scaled to magnitude one, to avoid overflow.
         self._scaled = np.ldexp(positions, -int(np.frexp(np.abs(positions).max())[1]))
         self._kept: dict[int, Wedges] = {}
         self._effort = effort
 
     def wedges(self, eye: int) -> Wedges:
-        """What is seen from a point, from a corner to the inside only.
+        """Return the wedges visible from a point; from a corner, only those inside the target.
 
-        Walls that end in the point, or lie on a line with it, hide nothing.
+        Walls that end at the point, or lie on a line with it, hide nothing.
         """
         if eye not in self._kept:
             while len(self._kept) >= _MOST_KEPT:
@@ -65,7 +65,7 @@ class Views:
         return self._kept[eye]
 
     def _look(self, eye: int) -> Wedges:
-        """Wedges of an eye; see `wedges`."""
+        """Compute the wedges of an eye; see `wedges`."""
         self._effort.spend(500 + len(self._ends))
         here, where = self._positions[eye], self._positions
         turn = orientation(here, where[self._ends[:, 0]], where[self._ends[:, 1]])
@@ -75,19 +75,19 @@ class Views:
         around, rank = self._sorted(eye, np.unique(np.append(walls, sides[sides >= 0])))
         first, last = rank[walls.T]
         count, owner = len(around), np.arange(len(walls))
-        # A wall that covers the direction in which counting begins is taken as two.
+        # Split a wall that covers the first direction into two.
         over = np.flatnonzero(last < first)
         first, last = np.append(first, np.zeros_like(over)), np.append(np.where(last < first, count, last), last[over])
         owner = np.append(owner, over)[first < last]
         first, last = first[first < last], last[first < last]
         tail, head = self._scaled[walls[owner].T] - self._scaled[eye]
         ray = self._scaled[around] - self._scaled[eye]
-        with np.errstate(invalid="ignore"):  # a direction that is lost in rounding
+        with np.errstate(invalid="ignore"):  # Rounding may make a ray zero.
             ray /= np.hypot(*ray.T)[:, None]
         between = ray + np.roll(ray, -1, axis=0)
         nearest = _nearest(first, last, tail, head - tail, between)
         if sides[0] >= 0:
-            # From the side that follows around to the one before is what is inside.
+            # The inside is counterclockwise from the next side to the side before.
             nearest[(np.arange(count) - rank[sides[0]]) % count >= (rank[sides[1]] - rank[sides[0]]) % count] = -1
         begin = np.flatnonzero(np.append(-2, nearest[:-1]) != nearest) if count else around
         end = np.append(begin[1:], 0)
@@ -97,14 +97,14 @@ class Views:
         )
 
     def _sorted(self, eye: int, points: IntArray) -> tuple[IntArray, IntArray]:
-        """Sort points by direction from the eye, counterclockwise from that of the x axis.
+        """Sort points by direction from the eye, counterclockwise from the x axis.
 
         Returns
         -------
         around : (r,) int64
             One of the points in each direction, in order.
         rank : (k,) int64
-            The place of the direction of a point in this order; of no meaning for other points.
+            Index of a point's direction in this order; undefined for other points.
         """
         here, where = self._positions[eye], self._positions
         low = (where[:, 1] < here[1]) | ((where[:, 1] == here[1]) & (where[:, 0] < here[0]))
@@ -114,14 +114,14 @@ class Views:
         points = points[np.lexsort([angle, low[points]])]
 
         def turns() -> SignArray:
-            """For all but the last: 1 where the next one comes later, 0 where it lies in the same direction."""
+            """Return for all but the last point: 1 if the next one comes later, 0 if it has the same direction."""
             turn = orientation(here, where[points[:-1]], where[points[1:]])
             turn[low[points[:-1]] != low[points[1:]]] = 1
             return turn
 
         turn = turns()
         if np.any(turn < 0):
-            # Directions that differ by a rounding.
+            # Rounding put nearby directions in the wrong order: sort exactly.
             points = np.array(sorted(points.tolist(), key=self._direction(eye, low)), dtype=np.int64)
             turn = turns()
         new = np.append(True, turn > 0)[: len(points)]
@@ -130,7 +130,7 @@ class Views:
         return points[new], rank
 
     def _direction(self, eye: int, low: BoolArray) -> Callable[[int], Any]:
-        """The key by which points are sorted, exact."""
+        """Return the exact sort key of points by direction."""
         points = self._lattice.points
         (x, y), lower = points[eye], low.tolist()
 
@@ -144,25 +144,24 @@ class Views:
 
 
 def _nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArray, ray: FloatArray) -> IntArray:
-    """The nearest wall in each of a circle of directions.
+    """Return the nearest wall in each of a circle of directions.
 
-    Each wall is put where two overlapping runs of 2ᵏ directions cover it. Of the walls on the same run
-    the nearest is the same in all its directions, as they do not cross, and it is handed down from run
-    to half run.
+    Each wall is stored at two overlapping runs of 2ᵏ directions that cover it. Walls do not cross, so the nearest wall
+    of a run is the same in all its directions. It is passed down from each run to its two halves.
 
     Parameters
     ----------
     first, last : (m,) int64
-        Directions that each wall covers, from the first one on up to, not including, the last.
+        Directions that each wall covers, from the first one up to, not including, the last.
     tail, along : (m, 2) float64
-        Where each wall begins, seen from the eye, and what leads from there to its end.
+        Start of each wall relative to the eye, and the vector from its start to its end.
     ray : (r, 2) float64
         The directions.
 
     Returns
     -------
     (r,) int64
-        Index of a wall, -1 where there is none.
+        Index of a wall, -1 if there is none.
     """
     best = np.full(len(ray), -1)
     if not len(first):
@@ -182,7 +181,7 @@ def _nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArra
     level = np.frexp((last - first).astype(np.float64))[1] - 1
     for k in range(int(level.max()), -1, -1):
         if k < level.max():
-            # Each run of the level before is two of this one.
+            # Each run of the previous level consists of two runs of this one.
             whole = np.flatnonzero(best >= 0)
             put(best[whole], whole + (1 << k))
         here = np.flatnonzero(level == k)

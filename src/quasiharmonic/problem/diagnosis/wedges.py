@@ -1,4 +1,4 @@
-"""What is seen from a point, as wedges of directions up to the wall where they end."""
+"""The view from a point as wedges, each bounded by two rays and the wall where the view ends."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Lattice, cr
 from quasiharmonic.problem.diagnosis.effort import Effort
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# Wedges in a row that are compared with others as one first.
+# Number of consecutive wedges that form a row for a first comparison.
 _ROW = 16
-# Pairs of rows that are compared wedge by wedge at most.
+# Limit on the pairs of rows that are compared wedge by wedge.
 _MOST_ROWS = 1024
 
 
 @dataclass(frozen=True, eq=False)
 class Wedges:
-    """Triangles with an eye at their tips, in counterclockwise order; indices are points of a lattice.
+    """Triangles with their tips at an eye, in counterclockwise order; indices are points of a lattice.
 
     Attributes
     ----------
@@ -29,9 +29,9 @@ class Wedges:
     right, left : (c,) int64
         Points on the two rays that bound each wedge.
     wall : (c, 2) int64
-        Ends of the wall on which it stands, from right to left.
+        Ends of the wall that bounds each wedge, from right to left.
     effort : Effort
-        Of which what is done with them takes.
+        Budget for all work with the wedges.
     """
 
     lattice: Lattice
@@ -45,7 +45,7 @@ class Wedges:
         return len(self.right)
 
     def parts(self, area: Convex, only: BoolArray | None = None) -> Iterator[tuple[int, Convex]]:
-        """The parts of an area in the wedges (of those named, if any), each with the index of its wedge."""
+        """Yield the parts of an area in the wedges, or in those of ``only``, with the index of each wedge."""
         self.effort.spend(100 + len(self) // 10)
         reached = self._may_reach(np.arange(len(self)), self.lattice.corners(area)[None])
         points = self.lattice.points
@@ -60,7 +60,7 @@ class Wedges:
                 yield k, part
 
     def overlapping(self, other: Wedges) -> IntArray | None:
-        """Pairs of wedges that may overlap; (m, 2) int64, or None where there are too many to tell."""
+        """Return pairs of wedges that may overlap, (m, 2) int64, or None if there are too many candidates."""
         self.effort.spend(300)
         rows = np.argwhere(self._rows_may_reach(other) & other._rows_may_reach(self).T)
         if len(rows) > _MOST_ROWS:
@@ -76,7 +76,7 @@ class Wedges:
         return np.stack([i, j], axis=1)
 
     def _may_reach(self, which: IntArray, corners: FloatArray) -> BoolArray:
-        """Whether wedges (m,) and polygons (m, r, 2) may overlap: no side of the wedge is between them."""
+        """Return whether wedges (m,) and polygons (m, r, 2) may overlap: no side of the wedge separates them."""
         triangle = self._triangles[which, :, None]
         tip, p, q = triangle[:, 0], triangle[:, 1], triangle[:, 2]
         right, left = self._rays[:, which, None]
@@ -87,27 +87,27 @@ class Wedges:
 
     @cached_property
     def _triangles(self) -> FloatArray:
-        """The triangles of the eye and a wall, which contain the wedges; (c, 3, 2), rounded."""
+        """Triangles of the eye and a wall, which contain the wedges; (c, 3, 2), rounded."""
         corners: FloatArray = self.lattice.near[np.column_stack([np.full(len(self), self.eye), self.wall])]
         return corners
 
     @cached_property
     def _rays(self) -> FloatArray:
-        """Points on the right and the left ray, seen from the eye; (2, c, 2), rounded."""
+        """Points on the right and the left ray, relative to the eye; (2, c, 2), rounded."""
         near = self.lattice.near
         rays: FloatArray = near[np.stack([self.right, self.left])] - near[self.eye]
         return rays
 
     @cached_property
     def _boxes(self) -> FloatArray:
-        """Corners of boxes around rows of wedges; (rows, 4, 2)."""
+        """Corners of bounding boxes of rows of wedges; (rows, 4, 2)."""
         first = np.arange(0, len(self), _ROW)
         low, high = (extreme.reduceat(self._triangles, first) for extreme in (np.minimum, np.maximum))
         (x0, y0), (x1, y1) = low.min(axis=1).T, high.max(axis=1).T
         return np.stack([np.stack(corner, axis=1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1)
 
     def _rows_may_reach(self, other: Wedges) -> BoolArray:
-        """Whether rows of these wedges may overlap with rows of others; (rows, rows) bool."""
+        """Return whether rows of these wedges may overlap with rows of others; (rows, rows) bool."""
         if not len(self) or not len(other):
             return np.zeros((-(-len(self) // _ROW), -(-len(other) // _ROW)), dtype=bool)
         mine, boxes = self._boxes[:, None], other._boxes[None]
@@ -116,7 +116,7 @@ class Wedges:
         last = np.minimum(first + _ROW, len(self)) - 1
         right, left = self._rays[0, first, None, None], self._rays[1, last, None, None]
         from_eye = boxes - self.lattice.near[self.eye]
-        # Rows that span half a circle or more have no sides.
+        # Rows that span half a circle or more are not bounded by two rays.
         wide = cross(right, left)[..., 0] < MARGIN
         reach &= (cross(right, from_eye) > -MARGIN).any(axis=2) | wide
         reach &= (cross(left, from_eye) < MARGIN).any(axis=2) | wide

@@ -1,7 +1,7 @@
-"""Places for free vertices, found by trial and proven exactly, for many vertices at once.
+"""Find positions for many free vertices by trial, and prove them exactly.
 
-Where a vertex has a place it is nearly always an obvious one, and showing that a point is one takes far
-less than showing that there is none.
+If a vertex has a valid position, simple trial positions nearly always include one. Proving a position valid is much
+cheaper than proving that there is none.
 """
 
 from __future__ import annotations
@@ -16,26 +16,25 @@ from quasiharmonic.problem.diagnosis.curves import Corners
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Stars
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# How far from the edges around it a vertex is looked for, as parts of the distance of its neighbours.
+# Distances of trial positions from the edges around a vertex, relative to the distance of its neighbours.
 _MARGINS = 0.1, 0.01, 0.001
-# Steps towards such a place.
+# Number of steps to move a trial position.
 _STEPS = 8
-# Pairs of a segment and a wall near it to be looked at in each trial: so many, and more for each star.
+# Limit on the pairs of a segment and a nearby wall to check in each trial: a constant, and a number per star.
 _PAIRS, _PAIRS_PER_STAR = 1_000_000, 100
 
 
 def unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls: IntArray) -> IntArray:
-    """Stars for which no place was found by trial.
+    """Return stars for which no trial position is valid.
 
     Parameters
     ----------
     stars : Stars
     fixture : Fixture
     corners : Corners or None
-        The target's, where it is simple and properly nested; None where vertices need not see their
-        neighbours.
+        Corners of the target if it is simple and properly nested. None if vertices need not see their neighbours.
     walls : (m, 2) int64
-        Edges that nothing sees through.
+        Edges that block the view.
 
     Returns
     -------
@@ -58,14 +57,14 @@ def unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls: Int
 
 
 def _middles(stars: Stars, fixture: Fixture) -> FloatArray:
-    """The mean of each star's neighbours, (s, 2) float64."""
+    """Return the mean of each star's neighbours, (s, 2) float64."""
     number = np.bincount(stars.of_neighbour, minlength=len(stars))
     share = fixture.positions[stars.neighbours] / number[stars.of_neighbour, None]
     return np.stack([np.bincount(stars.of_neighbour, share[:, c], minlength=len(stars)) for c in (0, 1)], axis=1)
 
 
 def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, margin: float) -> FloatArray:
-    """Places moved to the left of the edges that they are to be left of, one edge after another."""
+    """Return positions moved to the left of the edges that bound them, one edge after another."""
     where = fixture.positions
     of, edge = _sides(stars, fixture, corners)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -86,7 +85,7 @@ def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corner
 
 
 def _middles_of_rooms(stars: Stars, fixture: Fixture, corners: Corners | None) -> FloatArray:
-    """The middle of what lies to the left of the edges that each star is to be left of, NaN where nothing does."""
+    """Return the middle of the area to the left of each star's edges, NaN if it is empty."""
     places = np.full((len(stars), 2), np.nan)
     of, edge = _sides(stars, fixture, corners)
     edge = edge[np.argsort(of, kind="stable")]
@@ -99,11 +98,11 @@ def _middles_of_rooms(stars: Stars, fixture: Fixture, corners: Corners | None) -
 
 
 def _sides(stars: Stars, fixture: Fixture, corners: Corners | None) -> tuple[IntArray, IntArray]:
-    """Edges that stars are to be left of: the index of the star (h,) and the edge (h, 2)."""
+    """Return the edges that stars must be to the left of: the index of the star (h,) and the edge (h, 2)."""
     of, edge = stars.of_opposite, stars.opposite
     if corners is None:
         return of, edge
-    # What a vertex sees from a convex corner is to the left of both edges there.
+    # The points visible from a convex corner are to the left of both its edges.
     known = corners.known[stars.neighbours]
     v, star = stars.neighbours[known], stars.of_neighbour[known]
     convex = ~corners.reflex(v, fixture.positions)
@@ -113,10 +112,10 @@ def _sides(stars: Stars, fixture: Fixture, corners: Corners | None) -> tuple[Int
 
 
 def _suits(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, walls: IntArray) -> BoolArray:
-    """Whether places are ones, decided exactly where True; (s,) bool."""
+    """Return whether positions are valid, exact if True; (s,) bool."""
     where = fixture.positions
     fixed = where[fixture.fixed]
-    # A map without inverted triangles stays within the box around what is fixed. Not so NaN.
+    # A map without inverted triangles stays inside the bounding box of the fixed vertices. NaN fails this test.
     good: BoolArray = np.all((fixed.min(axis=0) < places) & (places < fixed.max(axis=0)), axis=1)
     places = np.where(good[:, None], places, 0.0)
     of, edge = stars.of_opposite, stars.opposite
