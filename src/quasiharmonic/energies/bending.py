@@ -52,7 +52,7 @@ class Pull:
     places : (k, 2) float64
         Target positions.
     weights : (k,) float64
-        ω: cost of a deviation by one length unit, in units of energy density times area.
+        ω: a deviation d costs as much as an energy density ω on an area |d|².
     """
 
     vertices: IntArray

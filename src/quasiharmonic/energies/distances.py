@@ -187,15 +187,15 @@ def surface_distances(
     F : (f, 3) array of int
         Triangles of a surface, consistently oriented.
     rings : int
-        How many edges apart vertices of a pair are at most.
+        Maximum number of edges between the vertices of a pair.
     sources : int
-        Vertices from which distances are taken, drawn at random without repetition; all, if there are no more.
+        Number of source vertices, drawn at random without repetition; all vertices if there are no more.
     targets : int, optional
-        Vertices to which they are taken from each source, drawn at random; by default all within so many rings.
+        Maximum number of targets per source, drawn at random; by default all within the given rings.
     crossings : int
-        How many edges each straight segment of a path may cross; see the module's description.
+        Maximum number of edges that each straight segment of a path may cross; see the module's description.
     seed : int
-        Of what is drawn: the same for the same surface and numbers.
+        Seed of the random draws. The same surface and arguments give the same sample.
 
     Returns
     -------
@@ -205,8 +205,8 @@ def surface_distances(
     Raises
     ------
     ValueError
-        When an array has the wrong shape, an index is out of range, a coordinate is not finite, a triangle has no
-        area, or a number is not a whole number of at least 1 (``crossings`` and ``seed``: 0).
+        When an array has the wrong shape, an index is out of range, a coordinate is not finite, a triangle has no area,
+        or a number is not a whole number of at least 1 (``crossings`` and ``seed``: at least 0).
     """
     V, F = real_array("V", V), index_array("F", F)
     if F.ndim != 2 or F.shape[1] != 3 or not len(F):
@@ -233,17 +233,17 @@ def sampled(
     among: IntArray | None = None,
     lowest: float = 0.0,
 ) -> SurfaceDistances:
-    """Distances as `surface_distances` samples them, its arguments checked.
+    """Sample distances as `surface_distances` does, without checking the arguments.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) float64
     F : (f, 3) int64
     sampling : Sampling
-        How many sources there are to be at most.
+        ``sources`` is the maximum number of sources.
     seed : int
     among : (m,) int64, optional
-        Vertices of which pairs are made, ascending; all that triangles have by default.
+        Vertices from which pairs are formed, ascending; by default all vertices of triangles.
     lowest : float
         Passed to `straight_segments`.
     """
