@@ -111,8 +111,7 @@ def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Piece
 
 
 def _breadth(contour: FloatArray) -> float:
-    """Sum of the areas of the triangles that a contour's sides span with its first point; 0 only for collinear points.
-    """
+    """Sum of the areas of the triangles that the sides span with the first point; 0 only for collinear points."""
     w = as_complex(contour - contour[0])
     return float(np.abs((w.conj() * np.roll(w, -1)).imag).sum()) / 2
 
@@ -279,7 +278,9 @@ _TRANSFORMS: dict[str, tuple[tuple[int, ...], Callable[..., FloatArray]]] = {
 
 
 def _length(attributes: dict[str, str], name: str, default: float = 0.0) -> float:
-    """Return a length in user units; raise ValueError for negative radii or sides and for units without a fixed size.
+    """Return a length in user units.
+
+    Raises ValueError for negative radii or sides, and for units without a fixed size.
     """
     if name not in attributes:
         return default

@@ -1,6 +1,6 @@
 """Parser of SVG path data (the attribute ``d``), which returns Bézier curves.
 
-.. [1] W3C, Scalable Vector Graphics (SVG) 2, chapter 9 and appendix B.2, https://www.w3.org/TR/SVG2/paths.html.
+W3C, Scalable Vector Graphics (SVG) 2, chapter 9 and appendix B.2, https://www.w3.org/TR/SVG2/paths.html.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
     Parameters
     ----------
     d : str
-        Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as defined in [1]_.
+        Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as in SVG 2.
     arcs : bool
         Whether to return arcs as `quasiharmonic.geometry.curves.Arc` instead of Bézier curves.
 
@@ -193,7 +193,7 @@ class _Pen:
         self.count += 1
 
     def _arc(self, rx: float, ry: float, turn: float, large: bool, sweep: bool, end: complex) -> None:
-        """Append an elliptical arc in center parametrization (appendix B.2.4 of [1]_)."""
+        """Append an elliptical arc, converted to its centre and angles (SVG 2, appendix B.2.4)."""
         rx, ry = abs(rx), abs(ry)
         if end == self.here:
             return

@@ -72,7 +72,9 @@ def _scaled(units: IntArray, em: int) -> IntArray:
 
 
 def _pieces(points: IntArray, on: list[int]) -> Pieces:
-    """Split a contour into lines and quadratic curves. Two successive off-curve points imply an on-curve point midway.
+    """Split a contour into lines and quadratic curves.
+
+    Two successive off-curve points imply an on-curve point midway.
     """
     corners = points.tolist()
     if not on[0]:

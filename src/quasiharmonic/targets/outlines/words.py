@@ -115,7 +115,7 @@ def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     """Return the curve of which a united contour is a polyline, made of pieces of the letters' curves."""
     middles = (contour + np.roll(contour, -1, axis=0)) / 2
     by_point, by_middle = (np.stack([one.nearest(points)[1] for one in drawn]) for points in (contour, middles))
-    # A chord belongs to the curve closest to its middle and both its ends. Its ends alone may lie on several curves.
+    # A chord belongs to the curve closest to its middle and both its ends. Other curves may cross it there.
     own = np.argmin(by_point + by_middle + np.roll(by_point, -1, axis=1), axis=0)
     begins = np.flatnonzero(own != np.roll(own, 1))
     if not begins.size:
@@ -143,8 +143,7 @@ def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
 
 
 def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
-    """Intersection of two curves near a point, as arc lengths along each, by Newton's method from the nearest points.
-    """
+    """Intersection of two curves near a point, as arc lengths along each, by Newton's method."""
     s, t = (curve.nearest(near[None])[0] for curve in (one, other))
     ahead = np.ones(1, dtype=bool)
     for _ in range(_STEPS):
