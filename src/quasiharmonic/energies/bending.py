@@ -257,9 +257,7 @@ def bend_map(
 
 
 def _places(part: csr_array, whole: csr_array) -> IntArray:
-    """Indices of the entries of ``part`` among those of ``whole``, whose pattern contains them; rows are sorted in
-    both.
-    """
+    """Indices of the entries of ``part`` in ``whole``, whose pattern contains them; rows are sorted in both."""
     rows = [np.repeat(np.arange(one.shape[0]), np.diff(one.indptr)) for one in (part, whole)]
     keys = [row * whole.shape[1] + one.indices for row, one in zip(rows, (part, whole), strict=True)]
     return np.searchsorted(keys[1], keys[0]).astype(np.int64)

@@ -103,9 +103,7 @@ class Pins:
             raise ValueError(f"{named('vertex', 'vertices', inner)} in corners, but not on the boundary")
 
     def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
-        """Return (position in the loop, parameter along its contour) for each pin of a loop, in order around the
-        contour.
-        """
+        """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""
         wanted = self.wanted.get(loop, {})
         marks, t = self.sharp[contour], arc(self.contours[contour])
         if self.all_corners and wanted and len(wanted) != len(marks):

@@ -177,8 +177,9 @@ class _Pen:
         self.before = kind
 
     def _reflected(self, alike: str) -> complex:
-        """Control point that continues the previous curve smoothly, if that has the same degree; else the current
-        point.
+        """Control point that continues the previous curve smoothly.
+
+        The current point if the previous command is not a curve of the same degree.
         """
         return 2 * self.here - self.control if self.before and self.before in alike else self.here
 
