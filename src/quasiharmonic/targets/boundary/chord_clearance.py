@@ -97,9 +97,7 @@ def reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
 
 
 def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
-    """Numbers of ``others`` strictly between successive values of ``wanted``, and before the first and after the
-    last.
-    """
+    """Numbers of ``others`` before the first, strictly between successive, and after the last of ``wanted``."""
     ends = np.concatenate([[0.0], wanted, [1.0]])
     return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")
 

@@ -258,9 +258,7 @@ def best_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
 
 
 def seen_flat(points: FloatArray, contour: FloatArray) -> FloatArray:
-    """Project a loop to the plane, seen from the side where it has the contour's orientation, y-axis upwards; (n,
-    2).
-    """
+    """Project a loop to the plane from the side where it has the contour's orientation, y-axis upwards; (n, 2)."""
     if points.shape[1] == 2:
         return points
     centred = points - points.mean(axis=0)

@@ -47,9 +47,7 @@ class Placement:
     corner_angle: float
 
     def laid(self, start: int = 0) -> tuple[FloatArray, bool]:
-        """Return positions, and whether chords have space; without pins, ``start`` goes to the contour's first
-        point.
-        """
+        """Return positions and whether chords have space; without pins, ``start`` goes to the contour's first point."""
         pins: Held = self.pins or [(start, 0.0)]
         along = self._along(pins)
         places = at(self.contour, along)
