@@ -47,10 +47,10 @@ class ReweightedDirichlet(SymmetricDirichlet):
         return cls(min(max(mean**0.5, NEAREST), FARTHEST))
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivative of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with constant left singular vectors uᵢ, goals σᵢ* and
-        rotation R.
+        """Second derivative of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with constant uᵢ, σᵢ* and R.
 
-        The form is positive definite, so ``negative`` is ignored.
+        Here uᵢ are the left singular vectors, σᵢ* the goals and R the rotation. The form is positive definite, so
+        ``negative`` is ignored.
         """
         both, mixed, none = np.empty(d.det.size), np.empty_like(d.p), np.zeros_like(d.p)
         rigid_proxies(d.p, d.q, d.det, self.aim, both, mixed)

@@ -25,9 +25,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 
 def rates(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> ComplexArray:
-    """``dp/p`` of every triangle (f,) of a map (n,) along a direction: the growth rate plus ``i`` times the angular
-    velocity.
-    """
+    """``dp/p`` of every triangle (f,) along a direction: the growth rate plus ``i`` times the angular velocity."""
     corners = F.T
     rate: ComplexArray = np.sum(g.conj() * direction[corners], axis=0) / np.sum(g.conj() * w[corners], axis=0)
     return rate

@@ -109,9 +109,7 @@ class SlidingSystem(NewtonSystem):
         self.coupling: FloatArray = np.zeros(0)
 
     def couple(self, pairs: IntArray) -> None:
-        """Set the pairs (e, 2) of sliding vertices, each an edge of the mesh, to which the values of ``coupling``
-        belong.
-        """
+        """Set the pairs (e, 2) of sliding vertices, each an edge of the mesh, to which ``coupling`` belongs."""
         low, high = np.sort(self.at[pairs], axis=1).T
         column = self._indices[self._side_slots[0]] // 2
         size = self.free.size
