@@ -31,9 +31,9 @@ class AskedCorners:
     Attributes
     ----------
     entries : tuple of (int or (x, y, z), int or (x, y) or None), or "auto"
-        Each entry has a vertex, or a position in space that stands for the nearest boundary vertex, and its target, a
-        corner's number or a point of the outline. The target is None, for all entries, if the vertices go to the
-        outline's corners in order.
+        Each entry has a vertex and its target. The vertex may be given by a position in space, which stands for the
+        nearest boundary vertex. The target is a corner's number or a point of the outline. If the vertices go to the
+        outline's corners in order, all targets are None.
     """
 
     entries: tuple[tuple[int | Place, Goal | None], ...] | Literal["auto"]
