@@ -1,15 +1,15 @@
-"""A deformation energy with a second-order term: maps that are smooth where single vertices are pinned.
+"""A deformation energy with a second-order term, whose minimisers are smooth at pinned vertices.
 
-Under an energy of first derivatives alone a pinned vertex is a cusp: a point has no capacity, and the finer the mesh
-the more of the way the triangles next to it take upon themselves. With second derivatives a point can be held: a thin
-plate does not break where a pin lifts it. To the mean energy E of a planar map w on a domain Ω is added, for the
-displacements ``u = w − z`` and a length ℓ::
+Under an energy of first derivatives only, a pinned vertex becomes a cusp, because a point has no capacity. On finer
+meshes more of the displacement concentrates in the triangles next to it. A term of second derivatives, as in a thin
+plate, keeps the displacement smooth at a pin. For a planar map w on a domain Ω with displacements ``u = w − z`` and a
+length ℓ, the term is added to the mean energy E::
 
     E(w)  +  (1/A) [ ℓ² ∫ |Δu|²  +  Σₖ ωₖ |wₖ − yₖ|² ]          A the area of Ω
 
-with ``∫ |Δu|² = Σᵥ |(L u)ᵥ|² / mᵥ`` over the vertices inside, L the cotangent Laplacian and m the vertices' areas.
-Where the boundary of a polygon stays that is the energy of a thin plate, ``∫ |∇²u|²``, with hinges for an edge [1]_.
-Up to lengths of about ℓ the plate decides, beyond them E. The last sum pulls vertices to places, softly.
+Here ``∫ |Δu|² = Σᵥ |(L u)ᵥ|² / mᵥ`` over the interior vertices, with the cotangent Laplacian L and the vertex areas m.
+If the boundary of a polygon is fixed, this is the energy of a hinged thin plate, ``∫ |∇²u|²`` [1]_. The plate term
+dominates up to lengths of about ℓ, E beyond. The last sum softly pulls vertices to target positions.
 
 References
 ----------
@@ -44,14 +44,15 @@ _STEPS, _TOLERANCE = 200, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """Vertices pulled to places.
+    """Vertices that are pulled to target positions.
 
     Attributes
     ----------
     vertices : (k,) int64
     places : (k, 2) float64
+        Target positions.
     weights : (k,) float64
-        ω: what missing by one length costs, in energy spread over one length squared.
+        ω: a deviation d costs as much as an energy density ω on an area |d|².
     """
 
     vertices: IntArray
@@ -60,7 +61,7 @@ class Pull:
 
 
 class Plate:
-    """The second-order term and the pulls, a quadratic function of where vertices are.
+    """The second-order term and the pulls, a quadratic function of the positions.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class Plate:
         Rest positions.
     F : (f, 3) int64
     inside : (m,) int64
-        Vertices at which the second derivatives count.
+        Vertices at which the second derivatives are evaluated.
     length : float
         ℓ.
     pull : Pull
@@ -89,30 +90,30 @@ class Plate:
         self.weight, self.towards = weight, towards.view(np.complex128).ravel()
 
     def matrix(self) -> csr_array:
-        """K (n, n) of the term's ``Re xᴴ K x`` in displacements x."""
+        """Matrix K (n, n) of the quadratic form ``Re xᴴ K x`` in displacements x."""
         n = len(self.weight)
         pulls = dia_array((self.weight[None], [0]), shape=(n, n))
         return csr_array(self.bent + pulls)
 
     def value(self, w: ComplexArray) -> float:
-        """The term for a map (n,) complex128."""
+        """Value of the term for a map (n,) complex128."""
         u, away = w - self.rest, w - self.towards
         return float(np.vdot(u, self.bent @ u).real + np.sum(self.weight * np.abs(away) ** 2))
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
-        """Its derivative, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
+        """Derivative of the term, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
         return 2 * (self.bent @ (w - self.rest) + self.weight * (w - self.towards))
 
 
 class PlateSystem(NewtonSystem):
-    """The matrix of Newton's steps with a constant one added, whose pattern is wider.
+    """Newton system with an added constant matrix, which has a larger sparsity pattern.
 
     Parameters
     ----------
     F, g, n, fixed, linear_solver
         As of `NewtonSystem`.
     constant : (n, n) csr_array
-        Symmetric; for either coordinate.
+        Symmetric; added for each coordinate.
     """
 
     def __init__(
@@ -121,7 +122,7 @@ class PlateSystem(NewtonSystem):
         super().__init__(F, g, n, fixed, linear_solver)
         own = csr_array((np.ones(self._indices.size), self._indices, self._indptr), shape=(2 * self.free.size,) * 2)
         added = triu(kron(constant[self.free][:, self.free], np.eye(2)), format="csr")
-        # Which entries there are is a matter of ones, so that none cancels.
+        # Compute the pattern with ones as values, so that no entries cancel.
         pattern = csr_array(own + csr_array((np.ones(added.nnz), added.indices, added.indptr), shape=added.shape))
         pattern.sort_indices()
         self._own_slots, self._constant = _places(own, pattern), np.zeros(pattern.nnz)
@@ -144,14 +145,14 @@ class PlateSystem(NewtonSystem):
 
 
 class BendingDescent(NewtonDescent):
-    """The descent of `NewtonDescent`, with a plate.
+    """`NewtonDescent` with an added `Plate` term.
 
     Parameters
     ----------
     energy, uv, fixed, exponent, linear_solver
         As of `NewtonDescent`.
     plate : Plate
-        For positions as they are, not in units.
+        Defined for positions in their original unit.
     """
 
     def __init__(
@@ -172,12 +173,12 @@ class BendingDescent(NewtonDescent):
         return PlateSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver, constant)
 
     def gradient(self) -> ComplexArray:
-        """That of the energy, and of the plate."""
+        """Gradient of the energy plus the plate term."""
         bent = self._unit * self.plate.gradient(self._unit * self.w)
         return super().gradient() + bent[self.system.free]
 
     def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """As `NewtonDescent.evaluate_trial`, of the energy with the plate."""
+        """Like `NewtonDescent.evaluate_trial`, for the energy plus the plate term."""
         deformation = self.energy.deform(w)
         value = self.energy.value_of(deformation) + self.plate.value(self._unit * w)
         accepted = value < bound and is_injective(self.energy.F, self.positions(w))
@@ -194,26 +195,26 @@ def bend_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
-    """Lower the energy with its second-order term; stages and history of the result are continued.
+    """Lower the energy with its second-order term, appending to the stages and history of a result.
 
     Parameters
     ----------
     domain : Domain
-        Planar; its fixed vertices stay.
+        Planar, with its fixed vertices.
     result : MapResult
-        An injective map of it.
+        An injective map of the domain.
     energy : str or Energy
-        As of `quasiharmonic.polish`.
+        As in `quasiharmonic.polish`.
     length : float
         ℓ, in the unit of the domain.
     pull : Pull
     linear_solver, callback
-        As of `quasiharmonic.polish`.
+        As in `quasiharmonic.polish`.
 
     Returns
     -------
     MapResult
-        With a status as of a polish; certified.
+        Certified, with a status as returned by `polish`.
     """
     began = time.perf_counter()
     inside = np.ones(domain.n, dtype=bool)
@@ -221,7 +222,7 @@ def bend_map(
     plate = Plate(domain.V, domain.F, np.flatnonzero(inside), length, pull)
     history = [*result.history]
     status = Status.STILL_FALLING
-    # As in a polish: a step to infinity or NaN is never accepted.
+    # As in `polish`, steps to inf or NaN are never accepted.
     with np.errstate(all="ignore"):
         deformation, exponent = at_own_scale(domain, result.uv, energy_named(energy))
         descent = BendingDescent(deformation, result.uv, domain.fixed, exponent, linear_solver, plate)
@@ -256,7 +257,7 @@ def bend_map(
 
 
 def _places(part: csr_array, whole: csr_array) -> IntArray:
-    """Where the entries of a matrix are among those of one whose pattern has them; rows sorted in both."""
+    """Indices of the entries of ``part`` in ``whole``, whose pattern contains them; rows are sorted in both."""
     rows = [np.repeat(np.arange(one.shape[0]), np.diff(one.indptr)) for one in (part, whole)]
     keys = [row * whole.shape[1] + one.indices for row, one in zip(rows, (part, whole), strict=True)]
     return np.searchsorted(keys[1], keys[0]).astype(np.int64)

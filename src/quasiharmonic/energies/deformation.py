@@ -1,7 +1,7 @@
 """A deformation energy integrated over a surface, as a function of the map (§11).
 
-The mean density, weighted by area (and by triangle, if asked), with the map brought to the surface's
-scale:  ``E(w) = Σⱼ cⱼ mⱼ φ(pⱼ, qⱼ) / Σⱼ mⱼ``.
+The value is the mean density, weighted by area and optionally by triangle, after scaling the map to the surface's area:
+``E(w) = Σⱼ cⱼ mⱼ φ(pⱼ, qⱼ) / Σⱼ mⱼ``.
 """
 
 from __future__ import annotations
@@ -16,36 +16,35 @@ from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_range, named, own_triangles, real_array
 from quasiharmonic.util.kernels import compiled
 
-# Singular values between this and its inverse are out of the reach of overflow, in whatever an energy makes of them.
+# For singular values between this and its inverse, no energy should overflow.
 _ORDINARY = 1e20
 
 
 class DeformationEnergy:
-    """An energy on a mesh.
+    """A deformation energy on a mesh.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array
-        Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles
-        are counterclockwise: the rest shapes have no sign.
+        Rest positions. The rest shapes have no sign: a planar mesh is treated as a surface seen from the side on which
+        its triangles are counterclockwise.
     F : (f, 3) array of int
         Triangles.
     energy : Energy
     area : float, optional
-        Area of the maps to come, which scales them to the surface's area as the paper does: p and q are
-        multiplied by ``√(Σ m / area)``. It does not change while the boundary is fixed. By default maps
-        are measured as they are.
+        Area of the maps to be measured. p and q are multiplied by ``√(Σ m / area)``, which scales maps to the surface's
+        area as in the paper. The area is constant while the boundary is fixed. By default maps are not scaled.
     weights : (f,) array, optional
-        A factor for each triangle's energy, not negative; 1 by default.
+        Nonnegative factor for each triangle's energy; 1 by default.
     rest_F : (f, 3) array of int, optional
-        Rows of ``V`` between which each triangle lies at rest, where it is not those of ``F``: rest triangles
-        need not fit together.
+        Rows of ``V`` that give the rest position of each triangle; by default ``F``. Rest triangles need not fit
+        together.
 
     Raises
     ------
     ValueError
-        When rest triangles have no area, which leaves their distortion undefined; when weights have the
-        wrong shape or are negative or not finite; when ``area`` is not positive.
+        When a rest triangle has no area, so that its distortion is undefined; when weights have the wrong shape or are
+        negative or not finite; when ``area`` is not positive.
 
     Attributes
     ----------
@@ -86,10 +85,11 @@ class DeformationEnergy:
         self._det_per_area = scale**2 / shapes.m
 
     def deform(self, w: ComplexArray) -> Deformation:
-        """The Jacobian of a map ``w = u + i v`` (n,) complex128 on every triangle.
+        """Jacobian of a map ``w = u + i v`` (n,) complex128 on every triangle.
 
-        Determinants come from the images' areas. An area too small to be told from its own rounding is
-        taken to be that rounding: it is positive if the map has been certified, and the energy huge.
+        Determinants are computed from the areas of the images. If an area is not larger than its rounding error, it is
+        replaced by that error. The determinant is then positive and a barrier energy is huge; the caller must certify
+        the map.
         """
         self._check_places(w.size)
         f = len(self.F)
@@ -98,22 +98,22 @@ class DeformationEnergy:
         return Deformation(p, q, det)
 
     def value(self, w: ComplexArray) -> float:
-        """The mean energy of a map; ``inf`` where the energy is a barrier and a triangle is inverted."""
+        """Mean energy of a map; ``inf`` where the energy is a barrier and a triangle is inverted."""
         return self.value_of(self.deform(w))
 
     def value_of(self, d: Deformation) -> float:
-        """The mean energy of a deformation at hand."""
+        """Mean energy of a given deformation."""
         mixture = mixture_of(self.energy, "density")
         if mixture is None:
             return float(np.sum(self.share * self.energy.density(d)))
         return mixed_energy(mixture, d.p, d.q, d.det, self.share)
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
-        """Its derivative by the positions, ``∂E/∂u + i ∂E/∂v`` at every vertex; (n,) complex128."""
+        """Derivative with respect to the positions, ``∂E/∂u + i ∂E/∂v`` at every vertex; (n,) complex128."""
         return self.gradient_of(self.deform(w), w.size)
 
     def gradient_of(self, d: Deformation, n: int) -> ComplexArray:
-        """The derivative by ``n`` positions for a deformation at hand."""
+        """Derivative with respect to ``n`` positions, for a given deformation."""
         mixture = mixture_of(self.energy, "density_gradient", "gradient")
         if mixture is None:
             slopes = (np.broadcast_to(by, d.p.shape) for by in self.energy.gradient(d))
@@ -133,7 +133,7 @@ class DeformationEnergy:
         ----------
         d : Deformation
         negative : float
-            What negative eigenvalues are multiplied by; see `Energy.curvature`.
+            Factor for negative eigenvalues; see `Energy.curvature`.
         """
         mixture = mixture_of(self.energy, "density_gradient", "density_hessian", "curvature")
         if mixture is None:
@@ -141,12 +141,12 @@ class DeformationEnergy:
         return curvature_of_mixture(mixture, d, self.share, negative)
 
     def check_numbers(self, d: Deformation) -> None:
-        """Raise a ValueError if the energy or its derivatives are NaN where no overflow can be the reason.
+        """Raise a ValueError if the energy or a derivative is NaN on triangles where overflow cannot be the cause.
 
         Raises
         ------
         ValueError
-            Which of them, and at which triangles.
+            The message names the quantity and the triangles.
         """
         larger = np.abs(d.p) + np.abs(d.q)
         ordinary = (larger < _ORDINARY) & (d.det > larger / _ORDINARY)
@@ -171,16 +171,16 @@ class DeformationEnergy:
                 )
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
-        """How far along a direction each triangle's area first vanishes.
+        """Smallest positive step along a direction at which each triangle's area vanishes.
 
-        The area of ``w + t · direction`` is a quadratic in t; its first positive zero is taken from
-        whichever form of the formula adds numbers of one sign.
+        The area of ``w + t · direction`` is a quadratic in t. Its first positive root is computed with the form of the
+        quadratic formula that avoids cancellation.
 
         Returns
         -------
         (f,) float64
-            Positive; ``inf`` where it never does, and where the area of ``w`` itself is lost in rounding, so
-            that only the exact test can say.
+            Positive. ``inf`` where the area never vanishes, and where the computed area of ``w`` is not positive
+            because of rounding. In the latter case only the exact test detects an inversion.
         """
         self._check_places(min(w.size, direction.size))
         first = np.empty(len(self.F))
@@ -188,7 +188,7 @@ class DeformationEnergy:
         return first
 
     def _check_places(self, n: int) -> None:
-        """Raise a ValueError unless there are places for all vertices of the triangles."""
+        """Raise a ValueError unless ``n`` positions cover all vertices of the triangles."""
         if n < self._least_places:
             raise ValueError(f"the triangles refer to vertex {self._least_places - 1}, but there are only {n} places")
 
@@ -203,7 +203,7 @@ def jacobians(
     q: ComplexArray,
     det: FloatArray,
 ) -> None:
-    """Fill in what `DeformationEnergy.deform` says of a map (n,)."""
+    """Fill ``p``, ``q`` and ``det`` for a map ``w`` (n,); see `DeformationEnergy.deform`."""
     for part in blocks(len(F)):
         d1, d2 = _edges(F[part].T, w)
         left, right = d1.real * d2.imag, d1.imag * d2.real
@@ -219,7 +219,10 @@ def jacobians(
 def pulls(
     by_p: ComplexArray, by_q: ComplexArray, share: FloatArray, F: IntArray, g: ComplexArray, gradient: ComplexArray
 ) -> None:
-    """Fill in derivatives by the positions (n,) of a sum whose terms have these derivatives by p and q, times share."""
+    """Fill ``gradient`` (n,) with the derivative by the positions of a sum over triangles.
+
+    The terms have the derivatives ``by_p`` and ``by_q``, multiplied by ``share``.
+    """
     x, y = np.empty((2, *g.shape))
     for part in blocks(len(F)):
         along_p, along_q, here = share[part] * by_p[part], share[part] * by_q[part], g[:, part]
@@ -231,7 +234,7 @@ def pulls(
 
 @compiled
 def collapses(w: ComplexArray, direction: ComplexArray, F: IntArray, first: FloatArray) -> None:
-    """Fill in what `DeformationEnergy.steps_to_collapse` says, (f,)."""
+    """Fill ``first`` (f,) with the steps of `DeformationEnergy.steps_to_collapse`."""
     for part in blocks(len(F)):
         corners = F[part].T
         d1, d2 = _edges(corners, w)
@@ -250,7 +253,7 @@ def collapses(w: ComplexArray, direction: ComplexArray, F: IntArray, first: Floa
 
 
 def signed_areas(F: NDArray[np.integer], w: ComplexArray) -> FloatArray:
-    """Signed areas of the images of triangles (f, 3) under a map (n,) complex128; (f,) float64."""
+    """Signed areas (f,) float64 of the images of triangles (f, 3) under a map (n,) complex128."""
     d1, d2 = _edges(F.T, w)
     return 0.5 * (d1.real * d2.imag - d1.imag * d2.real)
 
@@ -271,12 +274,12 @@ def _weights(weights: ArrayLike, f: int) -> FloatArray:
 
 
 def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
-    """Weights of ``f`` triangles, each positive, as (f,) float64; a copy.
+    """Return positive weights of ``f`` triangles as a new (f,) float64 array.
 
     Raises
     ------
     ValueError
-        When they are not; names the first triangles.
+        When the shape is wrong or a weight is not positive; the message lists the first triangles.
     """
     array = real_array("weights", weights)
     if array.shape != (f,):

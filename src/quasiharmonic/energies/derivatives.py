@@ -1,8 +1,8 @@
-"""Do a function and its derivative belong together? For everybody who writes an energy of their own.
+"""Derivative checks for functions and energies, for authors of user-defined energies.
 
-A derivative is compared with central differences over a range of step widths. Too wide, and the function's
-curvature shows; too narrow, and rounding does: in between lies a width that leaves about eight correct digits
-if the derivative is right, and hardly one if it is not.
+A derivative is compared with central differences over a range of step widths. Wide steps show the function's higher
+derivatives; narrow steps show rounding errors. At the best width a correct derivative agrees to about eight digits, a
+wrong one to hardly one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from quasiharmonic.util.arrays import ComplexArray
 
 Array = NDArray[np.inexact]
 
-# Step widths, relative to the size of what is varied.
+# Step widths, relative to the size of ``x``.
 _WIDTHS = 10.0 ** np.arange(-2, -9, -1)
 
 
@@ -30,22 +30,21 @@ def derivative_error(
     Parameters
     ----------
     function : callable
-        From arrays like ``x`` to a number or an array.
+        Takes an array like ``x`` and returns a number or an array.
     derivative : callable
-        From ``x`` and a direction like it to the change of the function along it, to first order: for a
-        gradient ``g`` of a real function ``lambda x, d: np.sum(g(x) * d)``, or
-        ``np.sum(np.conj(g(x)) * d).real`` where complex numbers stand for pairs of reals.
+        Takes ``x`` and a direction like ``x`` and returns the directional derivative of the function. For a gradient
+        ``g`` of a real function: ``lambda x, d: np.sum(g(x) * d)``. If complex numbers stand for pairs of reals:
+        ``np.sum(np.conj(g(x)) * d).real``.
     x : array, real or complex
-        Where.
+        Point of evaluation.
     seed : int
-        Of the directions.
+        Seed of the random directions.
 
     Returns
     -------
     float
-        The largest difference, relative to the largest change, at the best of several step widths; the
-        worst of three directions. Below 1e-6 for a derivative that is right and a function that is smooth
-        there.
+        The largest difference relative to the largest derivative, at the best step width, for the worst of three
+        directions. Below 1e-6 for a correct derivative of a function that is smooth at ``x``.
 
     Examples
     --------
@@ -75,18 +74,18 @@ def derivative_error(
 
 @dataclass(frozen=True)
 class EnergyCheck:
-    """What `check_energy` found.
+    """Result of `check_energy`.
 
     Attributes
     ----------
     gradient : float
         Relative error of the gradient against differences of the density.
     curvature : float
-        Relative error of the curvature (as it is, ``negative=1``) against differences of the gradient; NaN for
-        an energy without.
+        Relative error of the curvature (with ``negative=1``) against differences of the gradient; NaN for an energy
+        without curvature.
     indefinite : float
-        The most negative eigenvalue of the clamped curvature, relative to the largest: 0 up to rounding if
-        it is semidefinite, as Newton's method needs it. NaN for an energy without curvature.
+        The most negative eigenvalue of the clamped curvature, relative to the largest. Newton's method needs a
+        semidefinite form, which gives 0 up to rounding. NaN for an energy without curvature.
     """
 
     gradient: float
@@ -95,19 +94,19 @@ class EnergyCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether everything that the energy has is right."""
+        """Whether all derivatives that the energy has are correct."""
         return self.gradient < 1e-6 and not (self.curvature >= 1e-6 or self.indefinite >= 1e-12)
 
 
 def check_energy(energy: Energy, d: Deformation | None = None) -> EnergyCheck:
-    """Check an energy's derivatives against differences, and its clamped curvature for being semidefinite.
+    """Compare an energy's derivatives with differences, and check that its clamped curvature is semidefinite.
 
     Parameters
     ----------
     energy : Energy
     d : Deformation, optional
-        Where. By default 100 triangles, turned, stretched and sheared at random and none of them inverted; an
-        energy that is tied to a mesh needs one with as many triangles as the mesh.
+        Jacobians for the check. By default 100 triangles, rotated, stretched and sheared at random, without inversions.
+        An energy tied to a mesh needs as many triangles as the mesh has.
 
     Returns
     -------
@@ -145,14 +144,14 @@ def check_energy(energy: Energy, d: Deformation | None = None) -> EnergyCheck:
 
 
 def random_deformation(f: int, seed: int = 0) -> Deformation:
-    """Draw Jacobians with positive determinants, singular values around 1.
+    """Draw random Jacobians with positive determinants and singular values around 1.
 
     Parameters
     ----------
     f : int
-        How many triangles.
+        Number of triangles.
     seed : int
-        The same seed, the same Jacobians.
+        Seed of the random generator.
 
     Returns
     -------

@@ -1,19 +1,19 @@
-"""Distances along a surface, a sample of them, and how well a flat map keeps them.
+"""Sampled distances along a surface, and the error with which a flat map reproduces them.
 
-This is how brain mapping judges flat maps: not triangle by triangle, but by distances between vertices up to some rings
-apart, along the surface and straight in the plane. *Rings* count edges: two vertices are k rings apart if the shortest
-way along edges has k of them. What is measured here, all of which belongs beside any figure:
+Brain mapping evaluates flat maps in this way. It compares distances along the surface with straight distances in the
+plane, for vertices up to some number of rings apart. *Rings* count edges: two vertices are k rings apart if the
+shortest path along edges has k edges. A reported figure should state the following choices:
 
-- *Pairs*: sources drawn at random among the vertices, and for each all vertices at most so many rings away, or so many
-  of these, drawn at random. All pairs count alike; so do all vertices, whatever their area. Errors gather in places:
-  on a cortex of 9,465 vertices a thousand sources leave the mean uncertain by 0.3 % of the distances. To compare maps
-  that does not matter, as long as it is the same sample; for a figure to be quoted take all vertices as sources.
-- *Along the surface*: the shortest chain of straight segments that cross at most so many edges each
-  (`quasiharmonic.geometry.mesh.geodesics`), on the surface as it has been cut: no way leads across a cut. Never too
-  short, and with 5 crossings 0.2 % too long on average on a folded surface, with 3 crossings 0.6 %.
-- *In the plane*: straight, whatever lies between.
-- *Scale*: the map as a whole is scaled by the factor for which the mean error is least.
-- *Error*: of each pair ``|scale · d_plane / d_surface − 1|``.
+- *Pairs*: sources are drawn at random among the vertices. Each is paired with all vertices within the given rings, or
+  with a random sample of these. All pairs have the same weight, whatever the area of their vertices. Errors cluster: on
+  a cortex of 9,465 vertices, a thousand sources leave an uncertainty of the mean of 0.3 % of the distances. To compare
+  maps, use the same sample for each. For a figure to be published, use all vertices as sources.
+- *Along the surface*: the length of the shortest chain of straight segments that each cross a bounded number of edges
+  (`quasiharmonic.geometry.mesh.geodesics`). Chains do not cross cuts. They are never too short. On a folded surface
+  they are 0.2 % too long on average with 5 crossings, and 0.6 % with 3.
+- *In the plane*: the straight distance, whether or not the segment stays inside the map.
+- *Scale*: the whole map is scaled by the factor that minimises the mean error.
+- *Error*: ``|scale · d_plane / d_surface − 1|`` for each pair.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import heartbeat
 
-# The farthest vertices are looked for up to so many mean edges for each ring.
+# Search radius in mean edge lengths per ring.
 _REACH = 1.3
-# Cells of the curve that visits sources: 2^BITS along the longest side of their bounding box.
+# Cells of the space-filling curve that orders the sources: 2^BITS along the longest side of their bounding box.
 _BITS = 10
-# Pairs of which some are drawn at a time, about.
+# Approximate number of pairs that `_some_of_each` processes at a time.
 _AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How distances were sampled; belongs beside any figure made of them.
+    """Parameters of a distance sample; report them with every figure.
 
     Attributes
     ----------
     rings : int
-        How many edges apart vertices of a pair are at most.
+        Maximum number of edges between the vertices of a pair.
     sources : int
-        Vertices from which distances were taken.
+        Number of source vertices.
     targets : int or None
-        To how many others, drawn at random, at most from each; None for all within so many rings.
+        Maximum number of randomly drawn targets per source; None for all within the given rings.
     crossings : int
-        How many edges each straight segment of a path along the surface may cross.
+        Maximum number of edges that each straight segment of a path along the surface may cross.
     """
 
     rings: int
@@ -68,7 +68,7 @@ class Sampling:
     crossings: int
 
     def summary(self) -> str:
-        """In words."""
+        """Return the parameters as a sentence."""
         others = "all others" if self.targets is None else f"at most {self.targets} others"
         return (
             f"pairs of {self.sources} vertices with {others} at most {self.rings} edges away; along the surface, by "
@@ -78,16 +78,16 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class DistanceError:
-    """How far the distances of a map are off; made by `SurfaceDistances.error`, and by `quasiharmonic.distortion`.
+    """Errors of a map's distances, as `SurfaceDistances.error` and `quasiharmonic.distortion` return them.
 
     Attributes
     ----------
     scale : float
-        What the map was multiplied by: the factor for which `mean` is least.
+        Factor applied to the map; it minimises `mean`.
     relative : (k,) float64
-        ``scale · d_plane / d_surface − 1`` of every pair: positive where the map has it longer.
+        ``scale · d_plane / d_surface − 1`` of every pair: positive where the map lengthens the distance.
     sampling : Sampling
-        Which pairs they are, and how their distances were taken.
+        Parameters of the sample.
     """
 
     scale: float
@@ -96,21 +96,21 @@ class DistanceError:
 
     @property
     def mean(self) -> float:
-        """Of the absolute values; 0.15 when distances are 15 % off on average."""
+        """Mean absolute relative error; 0.15 if distances are 15 % off on average."""
         return float(np.abs(self.relative).mean())
 
     @property
     def median(self) -> float:
-        """Of the absolute values."""
+        """Median absolute relative error."""
         return float(np.median(np.abs(self.relative)))
 
     @property
     def rms(self) -> float:
-        """Root of the mean square, which minds large errors more."""
+        """Root-mean-square relative error, more sensitive to large errors than the mean."""
         return float(np.sqrt(np.mean(self.relative**2)))
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures, and all that belongs beside them, for JSON."""
+        """Return the errors and the parameters of the sample for JSON."""
         return {
             "mean": self.mean,
             "median": self.median,
@@ -122,7 +122,7 @@ class DistanceError:
         }
 
     def summary(self) -> str:
-        """In a sentence."""
+        """Return the errors as a sentence."""
         return (
             f"distances off by {100 * self.mean:.3g} % on average (root mean square {100 * self.rms:.3g} %), the map "
             f"scaled by {self.scale:.4g}; {self.sampling.summary()}"
@@ -131,14 +131,14 @@ class DistanceError:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDistances:
-    """Distances along a surface between some pairs of its vertices; made by `surface_distances`.
+    """Distances along a surface between pairs of its vertices, as `surface_distances` returns them.
 
     Attributes
     ----------
     source, target : (k,) int64
         Vertices; sources ascending.
     length : (k,) float64
-        Along the surface, positive.
+        Distances along the surface, positive.
     sampling : Sampling
     """
 
@@ -148,7 +148,7 @@ class SurfaceDistances:
     sampling: Sampling
 
     def error(self, uv: ArrayLike) -> DistanceError:
-        """Compare with distances in the plane.
+        """Compare the distances with those in the plane.
 
         Parameters
         ----------
@@ -187,15 +187,15 @@ def surface_distances(
     F : (f, 3) array of int
         Triangles of a surface, consistently oriented.
     rings : int
-        How many edges apart vertices of a pair are at most.
+        Maximum number of edges between the vertices of a pair.
     sources : int
-        Vertices from which distances are taken, drawn at random without repetition; all, if there are no more.
+        Number of source vertices, drawn at random without repetition; all vertices if there are no more.
     targets : int, optional
-        Vertices to which they are taken from each source, drawn at random; by default all within so many rings.
+        Maximum number of targets per source, drawn at random; by default all within the given rings.
     crossings : int
-        How many edges each straight segment of a path may cross; see the module's description.
+        Maximum number of edges that each straight segment of a path may cross; see the module's description.
     seed : int
-        Of what is drawn: the same for the same surface and numbers.
+        Seed of the random draws. The same surface and arguments give the same sample.
 
     Returns
     -------
@@ -205,8 +205,8 @@ def surface_distances(
     Raises
     ------
     ValueError
-        When an array has the wrong shape, an index is out of range, a coordinate is not finite, a triangle has no
-        area, or a number is not a whole number of at least 1 (``crossings`` and ``seed``: 0).
+        When an array has the wrong shape, an index is out of range, a coordinate is not finite, a triangle has no area,
+        or a number is not a whole number of at least 1 (``crossings`` and ``seed``: at least 0).
     """
     V, F = real_array("V", V), index_array("F", F)
     if F.ndim != 2 or F.shape[1] != 3 or not len(F):
@@ -233,19 +233,19 @@ def sampled(
     among: IntArray | None = None,
     lowest: float = 0.0,
 ) -> SurfaceDistances:
-    """Distances as `surface_distances` samples them, its arguments checked.
+    """Sample distances as `surface_distances` does, without checking the arguments.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) float64
     F : (f, 3) int64
     sampling : Sampling
-        How many sources there are to be at most.
+        ``sources`` is the maximum number of sources.
     seed : int
     among : (m,) int64, optional
-        Vertices of which pairs are made, ascending; all that triangles have by default.
+        Vertices from which pairs are formed, ascending; by default all vertices of triangles.
     lowest : float
-        As `straight_segments` has it.
+        Passed to `straight_segments`.
     """
     dice = np.random.default_rng(seed)
     used = np.unique(F) if among is None else among
@@ -267,7 +267,7 @@ def sampled(
 
 
 def _along_curve(points: FloatArray) -> IntArray:
-    """An order of points (n, d) in which those next to each other are near each other: Morton's curve."""
+    """Order of points (n, d) along Morton's curve, so that consecutive points are close to each other."""
     low = points.min(axis=0)
     size = float((points.max(axis=0) - low).max())
     cell = ((points - low) / (size if size > 0 else 1.0) * ((1 << _BITS) - 1)).astype(np.int64)
@@ -279,7 +279,7 @@ def _along_curve(points: FloatArray) -> IntArray:
 
 
 def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArray:
-    """Which of the entries to keep such that at most so many are left of each row; ``row`` is ascending."""
+    """Indices of at most ``most`` random entries of each row; ``row`` is ascending."""
     key = row + dice.random(row.size)
     kept = []
     begin = 0
@@ -295,8 +295,8 @@ def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArr
 
 
 def _best_scale(ratio: FloatArray) -> float:
-    """The factor s for which the mean of ``|s · ratio − 1|`` is least; 1 where all ratios are 0."""
-    # Its slope changes by the ratio where a term vanishes, at 1/ratio: a median of these, weighted by the ratios.
+    """The factor s that minimises the mean of ``|s · ratio − 1|``; 1 if all ratios are 0."""
+    # The derivative jumps by the ratio at s = 1/ratio. So s is a median of these, weighted by the ratios.
     falling = np.sort(ratio)[::-1]
     weight = np.cumsum(falling)
     return float(1 / falling[np.searchsorted(weight, 0.5 * weight[-1])]) if weight[-1] > 0 else 1.0

@@ -1,10 +1,10 @@
 """Deformation energies of a map, per triangle (§11): density, gradient, projected second derivatives.
 
-On a triangle a map is affine and ``w = p z + q z̄ + const`` in complex numbers, with the Wirtinger
-derivatives p and q. Its singular values are ``σ₁ = |p| + |q|`` and ``σ₂ = |p| − |q|``, the second one
-negative where the triangle is inverted, and ``det J = |p|² − |q|²``. An *isotropic* energy, one that
-does not change when triangle or image are turned, is a function ``φ(a, b)`` of ``a = |p|²`` and
-``b = |q|²``, and in (p, q) its second derivative falls apart by itself::
+On a triangle a map is affine: ``w = p z + q z̄ + const`` in complex numbers, with the Wirtinger derivatives p and q.
+Its singular values are ``σ₁ = |p| + |q|`` and ``σ₂ = |p| − |q|``. On an inverted triangle σ₂ is negative. The
+determinant is ``det J = |p|² − |q|²``. An *isotropic* energy does not change when the triangle or its image is rotated.
+It is a function ``φ(a, b)`` of ``a = |p|²`` and ``b = |q|²``. In (p, q) its second derivative decouples into two
+scalars and one 2×2 matrix::
 
     across p (turning it)      2 φ_a
     across q (turning it)      2 φ_b                                               ┐ four numbers, no
@@ -22,11 +22,11 @@ energy                in singular values   φ, with D = det J = a − b     pape
 `MassSpring`          lengths of sides     in `springs`                  E₃, §11.1.3
 ====================  ===================  ============================  ===========
 
-All are zero at isometries (MIPS at similarities) and nowhere negative. All but MIPS compare lengths, so
-the map must be brought to the surface's scale first; `DeformationEnergy` does that.
+All energies are nonnegative and vanish at isometries; MIPS also vanishes at similarities. All but MIPS compare lengths
+or areas, so the map must first be scaled to the surface's area. `DeformationEnergy` does this.
 
-To add an energy, derive from `Isotropic` (three short functions of a and b) or from `Energy`, and let
-`quasiharmonic.energies.derivatives.check_energy` look at it.
+To add an energy, derive from `Isotropic` (three short functions of a and b) or from `Energy`. Verify its derivatives
+with `quasiharmonic.energies.derivatives.check_energy`.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 @dataclass(frozen=True)
 class Deformation:
-    """The Jacobian of a map on every triangle, as energies read it.
+    """The Jacobian of a map on every triangle, the input of the energies.
 
     Attributes
     ----------
     p, q : (f,) complex128
         ``∂w/∂z`` and ``∂w/∂z̄``.
     det : (f,) float64
-        ``|p|² − |q|²``, as accurate as the caller knows it: for thin triangles the area of the image over
-        the triangle's own has digits that the difference of squares has lost.
+        ``|p|² − |q|²``, as accurately as the caller can compute it. On thin triangles, image area over rest area keeps
+        digits that the difference of squares loses.
     """
 
     p: ComplexArray
@@ -59,7 +59,7 @@ class Deformation:
 
     @classmethod
     def of(cls, p: ComplexArray, q: ComplexArray) -> Deformation:
-        """From the derivatives alone."""
+        """Deformation with determinants computed from p and q."""
         return cls(p, q, (np.abs(p) - np.abs(q)) * (np.abs(p) + np.abs(q)))
 
     @cached_property
@@ -75,7 +75,7 @@ class Deformation:
 
 @dataclass(frozen=True)
 class QuadraticForm:
-    """A quadratic form in (dp, dq) on every triangle, in the ten numbers that one has on ℝ⁴.
+    """A quadratic form in (dp, dq) on every triangle, stored as the ten coefficients of a form on ℝ⁴.
 
     ::
 
@@ -95,13 +95,13 @@ class QuadraticForm:
     pqc: ComplexArray
 
     def apply(self, dp: ComplexArray, dq: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """The form's matrix times (dp, dq), real and imaginary parts as two reals each."""
+        """Return the form's matrix times (dp, dq), where a complex number stands for a pair of reals."""
         along_p = self.pp * dp + np.conj(self.p2 * dp) + 0.5 * (np.conj(self.pq * dq) + np.conj(self.pqc) * dq)
         along_q = self.qq * dq + np.conj(self.q2 * dq) + 0.5 * (np.conj(self.pq * dp) + self.pqc * dp)
         return along_p, along_q
 
     def scaled(self, factor: FloatArray) -> QuadraticForm:
-        """The form times a number on every triangle, (f,) float64."""
+        """Return the form multiplied by one factor per triangle, (f,) float64."""
         return QuadraticForm(
             factor * self.pp,
             factor * self.qq,
@@ -112,7 +112,7 @@ class QuadraticForm:
         )
 
     def matrices(self) -> FloatArray:
-        """The symmetric matrices (f, 4, 4) float64 by Re p, Im p, Re q, Im q."""
+        """Symmetric matrices (f, 4, 4) float64 in the coordinates Re p, Im p, Re q, Im q."""
         columns = []
         for dp, dq in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
             along_p, along_q = self.apply(np.full(self.p2.shape, dp + 0j), np.full(self.p2.shape, dq + 0j))
@@ -126,15 +126,15 @@ class Energy(ABC):
     Attributes
     ----------
     barrier : bool
-        Whether it grows beyond all bounds as a triangle collapses. Such energies are infinite, and have no
-        derivatives, where ``det J ≤ 0``; the others are finite for inverted triangles too.
+        Whether the energy tends to infinity as a triangle collapses. Barrier energies are infinite and have no
+        derivatives where ``det J ≤ 0``. Other energies are finite on inverted triangles too.
     """
 
     barrier: bool = False
 
     @abstractmethod
     def density(self, d: Deformation) -> FloatArray:
-        """The energy per unit of rest area.
+        """Energy per unit of rest area.
 
         Parameters
         ----------
@@ -144,12 +144,12 @@ class Energy(ABC):
         Returns
         -------
         (f,) float64
-            Without unit, as the Jacobians are; ``inf`` outside of its domain.
+            Dimensionless; ``inf`` outside the energy's domain.
         """
 
     @abstractmethod
     def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives of the density by p and q.
+        """Derivatives of the density with respect to p and q.
 
         Parameters
         ----------
@@ -162,15 +162,15 @@ class Energy(ABC):
         """
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivative as a quadratic form in (dp, dq).
+        """Second derivative of the density as a quadratic form in (dp, dq).
 
         Parameters
         ----------
         d : Deformation
         negative : float
-            What becomes of negative eigenvalues: they are multiplied by this. 0 clamps them, which makes
-            the form positive semidefinite; -1 takes absolute values, a more careful choice while the energy
-            is far from quadratic; 1 leaves the second derivative as it is.
+            Factor for negative eigenvalues. 0 clamps them, which makes the form positive semidefinite. -1 takes
+            absolute values, which is more robust while the energy is far from quadratic. 1 keeps the second derivative
+            unchanged.
 
         Returns
         -------
@@ -180,13 +180,13 @@ class Energy(ABC):
         Raises
         ------
         NotImplementedError
-            From energies that know first derivatives only; they can be descended, not polished.
+            From energies without second derivatives. Use `harmonise` for these; `polish` rejects them.
         """
         raise NotImplementedError(f"{type(self).__name__} has no second derivatives")
 
 
 class Isotropic(Energy):
-    """An energy ``φ(a, b)`` of ``a = |p|²`` and ``b = |q|²``; the rest follows from φ's derivatives.
+    """Base class of energies ``φ(a, b)`` of ``a = |p|²`` and ``b = |q|²``, given by φ and its derivatives.
 
     Singular values enter as ``σ₁² + σ₂² = 2 (a + b)`` and ``σ₁σ₂ = det = a − b``.
 
@@ -209,19 +209,19 @@ class Isotropic(Energy):
 
     @abstractmethod
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """``φ_a, φ_b``."""
+        """First derivatives ``φ_a, φ_b``, each (f,) float64."""
 
     @abstractmethod
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """``φ_aa, φ_ab, φ_bb``."""
+        """Second derivatives ``φ_aa, φ_ab, φ_bb``, each (f,) float64."""
 
     def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives by p and q."""
+        """Derivatives of the density with respect to p and q."""
         slope_a, slope_b = self.density_gradient(d)
         return 2 * slope_a * d.p, 2 * slope_b * d.q
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivative as a quadratic form in (dp, dq)."""
+        """Second derivative of the density as a quadratic form in (dp, dq)."""
         slope_a, slope_b = self.density_gradient(d)
         aa, ab, bb = self.density_hessian(d)
         turn_p, turn_q = 2 * slope_a, 2 * slope_b
@@ -229,7 +229,7 @@ class Isotropic(Energy):
         turn_p, turn_q = damped(turn_p, negative), damped(turn_q, negative)
         along_p, kept, along_q = _filtered(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
         mixed = 4 * kept * ab
-        # Where p or q vanishes its direction does not matter: along and across are alike.
+        # Where p or q vanishes, the two eigenvalues are equal, so its direction does not matter.
         to_p: ComplexArray = np.conj(d.p)
         to_q: ComplexArray = np.conj(d.q)
         return QuadraticForm(
@@ -243,16 +243,16 @@ class Isotropic(Energy):
 
 
 def damped(eigenvalue: FloatArray, negative: float) -> FloatArray:
-    """Eigenvalues with the negative ones multiplied by ``negative``."""
+    """Multiply the negative eigenvalues by ``negative``."""
     return np.where(eigenvalue < 0, negative * eigenvalue, eigenvalue)
 
 
 def _filtered(
     xx: FloatArray, xy: FloatArray, yy: FloatArray, negative: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Symmetric 2×2 matrices with their negative eigenvalues multiplied by ``negative``.
+    """Multiply the negative eigenvalues of symmetric 2×2 matrices by ``negative``.
 
-    Returns the diagonal entries, and between them what the off-diagonal entry is multiplied by.
+    Return the first diagonal entry, the factor of the off-diagonal entry, and the second diagonal entry.
     """
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     radius = np.sqrt(half**2 + xy**2)
@@ -264,12 +264,12 @@ def _filtered(
 
 
 class MIPS(Isotropic):
-    """``σ₁/σ₂ + σ₂/σ₁ − 2``: conformal, blind to scale (Hormann and Greiner 2000; §10)."""
+    """``σ₁/σ₂ + σ₂/σ₁ − 2``: conformal and scale-invariant (Hormann and Greiner 2000; §10)."""
 
     barrier = True
 
     def density(self, d: Deformation) -> FloatArray:
-        """``4 b / D``."""
+        """``4 b / D``, ``inf`` where D ≤ 0."""
         return _where_positive(d.det, 4 * d.b / _positive(d.det))
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
@@ -284,12 +284,12 @@ class MIPS(Isotropic):
 
 
 class SymmetricDirichlet(Isotropic):
-    """``σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4``: isometric, as much against shrinking as against stretching."""
+    """``σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4``: isometric; shrinking and stretching cost the same."""
 
     barrier = True
 
     def density(self, d: Deformation) -> FloatArray:
-        """``2 (D − 1)²/D + 4b (1 + D⁻²)``."""
+        """``2 (D − 1)²/D + 4b (1 + D⁻²)``, ``inf`` where D ≤ 0."""
         det = _positive(d.det)
         return _where_positive(d.det, 2 * (det - 1) ** 2 / det + 4 * d.b * (1 + det**-2))
 
@@ -310,8 +310,8 @@ class SymmetricDirichlet(Isotropic):
 class ARAP(Isotropic):
     """``(σ₁ − 1)² + (σ₂ − 1)²``, as rigid as possible (E₁, §11.1.1).
 
-    With the signed ``σ₂``, that is with the nearest *rotation* (Sorkine and Alexa 2007): an inverted
-    triangle is charged for being inverted. On all others this is the paper's E₁ (`UnsignedARAP`).
+    The energy uses the signed ``σ₂``, the distance to the nearest *rotation* (Sorkine and Alexa 2007), so inversion
+    costs energy. On maps without inverted triangles it equals the paper's E₁ (`UnsignedARAP`).
     """
 
     def density(self, d: Deformation) -> FloatArray:
@@ -319,7 +319,9 @@ class ARAP(Isotropic):
         return 2 * (np.sqrt(d.a) - 1) ** 2 + 2 * d.b
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """``2 − 2/√a, 2``; at p = 0, where there is a kink, the pull to either side is left out."""
+        """``2 − 2/√a, 2``. At p = 0, where the energy has a kink, the first derivative is 2 (``1/√a`` is replaced by
+        0).
+        """
         return 2 - 2 * inverse(np.sqrt(d.a)), np.full(d.b.shape, 2.0)
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -329,24 +331,24 @@ class ARAP(Isotropic):
 
 
 class UnsignedARAP(Isotropic):
-    """``(σ₁ − 1)² + (σ₂ − 1)²`` with ``σ₂ ≥ 0``: E₁ as §11.1.1 has it.
+    """``(σ₁ − 1)² + (σ₂ − 1)²`` with ``σ₂ ≥ 0``: E₁ as in §11.1.1.
 
-    With the nearest orthogonal matrix, reflections too: a mirrored triangle costs nothing. On maps without inverted
-    triangles it is `ARAP`.
+    The energy is the distance to the nearest orthogonal matrix, reflections included, so a mirrored triangle costs no
+    energy. On maps without inverted triangles it equals `ARAP`.
     """
 
     def density(self, d: Deformation) -> FloatArray:
-        """``2 (√c − 1)² + 2e``, c the larger of a and b, e the smaller."""
+        """``2 (√c − 1)² + 2e`` with c = max(a, b) and e = min(a, b)."""
         return 2 * (np.sqrt(np.maximum(d.a, d.b)) - 1) ** 2 + 2 * np.minimum(d.a, d.b)
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """``2 − 2/√c`` and 2; where a = b there is a ridge, and its side without inversion counts."""
+        """``2 − 2/√c`` by the larger of a and b, and 2 by the smaller. At a = b, a counts as the larger."""
         upright = d.a >= d.b
         slope = 2 - 2 * inverse(np.sqrt(np.maximum(d.a, d.b)))
         return np.where(upright, slope, 2.0), np.where(upright, 2.0, slope)
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """``c^(−3/2)`` for the larger one, and zeros."""
+        """``c^(−3/2)`` by the larger of a and b, otherwise zeros."""
         upright = d.a >= d.b
         bend = inverse(np.sqrt(np.maximum(d.a, d.b))) ** 3
         return np.where(upright, bend, 0.0), np.zeros(d.b.shape), np.where(upright, 0.0, bend)
@@ -371,12 +373,12 @@ class AreaPreserving(Isotropic):
 
 
 class AreaBarrier(Isotropic):
-    """``det J + 1/det J − 2``: area-preserving, infinite at collapse (Garanzha et al. 2021's E_a; §10.2)."""
+    """``det J + 1/det J − 2``: area-preserving, infinite at collapse (E_a of Garanzha et al. 2021; §10.2)."""
 
     barrier = True
 
     def density(self, d: Deformation) -> FloatArray:
-        """``(D − 1)²/D``."""
+        """``(D − 1)²/D``, ``inf`` where D ≤ 0."""
         det = _positive(d.det)
         return _where_positive(d.det, (det - 1) ** 2 / det)
 
@@ -392,7 +394,7 @@ class AreaBarrier(Isotropic):
 
 
 class Combination(Isotropic):
-    """A weighted sum of isotropic energies, projected as one.
+    """A weighted sum of isotropic energies, with the second derivative of the sum projected as a whole.
 
     Parameters
     ----------
@@ -405,29 +407,29 @@ class Combination(Isotropic):
         self.barrier = any(energy.barrier for _, energy in terms)
 
     def density(self, d: Deformation) -> FloatArray:
-        """The sum of the densities."""
+        """Weighted sum of the densities."""
         return np.sum([factor * energy.density(d) for factor, energy in self.terms], axis=0)
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """The sums of the first derivatives."""
+        """Weighted sums of the first derivatives."""
         a, b = np.sum([factor * np.stack(energy.density_gradient(d)) for factor, energy in self.terms], axis=0)
         return a, b
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The sums of the second derivatives."""
+        """Weighted sums of the second derivatives."""
         aa, ab, bb = np.sum([factor * np.stack(energy.density_hessian(d)) for factor, energy in self.terms], axis=0)
         return aa, ab, bb
 
 
 def conformal_area_blend(theta: float = 1 / 128) -> Combination:
-    """``(1 − θ) MIPS + θ E_a``: the energy of Garanzha et al. (§10.2), with their θ unless another is given.
+    """``(1 − θ) MIPS + θ E_a``: the energy of Garanzha et al. (§10.2), by default with their θ.
 
-    A little of the area term keeps the map's scale from varying without bounds, which MIPS alone allows.
+    MIPS alone does not bound the scale of the map. The small area term does.
 
     Parameters
     ----------
     theta : float
-        Share θ of the area term ``E_a = D + 1/D − 2``, from 0 to 1.
+        Weight θ of the area term ``E_a = D + 1/D − 2``, from 0 to 1.
 
     Returns
     -------
@@ -444,7 +446,7 @@ def conformal_area_blend(theta: float = 1 / 128) -> Combination:
 
 
 def _positive(det: FloatArray) -> FloatArray:
-    """The determinants, NaN where there is no barrier energy."""
+    """Return the determinants, with NaN where they are not positive."""
     return np.where(det > 0, det, np.nan)
 
 
@@ -453,5 +455,5 @@ def _where_positive(det: FloatArray, value: FloatArray) -> FloatArray:
 
 
 def inverse(x: FloatArray) -> FloatArray:
-    """``1/x``, and 0 at 0."""
+    """``1/x`` where x is positive, otherwise 0."""
     return np.where(x > 0, 1 / np.where(x > 0, x, 1), 0.0)

@@ -1,4 +1,4 @@
-"""Distortion of a map, triangle by triangle and summed up (§10, §11)."""
+"""Distortion of a map per triangle and summarised over the surface (§10, §11)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from quasiharmonic.util.display import Displayable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Measures that `Distortion` has for every triangle, in the order in which reports list them.
+#: Per-triangle measures of `Distortion`, in the order of reports.
 MEASURES = (
     "sigma1",
     "sigma2",
@@ -46,16 +46,16 @@ MEASURES = (
 
 @dataclass(frozen=True)
 class Summary:
-    """One measure over the surface; means and quantiles are weighted by rest area.
+    """Statistics of one measure over the surface; mean and quantiles are weighted by rest area.
 
     Attributes
     ----------
     mean, median, p95 : float
-        Mean, and the values below which lies half and 95 % of the area.
+        Mean, median and 95 % quantile.
     minimum, maximum : float
-        Over all triangles, however small.
+        Over all triangles, whatever their area.
     lowest, highest : int
-        The triangles where these are attained.
+        Triangles with the minimum and the maximum.
     """
 
     mean: float
@@ -67,59 +67,58 @@ class Summary:
     highest: int
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, which has no infinity: what is not finite is None."""
+        """Return the statistics for JSON, with None for values that are not finite."""
         return {key: value if np.isfinite(value) else None for key, value in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Distortion(Displayable):
-    """What a map does to every triangle; made by `distortion`.
+    """Distortion of a map on every triangle, as `distortion` returns it.
 
-    The Jacobian is that of the affine map from the rest triangle, laid into the plane counterclockwise, to
-    its image. Its singular values are *signed*: ``σ₁ ≥ |σ₂|``, and ``σ₂`` has the sign of the image's
-    orientation, decided exactly. So ``det J = σ₁ σ₂``, and a triangle is inverted where ``σ₂ < 0`` and
-    has no area where ``σ₂ = 0``.
+    The Jacobian is that of the affine map from the rest triangle to its image. The rest triangle is laid into the plane
+    counterclockwise. The singular values are *signed*: ``σ₁ ≥ |σ₂|``, and ``σ₂`` has the sign of the image's
+    orientation, computed exactly. So ``det J = σ₁ σ₂``. A triangle is inverted if ``σ₂ < 0`` and degenerate if
+    ``σ₂ = 0``.
 
     ===================== ================================= ========= ==================================
     measure (f,) float64  formula                           scaled    where ``σ₂ ≤ 0``
     ===================== ================================= ========= ==================================
-    `sigma1`, `sigma2`    singular values                   as given  ``σ₂`` signed
-    `mips`                σ₁/σ₂ + σ₂/σ₁ − 2  (§10)          no matter inf
-    `conformal`           σ₁/σ₂                             no matter inf
+    `sigma1`, `sigma2`    singular values                   no        ``σ₂`` signed
+    `mips`                σ₁/σ₂ + σ₂/σ₁ − 2  (§10)          invariant inf
+    `conformal`           σ₁/σ₂                             invariant inf
     `isometric`           max(σ₁, 1/σ₂)                     yes       inf
     `symmetric_dirichlet` σ₁² + σ₂² + 1/σ₁² + 1/σ₂² − 4     yes       inf
     `arap`                (σ₁ − 1)² + (σ₂ − 1)²             yes       finite, with the signed ``σ₂``
     `area_ratio`          σ₁ σ₂                             yes       negative or 0
-    `shear`               |μ| = (σ₁ − σ₂)/(σ₁ + σ₂)         no matter 1 or more; inf where it is mirrored
-                                                                      at angles kept, NaN at a point
+    `shear`               |μ| = (σ₁ − σ₂)/(σ₁ + σ₂)         invariant 1 or more; inf for a mirrored
+                                                                      similarity, NaN for a point
     ===================== ================================= ========= ==================================
 
-    *Scaled* measures compare lengths or areas, so they are taken after the map has been scaled, as a
-    whole, to the surface's area: singular values are multiplied by `scale`. What is zero or one for an
-    isometry is so for any similarity then.
+    *Scaled* measures compare lengths or areas. They are computed after scaling the whole map to the surface's area,
+    which multiplies the singular values by `scale`. Their values at an isometry therefore hold for every similarity.
 
-    Triangles without area in the rest mesh (`flat`) have no Jacobian: everything is NaN there, and sums
-    and extremes leave them out.
+    Triangles without area in the rest mesh (`flat`) have no Jacobian. Their measures are NaN, and the summaries ignore
+    them.
 
     Attributes
     ----------
     share : (f,) float64
-        Rest areas over the surface's area.
+        Rest areas divided by the surface's area.
     scale : float
-        ``√(rest area / Σ |image areas|)``; 1 when one of them is zero.
+        ``√(rest area / Σ |image areas|)``; 1 if one of the two is zero.
     sigma1, sigma2 : (f,) float64
-        Singular values of the map as given.
+        Singular values of the unscaled map.
     beltrami : (f,) complex128
-        ``μ = q/p = (∂w/∂z̄)/(∂w/∂z)``, in the frame whose real axis points from vertex 0 to vertex 1 of
-        the triangle; `shear` is its modulus.
+        ``μ = q/p = (∂w/∂z̄)/(∂w/∂z)``, in the frame whose real axis points from vertex 0 to vertex 1 of the triangle;
+        `shear` is its modulus.
     flat : (k,) int64
         Triangles without area in the rest mesh.
     inverted : (l,) int64
-        Triangles whose image is inverted or has no area, flat ones excepted.
+        Triangles with an inverted or degenerate image, except flat ones.
     V, F, uv : arrays
-        The surface and the map that were measured.
+        The surface and the map.
     distances : DistanceError or None
-        How far distances between vertices are off, where that was asked for.
+        Error of the distances between vertices, if requested.
     """
 
     share: FloatArray
@@ -142,7 +141,7 @@ class Distortion(Displayable):
     distances: DistanceError | None = None
 
     def per_triangle(self) -> dict[str, FloatArray]:
-        """Every measure by its name, (f,) float64 each."""
+        """Every measure by name, each (f,) float64."""
         return {name: getattr(self, name) for name in MEASURES}
 
     @overload
@@ -150,12 +149,12 @@ class Distortion(Displayable):
     @overload
     def summary(self, measure: str) -> Summary: ...
     def summary(self, measure: str | None = None) -> str | Summary:
-        """Sum up one measure, or all of them in a table of text.
+        """Summarise one measure, or all measures in a text table.
 
         Parameters
         ----------
         measure : str, optional
-            One of `MEASURES`.
+            One of `MEASURES`. By default, all.
 
         Returns
         -------
@@ -164,7 +163,7 @@ class Distortion(Displayable):
         Raises
         ------
         ValueError
-            When there is no such measure, or no triangle on which it is defined.
+            When the measure is unknown, or not defined on any triangle.
         """
         if measure is None:
             return self._table()
@@ -177,7 +176,7 @@ class Distortion(Displayable):
         order = np.argsort(value, kind="stable")
         below = np.cumsum(share[order])
         median, p95 = value[order[np.searchsorted(below, [0.5 * below[-1], 0.95 * below[-1]])]].tolist()
-        with np.errstate(invalid="ignore"):  # what is infinite either way has no mean
+        with np.errstate(invalid="ignore"):  # values with infinities of both signs have no mean
             mean = float(np.sum(share / below[-1] * value))
         return Summary(
             mean=mean,
@@ -190,7 +189,7 @@ class Distortion(Displayable):
         )
 
     def _table(self) -> str:
-        """All measures, a line each."""
+        """Text table with one line per measure."""
         lines = [f"{'':>19} {'median':>10} {'95 %':>10} {'max':>10}"]
         for name, values in self.per_triangle().items():
             if not np.isnan(values).all():
@@ -211,12 +210,12 @@ class Distortion(Displayable):
         return f"{triangles}, stretch max(σ₁, 1/σ₂) {one.median:.3g} in the median, {one.maximum:.3g} at most"
 
     def plot(self, measure: str = "isometric") -> Figure:
-        """Draw surface and map coloured by a measure, and its histogram; `quasiharmonic.plot.plot_distortion`."""
+        """Draw surface and map coloured by a measure, and its histogram, with `quasiharmonic.plot.plot_distortion`."""
         figure: Figure = self._draw("distortion", measure=measure)
         return figure
 
     def to_dict(self) -> dict[str, Any]:
-        """Counts, and the summaries of all measures (None where undefined), for JSON."""
+        """Return counts and the summaries of all measures for JSON, with None for undefined summaries."""
         summaries = {
             name: None if np.isnan(values).all() else self.summary(name).to_dict()
             for name, values in self.per_triangle().items()
@@ -232,38 +231,38 @@ class Distortion(Displayable):
 
 @accepts_mesh
 def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None = None) -> Distortion:
-    """Measure what a map does to every triangle of a surface; and, if asked for, to distances farther apart.
+    """Measure the distortion of a map on every triangle of a surface and, optionally, of longer distances.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
-        Rest positions. A planar mesh is taken as a surface seen from the side on which its triangles are
+        Rest positions. A planar mesh is treated as a surface seen from the side on which its triangles are
         counterclockwise.
     F : (f, 3) array of int
         Triangles. They need not form a surface.
     uv : (n, 2) array
         The map, injective or not.
     rings : int, optional
-        Measure too how far distances between vertices at most so many edges apart are off, along the surface against
-        in the plane: from up to 1,000 vertices drawn at random, always the same, to all others within reach (20 is
-        usual in brain mapping). To judge several maps by one sample, or a larger one, see
+        Also compare distances along the surface with distances in the plane, between vertices at most this many edges
+        apart. Distances are measured from up to 1,000 vertices, drawn at random with a fixed seed, to all others within
+        reach. 20 is usual in brain mapping. To compare several maps on one sample, or to use a larger sample, see
         `quasiharmonic.energies.distances.surface_distances`.
 
     Returns
     -------
     Distortion
-        Every measure per triangle; `Distortion.summary` and `Distortion.to_dict` sum them up.
+        Every measure per triangle; `Distortion.summary` and `Distortion.to_dict` summarise them.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape, there are no triangles, an index is out of range, or a coordinate
-        is not finite.
+        When an array has the wrong shape, there are no triangles, an index is out of range, or a coordinate is not
+        finite.
 
     Examples
     --------
-    A square of side 2 stretched to a rectangle of 6 by 3: after scaling it to the square's area, by √2
-    one way and 1/√2 the other.
+    A square of side 2 is stretched to a rectangle of 6 by 3. After scaling to the square's area, the stretches are √2
+    and 1/√2.
 
     >>> V, F = [[0, 0], [2, 0], [2, 2], [0, 2]], [[0, 1, 2], [0, 2, 3]]
     >>> found = distortion(V, F, [[0, 0], [6, 0], [6, 3], [0, 3]])
@@ -277,7 +276,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None =
     V = vertex_array(V)
     F, uv = triangle_array(F, len(V)), map_array("uv", uv, len(V))
     off = None if rings is None else surface_distances(V, F, rings=rings).error(uv)
-    # What leaves the numbers' range in extreme maps becomes inf, 0 or NaN as the formulas have it.
+    # In extreme maps, overflow and underflow give inf, 0 or NaN, as the formulas imply.
     with np.errstate(all="ignore"):
         return replace(_measured(V, F, uv), distances=off)
 
@@ -294,14 +293,13 @@ def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
     Returns
     -------
     (f,) float64
-        1 for an equilateral triangle, 0 for one without area, negative for one wound clockwise. The sign is
-        exact.
+        1 for an equilateral triangle, 0 for a degenerate one, negative for a clockwise one. The sign is exact.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape or dtype, ``F`` refers to vertices that there are not, or a triangle's corner
-        is not finite.
+        When an array has the wrong shape or dtype, an index in ``F`` is out of range, or a triangle's corner is not
+        finite.
     """
     places, triangles = map_array("points", points, finite=False), triangle_rows(F)
     check_range("F", triangles, len(places))
@@ -309,7 +307,7 @@ def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
     sign = orientation(*(corners[:, k] for k in range(3)))
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.abs(sides).max(axis=(1, 2), initial=0.0)
-    # In units of the longest side, so that no square leaves the numbers' range.
+    # In units of the longest side, so that squares neither overflow nor underflow.
     a, b, c = (sides / np.where(longest > 0, longest, 1.0)[:, None, None]).transpose(1, 0, 2)
     squares = (a * a).sum(axis=1) + (b * b).sum(axis=1) + (c * c).sum(axis=1)
     area = np.maximum(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, np.finfo(float).tiny)
@@ -325,7 +323,7 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     d1, d2 = w[F[:, 1]] - w0, w[F[:, 2]] - w0
     left, right = d1.real * d2.imag, d1.imag * d2.real
     area, noise = 0.5 * (left - right), 2.0**-52 * (np.abs(left) + np.abs(right))
-    # Where rounding may have changed the area's sign, the sign is decided exactly.
+    # Where rounding may have changed the sign of the area, use the exact sign.
     sign = orientation(*(uv[F[:, k]] for k in range(3)))
     area = np.where(np.abs(area) <= noise, sign * noise, area)
 
@@ -337,12 +335,12 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     sigma2 = np.where(sigma1 > 0, det / np.where(sigma1 > 0, sigma1, 1), sigma1)
     total, image = float(shapes.m.sum()), float(np.abs(area).sum())
     units = unit / shapes.unit
-    # From the units of computation to the surface's area.
+    # From internal units to the surface's area.
     scale = float(np.sqrt(total / image)) if image > 0 and total > 0 else units
     scaled = Deformation(scale * p, scale * q, scale * scale * det)
     scaled1, scaled2 = scale * sigma1, scale * sigma2
     beltrami = np.where(p != 0, q / np.where(p != 0, p, 1), np.where(q != 0, np.inf, np.nan))
-    # Comparisons with NaN are false, and would give the barriers' infinity.
+    # Comparisons with NaN are false, so the barriers would return inf instead of NaN.
     undefined = np.where(defined, 0.0, np.nan)
     return Distortion(
         share=shapes.m / np.float64(total),
@@ -366,6 +364,6 @@ def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
 
 
 def _ratio(numerator: FloatArray | float, denominator: FloatArray) -> FloatArray:
-    """The quotient, infinite where the denominator is not positive."""
+    """The quotient, ``inf`` where the denominator is not positive."""
     positive = denominator > 0
     return np.where(positive, numerator / np.where(positive, denominator, 1), np.inf)

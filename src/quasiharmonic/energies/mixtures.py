@@ -1,4 +1,4 @@
-"""Sums of the package's own isotropic energies, in one pass over the triangles: their mean, its derivatives."""
+"""Sums of the package's own isotropic energies, with derivatives, evaluated in one pass over the triangles."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from quasiharmonic.geometry.mesh.reference import blocks
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 from quasiharmonic.util.kernels import compiled
 
-#: Of which a mixture is made, in the order of its factors.
+#: The energies of a mixture, in the order of its factors.
 OWN: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
 
 
 def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
-    """The factors of `OWN` of which an energy is the sum, (4,) float64; None where it is something else.
+    """The factors (4,) float64 that express an energy as a sum of `OWN`, or None if it is not one.
 
-    ``parts`` are the methods that matter: who derives from one of `OWN` and leaves these as they are counts as it.
+    ``parts`` are the methods that the caller uses. A subclass of one of `OWN` that does not override them counts as
+    that energy.
     """
     if type(energy) is not Combination:
         return _factors(type(energy), parts)
@@ -51,14 +52,14 @@ def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
 
 
 def energy_of(mixture: FloatArray) -> Isotropic:
-    """The way back: an energy that is the sum."""
+    """The energy with the factors ``mixture`` of `OWN`; the inverse of `mixture_of`."""
     terms = [(float(factor), energy) for factor, energy in zip(mixture, OWN, strict=True) if factor]
     return terms[0][1] if len(terms) == 1 and terms[0][0] == 1 else Combination(*terms)
 
 
 @compiled
 def mixed_energy(mixture: FloatArray, p: ComplexArray, q: ComplexArray, det: FloatArray, share: FloatArray) -> float:
-    """The sum of densities times ``share``, all (f,)."""
+    """Return the sum of the densities times ``share``; ``p``, ``q``, ``det`` and ``share`` are (f,)."""
     return float(np.sum(share * energy_of(mixture).density(Deformation(p, q, det))))
 
 
@@ -66,7 +67,7 @@ def mixed_energy(mixture: FloatArray, p: ComplexArray, q: ComplexArray, det: Flo
 def mixed_slopes(
     mixture: FloatArray, p: ComplexArray, q: ComplexArray, det: FloatArray, by_p: ComplexArray, by_q: ComplexArray
 ) -> None:
-    """Fill in the densities' derivatives by p and q."""
+    """Fill ``by_p`` and ``by_q`` with the derivatives of the densities with respect to p and q."""
     energy = energy_of(mixture)
     for part in blocks(det.size):
         by_p[part], by_q[part] = energy.gradient(Deformation(p[part], q[part], det[part]))
@@ -87,7 +88,7 @@ def mixed_curvature(
     pq: ComplexArray,
     pqc: ComplexArray,
 ) -> None:
-    """Fill in the densities' second derivatives as `Energy.curvature` has them, times ``share``, field by field."""
+    """Fill the fields of the second derivatives (see `Energy.curvature`), each multiplied by ``share``."""
     energy = energy_of(mixture)
     for part in blocks(det.size):
         form = energy.curvature(Deformation(p[part], q[part], det[part]), negative=negative).scaled(share[part])
@@ -102,7 +103,7 @@ def mixed_curvature(
 
 
 def curvature_of_mixture(mixture: FloatArray, d: Deformation, share: FloatArray, negative: float) -> QuadraticForm:
-    """Second derivatives of the sum of densities times ``share``."""
+    """Second derivatives of the densities times ``share``, as a quadratic form per triangle."""
     f = d.det.size
     reals, numbers = np.empty((2, f)), np.empty((4, f), dtype=np.complex128)
     mixed_curvature(mixture, d.p, d.q, d.det, share, negative, *reals, *numbers)

@@ -1,4 +1,4 @@
-"""Less distortion without leaving the injective maps, from a map that is injective (§10, §11)."""
+"""Lower the distortion of an injective map by Newton's method, keeping every step injective (§10, §11)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import reports_progress
 
-#: What a polish can lower, by name. ARAP gets a tenth of the area barrier: alone it lets triangles collapse.
+#: Energies that `polish` can minimise, by name. ARAP alone lets triangles collapse, so it gets a tenth of the area
+#: barrier.
 ENERGIES: dict[str, Energy] = {
     "symmetric-dirichlet": SymmetricDirichlet(),
     "mips": MIPS(),
@@ -64,7 +65,7 @@ def polish(
     callback: Callable[[Step], object] | None = None,
     slide: bool | BoundaryCurves = False,
 ) -> MapResult:
-    """Lower the distortion of an injective map; every step on the way is injective, certified exactly.
+    """Lower the distortion of an injective map; every step is injective, certified exactly.
 
     Parameters
     ----------
@@ -75,52 +76,55 @@ def polish(
     uv : (n, 2) array
         An injective map of the mesh.
     fixed : (k,) array of int
-        Vertices that stay where they are in ``uv``, to the last bit: the whole boundary and any pins.
+        Fixed vertices, which keep their positions in ``uv`` exactly: the whole boundary and any pins.
     energy : str or Energy
-        What is lowered, the mean over the surface's area:
+        The energy to minimise, averaged over the surface's area:
 
-        - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻², lengths. The safe choice.
-        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁, angles and nothing else; scale may vary by many orders of magnitude.
-        - ``"blend"``: (1 − θ) MIPS + θ (det J + 1/det J), θ = 1/128: angles, with the scale bounded. Another θ
-          with `quasiharmonic.energies.energies.conformal_area_blend`.
-        - ``"arap-barrier"``: (σ₁ − 1)² + (σ₂ − 1)² and a tenth of det J + 1/det J, rigid where it can be.
+        - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻², measures lengths. A good default.
+        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁, measures angles only; the scale may vary by many orders of magnitude.
+        - ``"blend"``: (1 − θ) MIPS + θ (det J + 1/det J), θ = 1/128: measures angles, with bounded scale. For another θ
+          use `quasiharmonic.energies.energies.conformal_area_blend`.
+        - ``"arap-barrier"``: (σ₁ − 1)² + (σ₂ − 1)² plus a tenth of det J + 1/det J, as rigid as possible.
 
-        Or any `Energy` that is a barrier and has second derivatives. Lengths and areas are compared after
-        scaling the map to the surface's area.
+        Or any `Energy` that is a barrier and has second derivatives. Lengths and areas are compared after scaling the
+        map to the surface's area.
     weights : (f,) array, optional
-        How much each triangle's distortion counts; positive, 1 by default.
+        Weight of each triangle's distortion; positive, 1 by default.
     max_iterations : int
-        Newton steps at most.
+        Maximum number of Newton steps.
     tolerance : float
-        The polish has converged when Newton's model promises a further decrease below this fraction of the
-        energy (half the squared Newton decrement over the energy). Not negative. Scans of 20,000 to 40,000 triangles on
-        letters end 0 to 1 % above the least energy known by the default, 0 to 2.1 % by 1e-3.
+        The polish has converged when half the squared Newton decrement is below this fraction of the energy. Not
+        negative. On scans of 20,000 to 40,000 triangles mapped to letters, the default ends 0 to 1 % above the lowest
+        known energy, 1e-3 ends 0 to 2.1 % above.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step, and with the last one again at least every half second
-        in between, but not within a single factorisation; its ``energy`` is the mean energy.
+        Called with a `Step` at the start and after every step; ``Step.energy`` is the mean energy. Between steps it is
+        called with the last `Step` again at least every half second, but not during a single factorisation.
     slide : bool or BoundaryCurves
-        Let boundary vertices glide along the outline, in their order, its corners held: along the curves of
-        `quasiharmonic.geometry.curves.BoundaryCurves`, or with True along the polygon that the boundary is in ``uv``,
-        whose corners are where it turns by 20° or more. Vertices that slide are on their curve up to one rounding; a
-        map that is bijective stays so. The scale is that of the start, whatever little the polygon's area changes.
+        Let boundary vertices slide along the outline, in their order, with fixed corners. With True, they slide along
+        the boundary polygon of ``uv``, whose corners turn by 20° or more. With
+        `quasiharmonic.geometry.curves.BoundaryCurves`, they slide along these curves. Sliding vertices are on their
+        curve up to one rounding. A bijective map stays bijective. The scale of the start is kept, although the area of
+        the polygon may change slightly.
 
     Returns
     -------
     MapResult
-        With status ``POLISHED``, ``STILL_FALLING`` after the last iteration, ``EXHAUSTED`` when doubles cannot
-        express a better map, or ``INTERRUPTED`` by Ctrl-C; certified in each case, with no more energy than
-        ``uv``. The history holds the mean energy at every step.
+        With status ``POLISHED`` on convergence, ``STILL_FALLING`` after the last iteration, ``EXHAUSTED`` when double
+        precision cannot express a better map, or ``INTERRUPTED`` by Ctrl-C. In each case the map is certified and its
+        energy is at most that of ``uv``. The history has the mean energy at every step.
 
     Raises
     ------
     ValueError
-        When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective;
-        the message names the triangles. When the boundary is not on the curves that it is to slide along (see
-        `BoundaryCurves`), or triangles are inverted once it is on them. When the energy is not known, not a barrier or
-        without second derivatives, or another option has no such value. When there is no step to take as an energy of
-        one's own, or a derivative of it, is NaN: the message names which, and the triangles.
+        - When the input is malformed (see `Problem`), a rest triangle has no area, or ``uv`` is not injective; the
+          message lists the triangles.
+        - When the boundary is not on the curves it should slide along (see `BoundaryCurves`), or moving it onto them
+          inverts triangles.
+        - When the energy is unknown, is not a barrier or has no second derivatives, or when another option is invalid.
+        - When a user-defined energy or one of its derivatives is NaN, so that no step is possible; the message lists
+          which, and the triangles.
 
     Examples
     --------
@@ -166,10 +170,11 @@ def polish_map(
     slide: bool | BoundaryCurves = False,
     triangles: IntArray | None = None,
 ) -> MapResult:
-    """Polish a map of a `Domain` at hand; the rest as `polish` has it.
+    """Polish a map of an existing `Domain`; parameters, results and errors as in `polish`.
 
-    The domain's ``fixed`` vertices stay where they are in ``uv``, or slide. ``triangles`` (t, 3) are measured in place
-    of its own if there are any, and stay positive, as they are in ``uv``; they may overlap, and cover all of it alike.
+    The domain's ``fixed`` vertices keep their positions in ``uv``, or slide. If ``triangles`` (t, 3) are given, they
+    are measured in place of the domain's triangles. They must be positive in ``uv`` and stay so. They may overlap, but
+    must cover the surface evenly.
     """
     began = time.perf_counter()
     chosen = energy_named(energy)
@@ -182,7 +187,7 @@ def polish_map(
         start = track.uv
     if weights is not None:
         weights = positive_weights(weights, len(domain.F if triangles is None else triangles))
-    # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never accepted.
+    # Overflow gives inf or NaN. Comparisons with NaN are false, so these steps are never accepted.
     with np.errstate(all="ignore"):
         deformation, exponent = at_own_scale(domain, start, chosen, weights, triangles)
         descent: NewtonDescent
@@ -243,7 +248,7 @@ def polished(
     slide: bool | BoundaryCurves = False,
     triangles: IntArray | None = None,
 ) -> MapResult:
-    """Polish the injective map of a result, as `polish_map` does; stages and history are continued."""
+    """Polish the injective map of a result with `polish_map`, appending to its stages and history."""
     further = polish_map(
         problem.domain,
         result.uv,
@@ -267,7 +272,7 @@ def polished(
 
 
 def energy_named(energy: str | Energy) -> Energy:
-    """Look an energy up by its name, and refuse what a polish cannot lower."""
+    """Look up an energy by its name and reject energies that `polish` cannot minimise."""
     if isinstance(energy, str):
         if energy not in ENERGIES:
             raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}")
@@ -294,27 +299,27 @@ def at_own_scale(
     weights: FloatArray | None = None,
     triangles: IntArray | None = None,
 ) -> tuple[DeformationEnergy, int]:
-    """An energy that measures maps after bringing them to the surface's area, and the exponent of their unit.
+    """Return an energy that scales maps to the surface's area, and the binary exponent of the length unit.
 
     Parameters
     ----------
     domain : Domain
     uv : (n, 2) float64
-        The map whose area says by how much; a power of two of its size is the unit.
+        The map whose area determines the scale. The unit is a power of two of about its size.
     energy : Energy
     weights : (f,) float64, optional
     triangles : (t, 3) int64, optional
-        Those to measure; the domain's by default.
+        Triangles to measure; by default those of the domain.
     """
     F = domain.F if triangles is None else triangles
-    # Products of coordinates must not leave the numbers' range. A power of two costs no digits.
+    # Scale so that products of coordinates neither overflow nor underflow. A power of two causes no rounding.
     exponent = int(np.frexp(np.abs(uv).max())[1])
     area = float(signed_areas(F, in_units(uv, exponent)).sum())
     return DeformationEnergy(domain.V, F, energy, area=area, weights=weights), exponent
 
 
 def injective_array(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:
-    """A map as float64, checked to be injective; ``why`` ends the message of one that is not."""
+    """Return a map as float64 and check that it is injective; ``why`` ends the error message."""
     array = map_array("uv", uv, domain.n)
     inverted = inverted_triangles(domain.F, array)
     if inverted.size:

@@ -1,4 +1,4 @@
-"""The worst distortion taken off a map by a few steps, where that is cheap: what is done unasked."""
+"""Default smoothing of a new map: a few polishing steps that remove the worst distortion at little cost."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 
-# On some 10,000 triangles these steps take a few times as long as the first map, and go nearly as far as convergence: a
-# fifth of the MIPS energy, a hundredth of the worst stretch. On larger meshes they are felt.
+# On about 10,000 triangles these steps take a few times as long as the first map and go nearly as far as convergence.
+# They lower the MIPS energy to a fifth and the worst stretch to a hundredth. On larger meshes their time is noticeable.
 STEPS, LARGEST = 20, 100_000
 
 
@@ -24,21 +24,22 @@ def smoothed(
     callback: Callable[[Step], object] | None = None,
     slide: bool | BoundaryCurves = False,
 ) -> MapResult:
-    """Lower the distortion of an injective map a little, if it is of moderate size.
+    """Lower the distortion of an injective map by a few polishing steps, if the mesh is of moderate size.
 
     Parameters
     ----------
     problem : Problem
     result : MapResult
-        An injective map of it.
+        An injective map of the problem.
     linear_solver, callback, slide
-        As of `quasiharmonic.polish`. Maps whose boundary slides are smoothed whatever their size, or it would not have
-        slid.
+        As in `quasiharmonic.polish`. With ``slide``, maps of any size are smoothed, because only polishing slides the
+        boundary.
 
     Returns
     -------
     MapResult
-        The map itself where it is too large, or a triangle has no area at rest.
+        The smoothed map. The unchanged map if the mesh has more than `LARGEST` triangles and does not slide, or if a
+        rest triangle has no area.
     """
     if (len(problem.F) > LARGEST and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
         return result
@@ -51,6 +52,6 @@ def smoothed(
         callback=callback,
         slide=slide,
     )
-    # Nobody asked for convergence, so it is not missed.
+    # Convergence is not the goal here, so the status does not report its absence.
     interrupted = smoother.status is Status.INTERRUPTED
     return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)

@@ -1,4 +1,4 @@
-"""Springs along the edges of a mesh: the one energy of §11 that is not isotropic."""
+"""Springs along the edges of a mesh: the only energy of §11 that is not isotropic."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, named, own_trian
 class MassSpring(Energy):
     """Springs along the edges, ``Σ (l − l⁰)²`` over the edges of the mesh (E₃, §11.1.3).
 
-    A sum over edges, unlike the other energies: it depends on the triangulation, and zigzag folds cost it
-    nothing. Each triangle carries half of its interior edges and the whole of its boundary edges.
+    Unlike the other energies, this sum over edges depends on the triangulation, and zigzag folds cost no energy. Each
+    triangle carries half of its interior edges and all of its boundary edges.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array
         Rest positions.
     F : (f, 3) array of int
-        Triangles, in the order in which `Deformation` has them.
+        Triangles, in the order of the rows of `Deformation`.
 
     Raises
     ------
@@ -45,22 +45,22 @@ class MassSpring(Energy):
         self._stiffness = np.where(single, 1.0, 0.5) / shapes.m
 
     def density(self, d: Deformation) -> FloatArray:
-        """``Σ (l − l⁰)²/m`` over the triangle's sides, with their shares."""
+        """``Σ (l − l⁰)²/m`` over the sides of each triangle, weighted by the triangle's share of each side."""
         _, length = self._images(d)
         return np.sum(self._stiffness * (length - self._lengths) ** 2, axis=0)
 
     def gradient(self, d: Deformation) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives by p and q; a side of no length has a kink and pulls nowhere."""
+        """Derivatives with respect to p and q; a side of zero length, where the energy has a kink, contributes 0."""
         side, length = self._images(d)
         pull = 2 * self._stiffness * (1 - self._lengths * inverse(length)) * side
         return np.sum(pull * self._sides.conj(), axis=0), np.sum(pull * self._sides, axis=0)
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivative; what is negative is what a compressed spring has across itself."""
+        """Second derivative; the negative eigenvalues are those of compressed springs, across their direction."""
         side, length = self._images(d)
         along, across = 2 * self._stiffness, 2 * self._stiffness * (1 - self._lengths * inverse(length))
         across = damped(across, negative)
-        # Of a side's change ds = dp z + dq z̄: along |ds|² of its part along the side, across |ds|² of the rest.
+        # With ds = dp z + dq z̄, ``along`` weights the part of ds along the side and ``across`` the part across it.
         z, zz = self._sides, self._lengths**2
         both, turn = 0.5 * (along + across), 0.5 * (along - across) * (np.conj(side) * inverse(length)) ** 2
         return QuadraticForm(

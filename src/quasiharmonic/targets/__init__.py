@@ -1,4 +1,4 @@
-"""Targets: outlines, which boundary vertex goes where on them, and where to cut a surface.
+"""Target positions: outlines, the correspondence of boundary vertices to an outline, and where to cut a surface.
 
 The package builds on `problem` and `geometry.curves`. Start reading in `outlines.shapes`, then `boundary.boundary_to`.
 """

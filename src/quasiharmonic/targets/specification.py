@@ -1,4 +1,4 @@
-"""Outlines named in a word, as on the command line: ``letter:G``, ``rect:2x1``, ``drawing.svg``."""
+"""Outlines specified by a short string, as on the command line: ``letter:G``, ``rect:2x1``, ``drawing.svg``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from quasiharmonic.util.arrays import FloatArray
 
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 _POINT_FILES = ".txt", ".csv"
-#: How far contours stray from curves, where nothing else is asked for.
+#: Default deviation of contours from curves.
 TOLERANCE = 1e-6
 
 
 def outline(
     specification: str | PathLike[str], *, font: Font | None = None, tolerance: float = TOLERANCE
 ) -> list[FloatArray]:
-    """Make the outline that a few words or a file specify.
+    """Make the outline that a string or a file specifies.
 
     Parameters
     ----------
@@ -32,26 +32,26 @@ def outline(
 
         - ``disk``, ``ellipse:2x1`` (half axes), ``ring:0.5`` (the unit disk around a hole of this radius);
         - ``rect:2x1`` (width and height), ``polygon:6`` (corners), ``star:5`` (tips);
-        - ``letter:G``, ``word:QH`` (letters pushed into each other, which needs Shapely);
-        - the name of a drawing, ``.svg``, or of a file of points, ``.txt`` or ``.csv`` (see `read_svg`
-          and `read_polylines`).
+        - ``letter:G``, ``word:QH`` (overlapping letters, which needs Shapely);
+        - the name of a drawing, ``.svg``, or of a file of points, ``.txt`` or ``.csv`` (see `read_svg` and
+          `read_polylines`).
     font : str or path, optional
-        For letters and words, as `letter` takes it.
+        Font of letters and words, as in `letter`.
     tolerance : float
-        How far contours may stray from curves: in units of the font size for letters and words, as a
-        share of the larger side for everything else.
+        Maximum deviation of contours from curves. For letters and words in units of the font size, otherwise as a share
+        of the larger side.
 
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area. Those of files run as they stand there; of the others the outer
-        ones run counterclockwise and holes clockwise.
+        Contours by decreasing area. Contours from files keep their orientation. Otherwise outer contours are
+        counterclockwise and holes clockwise.
 
     Raises
     ------
     ValueError, OSError, ModuleNotFoundError
-        When there is no such form or file, when numbers or letters are wrong, and as `letter`, `word`,
-        `read_svg` and `read_polylines` do.
+        When the form is unknown, the file does not exist, or a number or letter is invalid; and as `letter`, `word`,
+        `read_svg` and `read_polylines`.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def outline(
         return read_svg(text, tolerance=tolerance)
     if suffix in _POINT_FILES:
         return read_polylines(text)
-    # A chord of a circle of diameter 1 with n of them strays by (π / n)² / 4.
+    # On a circle of diameter 1 divided into n chords, the chords deviate by (π / n)² / 4.
     points = min(MOST_POINTS, max(64, math.ceil(math.pi / math.sqrt(4 * tolerance))))
     match name, colon:
         case "disk", "":

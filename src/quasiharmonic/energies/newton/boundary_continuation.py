@@ -1,13 +1,13 @@
-"""Fixed vertices that go somewhere else and take the map along, every triangle positive on the way.
+"""Boundary continuation: move fixed vertices to new positions together with the map, keeping every triangle positive.
 
-A step of Newton's method for the boundary as it will be: with g the energy's gradient by the free vertices, H its
-second derivative, and Δ how far the fixed ones have to go, the free ones go by::
+The step is a Newton step for the new boundary. Let g be the energy's gradient at the free vertices, H its second
+derivative, and Δ the displacement of the fixed vertices. The free vertices move by::
 
     d = −H⁻¹ (g + (H Δ)_free)
 
-which catches up with what the last step left undone too. It is taken as far as the triangles bear, and repeated from
-there until the fixed vertices have arrived. So the map is carried continuously: it neither leaps to another minimum nor
-turns the other way around a hole.
+The gradient term also corrects the error of earlier steps. The step is shortened so that no triangle collapses, and
+repeated until the fixed vertices reach their target. The map thus changes continuously: it does not jump to another
+minimum or to the other way around a hole.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from quasiharmonic.energies.newton.newton_descent import SHIFTS, NewtonDescent, 
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
-# Of the way to the first triangle's collapse, what a step takes.
+# Step as a fraction of the distance to the first collapse of a triangle.
 _FRACTION = 0.8
-# No step is a smaller part of what is left of the way.
+# Minimum step, as a share of the remaining displacement.
 _SHORTEST = 1e-4
 
 
 class CarryingDescent(NewtonDescent):
-    """The descent of `NewtonDescent`, whose fixed vertices can be carried elsewhere."""
+    """`NewtonDescent` whose fixed vertices can be moved to new positions."""
 
     def place(self, uv: FloatArray) -> None:
-        """Go on from another injective map (n, 2), its fixed vertices where they are in it."""
+        """Continue from another injective map (n, 2), with the fixed vertices at their positions in it."""
         self.w, self._pinned = in_units(uv, self.exponent), uv[self.fixed]
         self._look()
 
     def carry(self, target: FloatArray, tolerance: float, steps: int) -> float:
-        """Take the fixed vertices to a target (k, 2), or as far as the triangles let them.
+        """Move the fixed vertices to a target (k, 2), as far as possible without inverting triangles.
 
-        A map that had to stop on the way is lowered by one step before it goes on.
+        Between two partial moves, one descent step lowers the energy.
 
         Parameters
         ----------
         target : (k, 2) float64
         tolerance : float
-            As of `NewtonDescent.step`.
+            As in `NewtonDescent.step`.
         steps : int
-            To take at most.
+            Maximum number of steps.
 
         Returns
         -------
         float
-            Which share of the way: 1 where they have arrived, to the last bit.
+            Share of the displacement that was reached: 1 if the vertices are exactly at the target.
         """
         left = 1.0
         for k in range(steps):
@@ -65,7 +65,7 @@ class CarryingDescent(NewtonDescent):
         self.value = self.first = self.energy.value_of(self._deformation)
 
     def _carried(self, target: FloatArray) -> float:
-        """Take a step of the way; its length, 1 for all of it and 0 for none."""
+        """Take one step of the displacement; return its length, 1 for all of it and 0 for none."""
         way = np.zeros_like(self.w)
         way[self.fixed] = in_units(target, self.exponent) - self.w[self.fixed]
         self.assemble(0.0)
@@ -87,7 +87,7 @@ class CarryingDescent(NewtonDescent):
         return 0.0
 
     def _pull(self, way: ComplexArray) -> ComplexArray:
-        """The second derivative, clamped as in the matrix, times a displacement (n,): what it is at the free ones."""
+        """Product of the clamped second derivative with a displacement (n,), at the free vertices."""
         corners, g = self.energy.F.T, self.energy.g
         form = self.energy.curvature_of(self._deformation)
         p, q = form.apply((g.conj() * way[corners]).sum(axis=0), (g * way[corners]).sum(axis=0))

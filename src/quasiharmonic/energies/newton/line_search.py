@@ -1,4 +1,4 @@
-"""One line search for every descent: Armijo's rule, and steps beyond Newton's."""
+"""Line search for all descents: backtracking with Armijo's rule, and extension beyond Newton's step."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from quasiharmonic.util.progress import heartbeat
 
 S = TypeVar("S")
 
-# Fraction of the decrease that the gradient promises which a step must achieve (Armijo's condition).
+# Minimum decrease of a step, as a fraction of the expected decrease (Armijo's condition).
 _SUFFICIENT = 1e-4
 
 
 class Taken(NamedTuple, Generic[S]):
-    """A step that was accepted.
+    """An accepted step.
 
     Attributes
     ----------
     t : float
         Its length, in units of the direction.
     value : float
-        Of the function, there.
+        The function's value there.
     there : S
-        What the trial has made of it.
+        The state that the trial returned.
     """
 
     t: float
@@ -31,7 +31,7 @@ class Taken(NamedTuple, Generic[S]):
     there: S
 
 
-#: From a length and a bound to the value there and, if that is below the bound and nothing else forbids it, the state.
+#: Takes a length and a bound; returns the value there, and the state if the value is below the bound and accepted.
 Trial = Callable[[float, float], tuple[float, S | None]]
 
 
@@ -48,7 +48,7 @@ def backtrack(
     tries: int,
     factor: Callable[[float, float], float] = _half,
 ) -> Taken[S] | None:
-    """Try one length after the other until the function falls as much as it should.
+    """Try successive step lengths until the function decreases sufficiently.
 
     Parameters
     ----------
@@ -57,18 +57,18 @@ def backtrack(
     before : float
         The function's value at the start.
     expected_decrease : float
-        The rate at which it falls along the direction, to first order; positive.
+        Rate of decrease along the direction, to first order; positive.
     longest : float
         The first length.
     tries : int
-        Lengths at most.
+        Maximum number of lengths.
     factor : callable
-        From a length and the value there to what the next length is shorter by.
+        Takes a length and the value there; returns the factor for the next length.
 
     Returns
     -------
     Taken or None
-        The first that is accepted.
+        The first accepted step.
     """
     t = longest
     for _ in range(tries):
@@ -81,18 +81,18 @@ def backtrack(
 
 
 def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf"), *, longer: float = 2.0) -> Taken[S]:
-    """Lengthen a step that went well in full for as long as the function falls.
+    """Lengthen an accepted full step as long as the function decreases.
 
-    Far from the minimum barriers fall by powers, and Newton's step is several times too short.
+    Far from the minimum, barriers decrease like powers, and Newton's step is several times too short.
 
     Parameters
     ----------
     trial, taken
-        As of `backtrack`.
+        As in `backtrack`.
     limit : float
-        The longest length.
+        Maximum length.
     longer : float
-        How many times as long the next length is; above 1.
+        Ratio of successive lengths; above 1.
     """
     while taken.t >= 1 and longer * taken.t <= limit:
         heartbeat()

@@ -1,4 +1,4 @@
-"""Projected Newton steps down a deformation energy, each of which ends in an injective map (§10, §11).
+"""Projected Newton descent of a deformation energy; the map after every step is injective (§10, §11).
 
 ::
 
@@ -8,9 +8,8 @@
                                                   └── next map
 
 The second derivative of the energy is made positive definite triangle by triangle, in closed form
-(`quasiharmonic.energies.energies`). While collapsing triangles cut the steps short, negative eigenvalues enter with
-their absolute values, which aims less far and gets further; afterwards they are clamped at zero, which
-converges faster.
+(`quasiharmonic.energies.energies`). While collapsing triangles shorten the steps, negative eigenvalues are replaced by
+their absolute values, which allows longer steps. Afterwards they are clamped to zero, which converges faster.
 """
 
 from __future__ import annotations
@@ -28,94 +27,94 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
 
-# Fraction of the step at which the first triangle would collapse; no longer step is tried.
+# Maximum step, as a fraction of the step at which the first triangle would collapse.
 FRACTION = 0.9
-# The step is halved, and then doubled, this often before the direction is given up.
+# Maximum number of halvings, and then of doublings, of a step along one direction.
 HALVINGS = 30
-# Raised diagonals, one after the other until a factorisation exists. Rounding alone moves the eigenvalues
-# by the first, and where triangles span many orders of magnitude they are as small as that.
+# Relative increases of the diagonal, tried in turn until a factorisation exists. Rounding alone changes the eigenvalues
+# by about the first. They can be this small where triangle sizes span many orders of magnitude.
 SHIFTS = 1e-15, 1e-12, 1e-9, 1e-6, 1e-3
-# Steps shorter than this share count as cut short, and longer ones as in full; these are tried so many times as long.
+# Steps shorter than the first value count as shortened, others as full. Full steps are extended by the second factor.
 _SHORT, _LONGER = 0.25, 1.5
-# A step that lowers the energy by less than this part of the tolerance is idle; after so many in a row the
-# map has come to rest short of convergence.
+# A step that lowers the energy by less than the first value times the tolerance is idle. After this many successive
+# idle steps the descent has stalled.
 _IDLE, _PATIENCE = 1e-2, 3
-# Where a step that promised less than the tolerance brings more than so many times that, the model is pessimistic, and
-# the map not at rest.
+# If a step with an expected decrease below the tolerance gains more than this multiple of the tolerance, the model is
+# pessimistic and the map has not converged.
 _MORE = 4.0
-# A mean energy this small is rounding: the map is an isometry, or a similarity.
+# A mean energy this small is rounding error: the map is an isometry or a similarity.
 _NOTHING = 1e-12
-# Where maps stretch as much as this mean energy says, what clamping adds to the second derivatives may be so much that
-# a long way down looks like a short one: by about the energy, a thousand times where maps are stretched thirty times.
+# Above this mean energy, clamping may increase the second derivatives so much that the expected decrease is far too
+# low. The error is about the energy: a factor of a thousand for a stretch of thirty.
 _STRETCHED = 100.0
 
 
 def in_units(uv: FloatArray, exponent: int) -> ComplexArray:
-    """Positions (n, 2) as complex numbers (n,) in units of ``2 ** exponent``."""
+    """Return positions (n, 2) as complex numbers (n,) in units of ``2 ** exponent``."""
     return np.ldexp(uv, -exponent).view(np.complex128).ravel()
 
 
 def _out_of_units(w: ComplexArray, exponent: int) -> FloatArray:
-    """The way back."""
+    """Return positions (n, 2) from complex numbers (n,) in units of ``2 ** exponent``."""
     return np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
 
 
 class NewtonObjective(Protocol):
-    """What `NewtonDescent` asks of an energy: a barrier on a mesh, such as `DeformationEnergy`.
+    """Interface of the objectives of `NewtonDescent`: a barrier energy on a mesh, such as `DeformationEnergy`.
 
-    What ``deform`` makes of a map is handed to the other methods as it is, and is nobody else's concern.
+    The result of ``deform`` is passed to the other methods; its type is up to the objective.
 
     Attributes
     ----------
     F : (f, 3) int64
     g : (3, f) complex128
-        As `NewtonSystem` has them: each quadratic form of ``curvature_of`` is on one of these triangles.
+        As in `NewtonSystem`; each quadratic form of ``curvature_of`` belongs to one of these triangles.
     """
 
     F: IntArray
     g: ComplexArray
 
     def deform(self, w: ComplexArray) -> Any:
-        """What the other methods read of a map (n,)."""
+        """Data of a map (n,) for the other methods."""
 
     def value_of(self, moment: Any, /) -> float:
-        """The energy; ``inf`` where a triangle is inverted."""
+        """Energy; ``inf`` where a triangle is inverted."""
 
     def gradient_of(self, moment: Any, n: int, /) -> ComplexArray:
-        """The derivative by ``n`` positions; (n,) complex128."""
+        """Derivative with respect to ``n`` positions; (n,) complex128."""
 
     def curvature_of(self, moment: Any, /, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivatives; ``negative`` as `Energy.curvature` has it."""
+        """Second derivatives; ``negative`` as in `Energy.curvature`."""
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
-        """How far along a direction each triangle's area first vanishes; (f,) float64."""
+        """Smallest positive step along a direction at which each triangle's area vanishes; (f,) float64."""
 
 
 class NewtonDescent:
-    """The map at hand and how to get to the next.
+    """State of a Newton descent: the current map and the computation of the next.
 
     Parameters
     ----------
-    energy : Lowered
+    energy : NewtonObjective
         For maps in units of ``2 ** exponent``.
     uv : (n, 2) float64
         An injective map.
     fixed : (k,) int64
-        Vertices that stay where they are in ``uv``, to the last bit.
+        Fixed vertices, which keep their positions in ``uv`` exactly.
     exponent : int
-        Of the unit of computation.
+        Binary exponent of the length unit of the computation.
     linear_solver : str
 
     Attributes
     ----------
     w : (n,) complex128
-        The map, in units.
+        The current map, in units.
     first, value : float
-        What is descended, at the start and now.
+        Objective at the start and now.
     fixed : (k,) int64
-        The vertices that stay.
+        The fixed vertices.
     exponent : int
-        Of the unit of computation.
+        Binary exponent of the length unit of the computation.
     """
 
     def __init__(
@@ -125,7 +124,7 @@ class NewtonDescent:
         self.fixed, self._pinned = fixed, uv[fixed]
         self.exponent = exponent
         self.w: ComplexArray = in_units(uv, exponent)
-        # What is too small for the unit does not come back from it.
+        # Coordinates too small for the unit do not survive the conversion and are stored separately.
         self._faint = np.flatnonzero((_out_of_units(self.w, exponent) != uv).any(axis=1))
         self._faint_uv, self._faint_w = uv[self._faint], self.w[self._faint]
         self.system = self._system(len(uv), linear_solver)
@@ -137,11 +136,11 @@ class NewtonDescent:
 
     @property
     def energies(self) -> tuple[float, float]:
-        """The mean energy at the start and now."""
+        """Mean energy at the start and now."""
         return self.first, self.value
 
     def positions(self, w: ComplexArray) -> FloatArray:
-        """A map as the caller gets it, the fixed vertices and those that have not moved to the last bit."""
+        """Convert a map to positions (n, 2); fixed and unmoved vertices keep their original positions exactly."""
         uv = _out_of_units(w, self.exponent)
         still = w[self._faint] == self._faint_w
         uv[self._faint[still]] = self._faint_uv[still]
@@ -149,26 +148,26 @@ class NewtonDescent:
         return uv
 
     def descend(self, steps: int, tolerance: float) -> Iterator[Status | None]:
-        """Take so many steps at most, and tell after each what `step` does; a status after the last that there is."""
+        """Take at most ``steps`` steps and yield the result of `step` after each; stop at the first status."""
         outcome = None
         while outcome is None and steps > 0:
-            # Overflow gives inf or NaN, and a step with either is never accepted.
+            # Overflow gives inf or NaN. Steps with either are never accepted.
             with np.errstate(all="ignore"):
                 outcome = self.step(tolerance)
             steps -= 1
             yield outcome
 
     def step(self, tolerance: float) -> Status | None:
-        """Take one step; a status where there is no other to take."""
+        """Take one step; return a status if no further step is possible."""
         gradient = self.gradient()
-        # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
+        # While steps are shortened, reflect negative eigenvalues. After a full step, clamp them.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
             direction, expected_decrease, newton = self._direction(gradient, negative)
             small = newton and 0.5 * expected_decrease <= tolerance * (self.value + _NOTHING)
             if small and negative < 0 and self._cut:
-                continue  # the reflected model is pessimistic: only the clamped one may declare an end
+                continue  # the reflected model is pessimistic: only the clamped one may report convergence
             if small and negative == 0 and self.value > _STRETCHED:
-                # The model as it is has the last word, if it has a lowest point that doubles can tell.
+                # The unmodified model decides, if it has a minimum within double precision.
                 true, further, newton = self._direction(gradient, 1.0, SHIFTS[:1])
                 if not newton:
                     self._search(direction, expected_decrease)
@@ -185,12 +184,12 @@ class NewtonDescent:
         return Status.EXHAUSTED
 
     def _check_numbers(self) -> None:
-        """Raise a ValueError where there is no step to take, or no factorisation, as an energy has no numbers."""
+        """Raise a ValueError if the energy or a derivative is NaN, which prevents a step or a factorisation."""
         if isinstance(self.energy, DeformationEnergy):
             self.energy.check_numbers(self._deformation)
 
     def lower(self, energy: NewtonObjective) -> None:
-        """Go on with another energy on the same triangles."""
+        """Continue the descent with another energy on the same triangles."""
         self.energy = energy
         self.system.take_gradients(energy.g)
         self._deformation = energy.deform(self.w)
@@ -198,21 +197,23 @@ class NewtonDescent:
         self._cut, self._shift, self._idle = True, 0, 0
 
     def _system(self, n: int, linear_solver: str) -> NewtonSystem:
-        """The matrix of Newton's steps for ``n`` vertices."""
+        """Return the linear system of Newton's steps for ``n`` vertices."""
         return NewtonSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver)
 
     def gradient(self) -> ComplexArray:
-        """The energy's derivative by the unknowns."""
+        """Derivative of the energy with respect to the unknowns."""
         return self.energy.gradient_of(self._deformation, self.w.size)[self.system.free]
 
     def _direction(
         self, gradient: ComplexArray, negative: float, shifts: tuple[float, ...] = SHIFTS
     ) -> tuple[ComplexArray, float, bool]:
-        """Newton's direction, the rate at which the energy falls along it (the squared decrement), and True;
-        or, where no factorisation exists, the gradient over the diagonal, its rate, and False.
+        """Return Newton's direction, its expected decrease (the squared Newton decrement), and True.
+
+        If no factorisation exists, return the negative gradient divided by the diagonal, its expected decrease, and
+        False.
         """
         self.assemble(negative)
-        # While steps are cut short, what was too little for the last matrix is for this one.
+        # While steps are shortened, skip shifts that were too small for the previous matrix.
         skipped = self._shift if self._cut and shifts is SHIFTS else 0
         found = self.system.descent(gradient, shifts[skipped:], self.solve)
         if found is not None:
@@ -226,16 +227,17 @@ class NewtonDescent:
         return direction, -work(gradient, direction), False
 
     def assemble(self, negative: float) -> None:
-        """Fill in the system's matrix at the map at hand."""
+        """Assemble the system's matrix at the current map."""
         self.system.assemble(self.energy.curvature_of(self._deformation, negative=negative))
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """The displacement of the free vertices under a load on them, the matrix being factored."""
+        """Displacement of the free vertices under a load on them, with the factored matrix."""
         return self.system.solve(load)
 
     def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """The energy of a map (n,) complex128, and the map with what was made of it if it may be gone on from: if its
-        energy is below a bound and every triangle, exactly, positive.
+        """Return the energy of a map (n,) complex128, and the map with its deformation if it is accepted.
+
+        A map is accepted if its energy is below ``bound`` and every triangle is positive, computed exactly.
         """
         deformation = self.energy.deform(w)
         value = self.energy.value_of(deformation)
@@ -243,7 +245,7 @@ class NewtonDescent:
         return value, (w, deformation) if accepted else None
 
     def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
-        """Move along a direction, as far as is good; False where no step lowers the energy enough."""
+        """Line search along a direction; return False if no step lowers the energy enough."""
         if not expected_decrease > 0:
             return False
         full = np.zeros_like(self.w)
@@ -256,7 +258,8 @@ class NewtonDescent:
 
         taken = backtrack(trial, before, expected_decrease, longest=min(1.0, limit), tries=HALVINGS)
         if taken is None:
-            # Where a triangle's area is all rounding, Newton's step is shorter than the spacing of the numbers.
+            # If a triangle's area is at rounding level, Newton's step may be shorter than the spacing of doubles, so
+            # try longer ones.
             doublings = int(np.count_nonzero(2.0 ** np.arange(1, HALVINGS) <= limit))
             taken = backtrack(
                 trial, before, expected_decrease, longest=2.0, tries=doublings, factor=lambda t, value: 2.0

@@ -1,8 +1,7 @@
 """Second derivatives of a deformation energy in vertex positions: assembly, factorisation, solve.
 
-The pattern of the matrix is that of the mesh's edges in 2×2 blocks and never changes, so it is found and
-analysed once. An assembly turns the triangles' quadratic forms into blocks and adds these up into the
-values that the factorisation reads.
+The matrix has the pattern of the mesh's edges in 2×2 blocks. The pattern never changes, so it is computed and analysed
+once. Assembly converts the triangles' quadratic forms to blocks and sums these into the matrix values.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from quasiharmonic.util.progress import heartbeat
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# Triangles whose blocks are formed at a time, so that what is in between stays in the cache.
+# Triangles per chunk; intermediate results of a chunk stay in the cache.
 _CHUNK = 8192
 
 
 class NewtonSystem:
-    """The matrix of ``Σⱼ formⱼ(dp, dq)`` by the positions of the free vertices.
+    """The matrix of ``Σⱼ formⱼ(dp, dq)`` in the positions of the free vertices.
 
-    Unknowns alternate between the x and the y of the free vertices, in ascending order.
+    Unknowns alternate between x and y of the free vertices, in ascending order.
 
     Parameters
     ----------
@@ -41,14 +40,14 @@ class NewtonSystem:
     n : int
         Number of vertices.
     fixed : (k,) int
-        Vertices that do not move.
+        Fixed vertices.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
 
     Attributes
     ----------
     free : (n - k,) int64
-        The vertices that do, ascending.
+        The free vertices, ascending.
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
@@ -62,15 +61,15 @@ class NewtonSystem:
         self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
 
     def take_gradients(self, g: ComplexArray) -> None:
-        """Have other gradients (3, f) of the hat functions on the same triangles, as another scale gives them."""
+        """Set new gradients (3, f) of the hat functions on the same triangles, for example for another scale."""
         self._g = np.ascontiguousarray(g, dtype=np.complex128)
 
     def _pattern(self, F: IntArray, place: NDArray[np.int32]) -> None:
-        """Where the blocks go."""
+        """Compute the sparsity pattern and the slots of the blocks."""
         size = self.free.size
         edges = stiffness_pattern(F, place, size)
         row, column = edges.row, edges.column
-        # Row 2i holds xx and xy of the diagonal block and then of the others, row 2i + 1 yy and then yx, yy.
+        # Row 2i has xx and xy of the diagonal block and then of the others, row 2i + 1 has yy and then yx, yy.
         degree = np.bincount(row, minlength=size)
         upper = np.append(0, np.cumsum(4 * degree + 3))
         lower = upper[:-1] + 2 * degree + 2
@@ -86,7 +85,7 @@ class NewtonSystem:
         self._first = self._indptr[:-1]
 
         # By triangle: the first entries of both rows of the blocks of its sides, from lower to higher free vertex, and
-        # of its corners. What belongs to a fixed vertex goes where nobody looks, behind the matrix.
+        # of its corners. Blocks of fixed vertices go to unused entries behind the matrix.
         self._sums = np.empty(upper[-1] + 2)
         self._values = self._sums[:-2]
         corner = place[F.T]
@@ -100,12 +99,12 @@ class NewtonSystem:
         of_corners[0, free], of_corners[1, free] = upper[of], lower[of] - 1
 
     def assemble(self, form: QuadraticForm) -> None:
-        """Add up the triangles' quadratic forms.
+        """Sum the triangles' quadratic forms into the matrix.
 
         Parameters
         ----------
         form : QuadraticForm
-            On every triangle, with its area and weight in it.
+            On every triangle, multiplied by its area and weight.
         """
         heartbeat()
         pp, qq = (np.ascontiguousarray(field, dtype=np.float64) for field in (form.pp, form.qq))
@@ -122,11 +121,11 @@ class NewtonSystem:
 
     @property
     def diagonal(self) -> FloatArray:
-        """The assembled matrix's, (2 (n - k),) float64."""
+        """Diagonal of the assembled matrix, (2 (n - k),) float64."""
         return self._diagonal
 
     def matrix(self) -> csr_array:
-        """The assembled matrix, both of its triangles; for study and tests."""
+        """The full symmetric matrix as assembled, for inspection and tests."""
         from scipy.sparse import csr_array, triu
 
         size = self._first.size
@@ -139,16 +138,15 @@ class NewtonSystem:
         Parameters
         ----------
         shift : float
-            Fraction by which the diagonal is raised. Measured on the diagonal, it means the same to
-            triangles of any size.
+            Relative increase of the diagonal. Because it is relative, its effect does not depend on triangle size.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When the matrix, as rounded, is not positive definite.
+            When the rounded matrix is not positive definite.
         """
         diagonal = self._diagonal * (1 + shift)
-        # A vertex whose triangles leave it free to move gets a one of its own.
+        # Where the triangles give no stiffness, use 1 on the diagonal.
         self._values[self._first] = np.where(diagonal > 0, diagonal, 1)
         self.solver.factor(self._values)
 
@@ -168,24 +166,26 @@ class NewtonSystem:
         shifts: Sequence[float],
         solve: Callable[[ComplexArray], ComplexArray] | None = None,
     ) -> tuple[ComplexArray, float, int] | None:
-        """Newton's direction by the assembled matrix, its diagonal raised as much as a factorisation needs.
+        """Newton's direction for the assembled matrix, with the diagonal raised as far as the factorisation requires.
 
         Parameters
         ----------
         gradient : (n - k,) complex128
-            By the free vertices' positions.
+            With respect to the free vertices' positions.
         shifts : sequence of float
-            Fractions by which the diagonal is raised, tried in turn.
+            Relative increases of the diagonal, tried in turn.
         solve : callable, optional
-            From a load to the displacements under it, with the matrix factored; `solve` by default.
+            Maps a load to displacements, with the factored matrix; `solve` by default.
 
         Returns
         -------
         direction : (n - k,) complex128
         expected_decrease : float
-            The rate at which the energy falls along it (the squared decrement); not negative.
+            Rate of decrease of the energy along the direction (the squared Newton decrement); not negative.
         number : int
-            Of the shift that did. Instead of all three, None where no shift leaves a positive definite matrix.
+            Index of the successful shift.
+
+        If no shift gives a positive definite matrix, None is returned instead.
         """
         for number, shift in enumerate(shifts):
             try:
@@ -199,7 +199,7 @@ class NewtonSystem:
         return None
 
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:
-        """The load divided by the matrix's diagonal: what is left when no factorisation exists."""
+        """Divide the load by the matrix's diagonal, as a fallback if no factorisation exists."""
         diagonal = np.where(self._diagonal > 0, self._diagonal, 1)
         return (np.ascontiguousarray(load).view(np.float64) / diagonal).view(np.complex128)
 
@@ -217,7 +217,7 @@ def add_up(
     turns: FloatArray,
     values: FloatArray,
 ) -> None:
-    """Fill in the entries of a matrix to which triangles' quadratic forms add up.
+    """Fill in the matrix values with the sum of the triangles' quadratic forms.
 
     Parameters
     ----------
@@ -226,11 +226,11 @@ def add_up(
     g : (3, f) complex128
         Half the gradients of the hat functions.
     slots : (2, 2, 3, f) int32
-        Where rows of blocks begin in ``values``: of the triangles' sides and of their corners, upper rows and lower.
+        First entries in ``values`` of the upper and lower rows of blocks, for the sides and the corners of triangles.
     turns : (3, f) float64
-        Of the sides: 1, or -1 where they run from the higher vertex to the lower, and the block is transposed.
+        1 for each side, or -1 if it runs from the higher vertex to the lower, so that the block is transposed.
     values : float64
-        The first entries of corners' lower rows, which are below the diagonal, are not in it.
+        Matrix values. In the lower rows of corners, the first entries are below the diagonal and not stored.
     """
     # With dp and dq written out, the form is the real part of Σ Mᵢⱼ conj(dwᵢ) dwⱼ + Nᵢⱼ dwᵢ dwⱼ.
     values[:] = 0

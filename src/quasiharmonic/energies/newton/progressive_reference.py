@@ -1,19 +1,19 @@
-"""Steps from afar: down the symmetric Dirichlet energy by way of references between rest and the map.
+"""Progressive references: minimise symmetric Dirichlet from a distant start through intermediate rest shapes.
 
-Where a map has shrunk a limb to ``σ = 1e-8`` the energy is ``σ⁻² = 1e16``, and of what other triangles want nothing is
-left in it. Newton's step takes σ to 4/3 σ. So distortion is not measured against rest but against *references* [1]_.
-A triangle whose map is ``U diag(σ₁, σ₂) Vᵀ`` gets the reference ``V diag(σ₁, σ₂)^(1 − t) Vᵀ``, and against that its
-singular values are ``σ₁ᵗ, σ₂ᵗ``. With one t for all triangles none of them is further than `REACH` from its reference,
-all of a limb wants to grow by its part of the way, and a step down the reweighted proxies of this energy
-(`quasiharmonic.energies.newton.reweighted`) brings it there: t grows from step to step, and with t = 1 the references
-are at rest.
+Where a map has shrunk a limb to ``σ = 1e-8``, the energy is ``σ⁻² = 1e16`` and the contribution of other triangles is
+lost in rounding. A Newton step increases σ only to 4/3 σ. So distortion is measured against *references* [1]_ instead
+of the rest shapes. A triangle whose map is ``U diag(σ₁, σ₂) Vᵀ`` gets the reference ``V diag(σ₁, σ₂)^(1 − t) Vᵀ``.
+Against this its singular values are ``σ₁ᵗ, σ₂ᵗ``. One t is chosen for all triangles, so that every triangle is within
+`REACH` of its reference. Then a whole limb grows at once, and one step on the reweighted proxies of this energy
+(`quasiharmonic.energies.newton.reweighted`) brings it there. t grows from step to step; at t = 1 the references are the
+rest shapes.
 
 ::
 
     map ──▶ largest |log σ| ──▶ t ──▶ references ──▶ one step ──▶ less than half the energy? ──▶ next
                                                                          no: Newton's steps ◀──┘ yes
 
-In the sum triangles count by their area at rest, as in the energy, and those that are far a little more.
+Triangles are weighted by rest area, as in the energy, with a slightly higher weight if they are far from rest.
 
 References
 ----------
@@ -35,30 +35,30 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 #: Singular values against the references are between this and its inverse.
 REACH = 30.0
-# Triangles count by this power of one plus their density.
+# Weights of triangles are multiplied by this power of one plus their density.
 _POWER = 0.25
-# The approach goes on as long as each step leaves less than this share of the energy.
+# The approach continues while each step leaves less than this share of the energy.
 _WORTH = 0.5
 
 
 class RelativeDirichlet(DeformationEnergy):
-    """Symmetric Dirichlet against references between rest and a map, for one step from that map.
+    """Symmetric Dirichlet energy against references between rest and a map, for one step from that map.
 
     Parameters
     ----------
     energy : DeformationEnergy
         Against rest; its density is `SymmetricDirichlet`.
     at : Deformation
-        Of the map, by that energy.
+        Deformation of the map, from ``energy``.
     share : float
-        t, in (0, 1): the singular values at the map become their powers with this exponent.
+        t, in (0, 1): the exponent of the singular values at the map.
     """
 
     def __init__(self, energy: DeformationEnergy, at: Deformation, share: float) -> None:
         self.energy, self.F, self._least_places = energy.energy, energy.F, energy._least_places
         a, b = (sigma ** (1 - share) for sigma in _singular_values(at))
         det = a * b
-        # The reference is the image of z by s z + c z̄, and stretches where the map does.
+        # The reference is the image of z under s z + c z̄, and is stretched in the same direction as the map.
         s, c = 0.5 * (a + b), 0.5 * (a - b) * at.q * at.p.conj() * inverse(np.abs(at.p) * np.abs(at.q))
         self.g: ComplexArray = (s * energy.g - c * energy.g.conj()) / det
         self.share: FloatArray = energy.share * (1 + energy.energy.density(at)) ** _POWER
@@ -66,38 +66,38 @@ class RelativeDirichlet(DeformationEnergy):
         self._proxies = ReweightedDirichlet(np.inf)
 
     def curvature_of(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivatives of the proxies, which are positive definite; ``negative`` plays no part."""
+        """Second derivatives of the proxies, which are positive definite; ``negative`` is ignored."""
         return self._proxies.curvature(d).scaled(self.share)
 
 
 def _singular_values(d: Deformation) -> tuple[FloatArray, FloatArray]:
-    """The larger and the smaller one on every triangle; (f,) float64 each."""
+    """Larger and smaller singular value of every triangle; (f,) float64 each."""
     larger = np.abs(d.p) + np.abs(d.q)
     return larger, d.det / larger
 
 
 def relative(energy: DeformationEnergy, at: Deformation) -> RelativeDirichlet | None:
-    """The energy against references within reach of a map; None where rest itself is."""
+    """Return the energy against references within reach of a map, or None if rest itself is within reach."""
     larger, smaller = _singular_values(at)
     farthest = max(float(np.log(larger.max())), -float(np.log(smaller.min())))
-    # Also where doubles do not tell how far it is.
+    # None also if the distance is not finite in double precision.
     return RelativeDirichlet(energy, at, np.log(REACH) / farthest) if np.log(REACH) < farthest < np.inf else None
 
 
 def descend(descent: NewtonDescent, steps: int, tolerance: float) -> Iterator[Status | None]:
-    """As `NewtonDescent.descend`, beginning with an approach where the energy is symmetric Dirichlet and the map far.
+    """Descend like `NewtonDescent.descend`, after a progressive approach for symmetric Dirichlet from distant maps.
 
     Parameters
     ----------
     descent : NewtonDescent
-        Whose vertices move as they will: with boundaries that slide there is no approach.
+        Without sliding boundary vertices; these have no approach.
     steps, tolerance
-        As of `NewtonDescent.descend`.
+        As in `NewtonDescent.descend`.
 
     Yields
     ------
     Status or None
-        After every step; a status after the last that there is. The energy falls at every step of the approach too.
+        After every step; a status ends the descent. The energy also decreases at every step of the approach.
     """
     taken = 0
     energy = descent.energy
@@ -116,7 +116,10 @@ def descend(descent: NewtonDescent, steps: int, tolerance: float) -> Iterator[St
 
 
 def _approached(descent: NewtonDescent, energy: DeformationEnergy) -> bool:
-    """Take one step towards references; False, the map as it was, where rest is near or the energy does not fall."""
+    """Take one step towards references.
+
+    Return False, with the map unchanged, if rest is within reach or the energy does not decrease.
+    """
     start, value = descent.w, descent.value
     towards = relative(energy, energy.deform(start))
     if towards is None:
@@ -127,7 +130,7 @@ def _approached(descent: NewtonDescent, energy: DeformationEnergy) -> bool:
         descent.step(0.0)
         closer = energy.value(descent.w) < value
     finally:
-        # Also when the user has interrupted the step.
+        # Restore the map even if the user interrupts the step.
         if not closer:
             descent.w = start
         descent.lower(energy)

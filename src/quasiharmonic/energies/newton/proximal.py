@@ -1,13 +1,13 @@
-"""Newton steps down a deformation energy that keep a map near others: those before and after it in a sequence.
+"""Newton steps on a deformation energy with a proximal term, which keeps a map near its neighbours in a sequence.
 
-To the mean energy E is added what vertices do that are further than ``s`` of their lengths r from where another map a
-has them, the mean over all n vertices::
+A penalty is added to the mean energy E for vertices further than ``s`` lengths r from their positions in another map a.
+It is the mean over all n vertices::
 
     E(w) + (k/n) Σₐ Σᵥ max(0, |wᵥ − aᵥ| / rₐ − s)²
 
-Nothing is asked of a vertex that has not gone so far, so a map that need not hurry is the one of least energy. The
-term is convex and separate for each vertex: its second derivative, ``2k/(n r²)`` along the way that the vertex has gone
-and ``1 − s r/|w − a|`` of that across, is a 2×2 block of the matrix that is there.
+Vertices within this distance are not penalised, so the result is the minimum of the energy if that is near enough. The
+term is convex and separate for each vertex. Its second derivative is ``2k/(n r²)`` along the vertex's displacement, and
+``1 − s r/|w − a|`` of that across. It is a 2×2 block in the existing matrix pattern.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Neighbour:
-    """A map to keep near to.
+    """A neighbouring map in the sequence.
 
     Attributes
     ----------
     uv : (n, 2) float64
     length : float
-        What counts as one length between the two maps; positive.
+        Length unit r for displacements between the two maps; positive.
     """
 
     uv: FloatArray
@@ -42,30 +42,30 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class Nearness:
-    """How much nearness counts.
+    """The proximal penalty.
 
     Attributes
     ----------
     weight : float
-        k, beside a mean energy.
+        k, relative to a mean energy.
     within : float
-        s: as many lengths as a vertex may go for nothing.
+        s: displacement without penalty, in lengths.
     """
 
     weight: float
     within: float
 
     def value(self, away: ComplexArray) -> float:
-        """The term for displacements (n,) in lengths."""
+        """Value of the penalty for displacements (n,) in lengths."""
         return self.weight * float(np.mean(self._excess(np.abs(away)) ** 2))
 
     def gradient(self, away: ComplexArray) -> ComplexArray:
-        """Its derivative by the displacements, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
+        """Derivative with respect to the displacements, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
         far = np.abs(away)
         return 2 * self.weight / away.size * self._excess(far) * _direction(away, far)
 
     def blocks(self, away: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Its second derivatives by the displacements, xx, xy and yy of each vertex's block; (n,) float64 each."""
+        """Second derivatives by the displacements: xx, xy and yy of each vertex's block; (n,) float64 each."""
         far = np.abs(away)
         along = 2 * self.weight / away.size * (far > self.within)
         across = along * self._excess(far) / np.where(far > 0, far, 1)
@@ -79,14 +79,14 @@ class Nearness:
 
 
 class NearDescent(NewtonDescent):
-    """The descent of `NewtonDescent`, near to other maps.
+    """`NewtonDescent` with a proximal penalty towards other maps.
 
     Parameters
     ----------
     energy, uv, fixed, exponent
-        As of `NewtonDescent`.
+        As in `NewtonDescent`.
     system : NewtonSystem
-        Of that mesh and those vertices that move; maps of a sequence share it, one after another. Changed.
+        For this mesh and these free vertices. Maps of a sequence share it, one after another; it is modified.
     neighbours : sequence of Neighbour
     nearness : Nearness
     """
@@ -117,14 +117,14 @@ class NearDescent(NewtonDescent):
         return sum(self.nearness.value((w - other) / length) for other, length in self._others)
 
     def gradient(self) -> ComplexArray:
-        """That of the energy, and of the distance to the others."""
+        """Gradient of the energy plus the penalty."""
         gradient = super().gradient()
         for other, length in self._others:
             gradient += self.nearness.gradient((self.w - other) / length)[self.system.free] / length
         return gradient
 
     def assemble(self, negative: float) -> None:
-        """The energy's matrix, and each vertex's own block."""
+        """Assemble the energy's matrix and add the penalty's block at each vertex."""
         super().assemble(negative)
         for other, length in self._others:
             blocks = self.nearness.blocks((self.w - other) / length)
@@ -132,7 +132,7 @@ class NearDescent(NewtonDescent):
             self.system.add_blocks(xx, xy, yy)
 
     def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """As `NewtonDescent.evaluate_trial`, of the energy with the distance to the others."""
+        """Like `NewtonDescent.evaluate_trial`, for the energy plus the penalty."""
         deformation = self.energy.deform(w)
         mean = self.energy.value_of(deformation)
         value = mean + self._apart(w)
@@ -141,7 +141,7 @@ class NearDescent(NewtonDescent):
 
     @property
     def lowered(self) -> float:
-        """The mean energy of the map at hand, alone."""
+        """Mean energy of the current map, without the penalty."""
         return self.energy.value_of(self._deformation)
 
 

@@ -1,15 +1,14 @@
-"""Symmetric Dirichlet with the second derivatives of reweighted rigid proxies, for maps far from their best.
+"""Symmetric Dirichlet with the second derivatives of reweighted rigid proxies, for maps far from the minimum.
 
-Where a triangle has collapsed to ``σ ≪ 1`` the energy is ``σ⁻²``, and Newton's step takes it to 4/3 σ. The proxy
-``k/2 (σ − 1)²`` with the energy's own slope, ``k = φ'(σ)/(σ − 1)``, has its minimum where the triangle is as large as
-at rest, and a step goes as far in its direction as other triangles allow [1]_: a map that Newton's method brings down
-by a factor of two or three a step falls by a factor of a hundred. Near the minimum the proxies forget how triangles
-resist shear, and Newton's own second derivatives are better.
+On a collapsed triangle, ``σ ≪ 1``, the energy is ``σ⁻²`` and Newton's step increases σ only to 4/3 σ. The proxy
+``k/2 (σ − 1)²`` has the same first derivative with ``k = φ'(σ)/(σ − 1)``. Its minimum is at the triangle's rest size,
+and a step goes as far in its direction as other triangles allow [1]_. Newton's method lowers the energy by a factor of
+two or three per step, the proxies by a factor of a hundred. Near the minimum the proxies ignore the resistance to
+shear, so Newton's second derivatives are better.
 
-Where sizes span many orders of magnitude, as along a limb that a disk has shrunk to nothing, the smallest triangles
-would be far ahead of all others: they end the step before anything else has moved. So no triangle aims at more than
-so many times its own size: the proxy is ``k/2 (σ − σ*)²`` with ``σ*`` between ``σ/aim`` and ``aim · σ``, and all of the
-limb grows at once.
+Where sizes span many orders of magnitude, as along a limb shrunk by a disk map, the smallest triangles would end the
+step before others move. So each triangle aims at a limited multiple of its size. The proxy is ``k/2 (σ − σ*)²`` with
+``σ*`` between ``σ/aim`` and ``aim · σ``, and the whole limb grows at once.
 
 References
 ----------
@@ -26,7 +25,7 @@ from quasiharmonic.geometry.mesh.reference import blocks
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 from quasiharmonic.util.kernels import compiled
 
-#: How far a triangle aims at least and at most, in multiples of its size.
+#: Lower and upper bound of the aim, in multiples of a triangle's size.
 NEAREST, FARTHEST = 5.0, 1000.0
 
 
@@ -36,7 +35,7 @@ class ReweightedDirichlet(SymmetricDirichlet):
     Parameters
     ----------
     aim : float
-        Singular values are to become at most so many times as large or as small, and 1 where that is nearer; above 1.
+        Maximum factor by which singular values aim to grow or shrink towards 1; above 1.
     """
 
     def __init__(self, aim: float = FARTHEST) -> None:
@@ -44,13 +43,14 @@ class ReweightedDirichlet(SymmetricDirichlet):
 
     @classmethod
     def at(cls, mean: float) -> ReweightedDirichlet:
-        """For a map of this mean energy: it aims as far as an average triangle has to go, ``σ⁻² = mean``."""
+        """Energy with the aim suited to a mean energy: the distance of an average triangle, ``σ⁻² = mean``."""
         return cls(min(max(mean**0.5, NEAREST), FARTHEST))
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """That of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with left singular vectors uᵢ, goals σᵢ* and rotation R held.
+        """Second derivative of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with constant uᵢ, σᵢ* and R.
 
-        ``negative`` plays no part: the form is positive definite.
+        Here uᵢ are the left singular vectors, σᵢ* the goals and R the rotation. The form is positive definite, so
+        ``negative`` is ignored.
         """
         both, mixed, none = np.empty(d.det.size), np.empty_like(d.p), np.zeros_like(d.p)
         rigid_proxies(d.p, d.q, d.det, self.aim, both, mixed)
@@ -61,12 +61,12 @@ class ReweightedDirichlet(SymmetricDirichlet):
 def rigid_proxies(
     p: ComplexArray, q: ComplexArray, det: FloatArray, aim: float, both: FloatArray, mixed: ComplexArray
 ) -> None:
-    """Fill in ``k₁ + k₂`` and ``2 (k₁ − k₂)`` times the conjugate of p q over its absolute value, (f,)."""
+    """Fill ``both`` with ``k₁ + k₂`` and ``mixed`` with ``2 (k₁ − k₂)`` times the conjugate of p q / |p q|, (f,)."""
     for part in blocks(det.size):
         size_p, size_q = np.abs(p[part]), np.abs(q[part])
         larger = size_p + size_q
         k1, k2 = _factor(larger, aim), _factor(det[part] / larger, aim)
-        # Twice the angle of u₁ is that of p q; a triangle that is not sheared has no u₁, and k₁ = k₂.
+        # The angle of u₁ is half that of p q. A triangle without shear has no u₁, but then k₁ = k₂.
         both[part] = k1 + k2
         mixed[part] = 2 * (k1 - k2) * (p[part] * q[part]).conj() * inverse(size_p) * inverse(size_q)
 
@@ -74,6 +74,6 @@ def rigid_proxies(
 def _factor(sigma: FloatArray, aim: float) -> FloatArray:
     """``(2σ − 2σ⁻³)/(σ − σ*)``, positive at ``σ = σ* = 1`` too."""
     rigid = 2 * (sigma + 1) * (sigma**2 + 1) / sigma**3
-    # Of σ − 1 and σ − σ* the first is the longer way where σ* is held back.
+    # |σ − 1| exceeds |σ − σ*| where the aim limits σ*.
     held = np.where(sigma < 1, (aim - 1) * sigma, (1 - 1 / aim) * sigma)
     return rigid * np.maximum(1, np.abs(sigma - 1) / held)

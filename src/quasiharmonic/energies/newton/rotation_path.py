@@ -1,15 +1,16 @@
-"""Steps along which triangles turn as they go, for maps that have far to turn.
+"""Curved search paths along which triangles rotate, for maps with large rotations.
 
-A strip that rolls up hardly strains its triangles but turns them by whole turns. Along a straight line a triangle that
-turns by θ grows by ``√(1 + θ²)``, so the energy lets a step turn it by little, and hundreds of steps are taken in full
-that lower the energy by a hundredth each. With ``θ = Im dp/p`` the angular velocity of a triangle along a direction::
+A strip that rolls up hardly strains its triangles but rotates them by whole turns. Along a straight line, a triangle
+that rotates by θ grows by ``√(1 + θ²)``. So the energy permits only small rotations per step. Hundreds of full steps
+each lower the energy by one percent. With the angular velocity ``θ = Im dp/p`` of a triangle along a direction, the
+path::
 
     p(t) = e^{iθt} (p + t (dp − iθp)),    q(t) = e^{iθt} (q + t (dq − iθq))
 
-begins as the straight line does and turns it as far as one likes without strain. Triangles that turn by themselves do
-not fit together; the map whose derivatives are nearest these, by areas at rest, is one solve with a Laplacian that
-does not change. What fits already stays as it is, so the path has the line's direction at its start, and a step along
-it is promised what Newton's step is.
+is tangent to the straight line and rotates the triangle without strain. Triangles rotated separately do not fit
+together. The map whose derivatives are closest to these, weighted by rest area, is the solution of a linear system with
+a constant Laplacian. At first order the triangles fit, so the path is tangent to the direction. A step along it has the
+same expected decrease as Newton's step.
 """
 
 from __future__ import annotations
@@ -24,57 +25,57 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 
 def rates(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> ComplexArray:
-    """``dp/p``: how every triangle (f,) of a map (n,) begins to grow along a direction, and ``i`` times its turning."""
+    """``dp/p`` of every triangle (f,) along a direction: the growth rate plus ``i`` times the angular velocity."""
     corners = F.T
     rate: ComplexArray = np.sum(g.conj() * direction[corners], axis=0) / np.sum(g.conj() * w[corners], axis=0)
     return rate
 
 
 class Turning:
-    """Paths for maps of one mesh.
+    """Rotation paths for maps of one mesh.
 
     Parameters
     ----------
     F : (f, 3) int64
-        Triangles, each vertex in one at least.
+        Triangles; each vertex is in at least one.
     g : (3, f) complex128
-        Half the gradients of the hat functions, as `NewtonSystem` has them.
+        Half the gradients of the hat functions, as in `NewtonSystem`.
     n : int
         Number of vertices.
     fixed : (k,) int
-        Vertices that do not move; one in each component at least.
+        Fixed vertices, at least one in each component.
     linear_solver : str
 
     Raises
     ------
     quasiharmonic.linsolve.NotPositiveDefinite
-        As `of` knows it.
+        When rounding leaves no positive definite Laplacian, because rest triangles differ too much; see `of`.
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
         self._F, self._corners = F, np.ascontiguousarray(F.T)
         self._g = g
-        # The gradients' cross product says how large the triangle is, up to a factor that all have in common.
+        # The cross product of the gradients gives the area up to a common factor.
         self._area: FloatArray = 1 / np.abs((g[1].conj() * g[2]).imag)
         stiffness = 2 * self._area * (g * g[(1, 2, 0), :].conj()).real
         self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(stiffness)
 
     @classmethod
     def of(cls, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> Turning | None:
-        """Make one; None where rest triangles differ so much that rounding leaves no positive definite Laplacian."""
+        """Create a `Turning`, or return None if rounding leaves no positive definite Laplacian."""
         try:
             return cls(F, g, n, fixed, linear_solver)
         except NotPositiveDefinite:
             return None
 
     def path(self, w: ComplexArray, direction: ComplexArray) -> Callable[[float], ComplexArray]:
-        """Lay a path through a map (n,) complex128 along a direction (n,), which is zero at the fixed vertices.
+        """Return a path through a map (n,) complex128 along a direction (n,), which is zero at the fixed vertices.
 
         Returns
         -------
         callable
-            From a length t to the map there, in first order ``w + t · direction``. It may raise
-            `quasiharmonic.linsolve.NotPositiveDefinite` where rounding leaves no digit of it.
+            Maps a length t to a map, ``w + t · direction`` to first order. It may raise
+            `quasiharmonic.linsolve.NotPositiveDefinite` if rounding leaves no correct digit.
         """
         (p, q), (dp, dq) = self._derivatives(w), self._derivatives(direction)
         angle = rates(self._F, self._g, w, direction).imag
@@ -95,6 +96,6 @@ class Turning:
         return np.sum(self._g.conj() * corners, axis=0), np.sum(self._g * corners, axis=0)
 
     def _gathered(self, load: ComplexArray, n: int) -> ComplexArray:
-        """Sum up at every vertex (n,) what its corners have, (3, f)."""
+        """Sum the loads (3, f) of triangle corners at every vertex (n,)."""
         at, load = self._corners.ravel(), load.ravel()
         return np.bincount(at, load.real, minlength=n) + 1j * np.bincount(at, load.imag, minlength=n)

@@ -1,19 +1,20 @@
-"""Newton steps in the places of free vertices and the arc lengths of sliding ones.
+"""Newton steps in the positions of free vertices and the arc lengths of sliding boundary vertices.
 
-A vertex that slides has one unknown, a length δ along its curve: to first order it moves by ``δ τ``, with τ the unit
-tangent, and to second order by ``½ κ δ² iτ`` to the side. With P the matrix that takes unknowns to displacements, g the
-energy's gradient by positions and H its second derivative::
+A sliding vertex has one unknown, a length δ along its curve. To first order it moves by ``δ τ`` with the unit tangent
+τ, to second order also by ``½ κ δ² iτ``. Let P be the matrix from unknowns to displacements, g the energy's gradient by
+positions and H its second derivative::
 
     gradient  Pᵀ g        Hessian  Pᵀ H P + diag(κ g · iτ)
 
-The unknown across the curve keeps its row and column, emptied, so that the pattern is that of the mesh. A step is laid
-back onto the curve by going the length δ along it.
+The unknown across the curve keeps its row and column, without entries, so that the pattern is that of the mesh. A step
+is projected to the curve by moving the length δ along it.
 
-What is descended is the energy and a little of a barrier that keeps the boundary's edges near the curves
+The objective is the energy plus a small barrier that keeps the boundary's edges near the curves
 (`quasiharmonic.geometry.curves.deviation`).
 
-At a kink the energy has two slopes. If it falls to neither side the vertex rests there for this step; if it falls to
-one, that is where it may go. Where a step over kinks leads nowhere, one that stops at them does.
+At a kink the energy has two one-sided derivatives. If it decreases to neither side, the vertex stays for this step.
+Otherwise it may move to the side with the steeper descent. If a step across kinks does not lower the energy, a step
+that stops at kinks is tried.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
 
-# Of the energy at hand: the weight of the barrier.
+# Weight of the barrier, as a share of the current energy.
 _WEIGHT = 1e-2
 
 
 def lay_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) -> Track:
-    """Put the boundary of an injective map onto the curves it is to slide along.
+    """Move the boundary of an injective map onto the curves it slides along.
 
     Raises
     ------
     ValueError
-        As `BoundaryCurves.lay`; when triangles are inverted by the way onto the curves.
+        As `BoundaryCurves.lay`; when moving the boundary onto the curves inverts triangles.
     """
     track = rails_of(slide, domain.loops, uv).lay(domain.loops, uv)
     inverted = inverted_triangles(domain.F, track.uv)
@@ -59,7 +60,7 @@ def lay_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) -
 
 
 def moved_onto(slide: bool | BoundaryCurves, problem: Problem) -> Problem:
-    """The problem with its boundary's target on the curves that it is to slide along."""
+    """Return the problem with its boundary's target moved onto the curves it slides along."""
     places = np.zeros((problem.n, 2))
     places[problem.fixed] = problem.target
     loops = problem.domain.loops
@@ -67,24 +68,24 @@ def moved_onto(slide: bool | BoundaryCurves, problem: Problem) -> Problem:
     return problem.with_target(track.uv[problem.fixed])
 
 
-#: A map in units, lengths along the curves, the map's Jacobians, and its energy without the barrier.
+#: A map in units, arc lengths along the curves, the map's Jacobians, and its energy without the barrier.
 _State: TypeAlias = tuple[ComplexArray, FloatArray, Deformation, float]
 
 
 class SlidingSystem(NewtonSystem):
-    """The matrix of Newton's steps in which some vertices have one unknown, the length along their curve.
+    """Newton system in which some vertices have one unknown, the length along their curve.
 
     Parameters
     ----------
     F, g, n, fixed, linear_solver
-        As of `NewtonSystem`; ``fixed`` without those that slide.
+        As in `NewtonSystem`; ``fixed`` without the sliding vertices.
     sliding : (k,) int64
-        Vertices that do.
+        Sliding vertices.
 
     Attributes
     ----------
     sliding : (k,) int64
-        As given, in their order.
+        As given, in the same order.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class SlidingSystem(NewtonSystem):
         place[self.at] = np.arange(sliding.size)
         row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
         ends = place[row // 2], place[self._indices[self._side_slots[0]] // 2]
-        # Blocks of which a row, or a column, belongs to a sliding vertex, and to which.
+        # Blocks with a row or a column of a sliding vertex, and the numbers of these vertices.
         self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
         self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
         self._row = row // 2
@@ -108,7 +109,7 @@ class SlidingSystem(NewtonSystem):
         self.coupling: FloatArray = np.zeros(0)
 
     def couple(self, pairs: IntArray) -> None:
-        """Name pairs (e, 2) of sliding vertices, each an edge of the mesh, between whose unknowns ``coupling`` is."""
+        """Set the pairs (e, 2) of sliding vertices, each an edge of the mesh, to which ``coupling`` belongs."""
         low, high = np.sort(self.at[pairs], axis=1).T
         column = self._indices[self._side_slots[0]] // 2
         size = self.free.size
@@ -117,7 +118,7 @@ class SlidingSystem(NewtonSystem):
         self.coupling = np.zeros(len(pairs))
 
     def assemble(self, form: QuadraticForm) -> None:
-        """Add up the triangles' forms and pass to the unknowns along ``tangent``; ``bend`` is added on the diagonal."""
+        """Sum the triangles' forms in the unknowns along ``tangent``, and add ``bend`` to the diagonal."""
         super().assemble(form)
         values, slots = self._values, self._side_slots
         x, y = self.tangent.real, self.tangent.imag
@@ -138,29 +139,29 @@ class SlidingSystem(NewtonSystem):
 
 
 class SlidingDescent(NewtonDescent):
-    """As `NewtonDescent`, with boundary vertices on curves.
+    """`NewtonDescent` with boundary vertices that slide on curves.
 
     Parameters
     ----------
     energy : DeformationEnergy
     track : Track
-        The map, and what slides where.
+        The map, and the sliding vertices on their curves.
     fixed : (k,) int64
-        Vertices that stay where they are, but for those that slide.
+        Fixed vertices; sliding ones are excluded.
     loops : sequence of (l,) int64
-        The boundary, which may not come to meet itself.
+        The boundary, which must not meet itself.
     exponent : int
     linear_solver : str
-        As of `NewtonDescent`.
+        As in `NewtonDescent`.
     system : SlidingSystem, optional
-        Of an earlier descent on the same triangles with the same ``fixed``: used again if the same vertices slide.
+        From an earlier descent on the same triangles with the same ``fixed``; reused if the same vertices slide.
 
     Attributes
     ----------
-    deviation_barrier, weight : Straying, float
+    deviation_barrier, weight : DeviationBarrier, float
         The barrier and its factor, in the energy's units.
     forces : (k,) float64
-        What the curves' bends add to the second derivative by each sliding vertex's length, in units.
+        Contribution of the curves' curvature to the second derivative for each sliding vertex, in units.
     """
 
     system: SlidingSystem
@@ -185,7 +186,7 @@ class SlidingDescent(NewtonDescent):
         both = (self.deviation_barrier.pairs >= 0).all(axis=1)
         self._both = np.flatnonzero(both)
         self.system.couple(self.deviation_barrier.pairs[both])
-        # A map that is injective and no more may overlap itself further.
+        # A boundary that already overlaps itself may overlap further.
         self._simple = not judge_loops(self._loops, track.uv)[1]
 
     def _system(self, n: int, linear_solver: str) -> SlidingSystem:
@@ -196,21 +197,21 @@ class SlidingDescent(NewtonDescent):
 
     @property
     def energies(self) -> tuple[float, float]:
-        """The mean energy at the start and now, without the barrier."""
+        """Mean energy at the start and now, without the barrier."""
         return self._energies
 
     def _weigh(self) -> None:
-        """Give the barrier its part of the energy at hand, which only falls."""
+        """Set the barrier's weight to its share of the current energy, which only decreases."""
         self.weight = _WEIGHT * self._energies[1]
         self.value = self._energies[1] + self.weight * self.deviation_barrier.value(self._s)
 
     def step(self, tolerance: float) -> Status | None:
-        """Take one step; a status where there is no other to take."""
+        """Take one step; return a status if no further step is possible."""
         self._weigh()
         return super().step(tolerance)
 
     def gradient(self) -> ComplexArray:
-        """By the unknowns: of a sliding vertex the real part counts, and the imaginary one is zero."""
+        """Derivative by the unknowns; for a sliding vertex it is in the real part, and the imaginary part is zero."""
         pull = self.energy.gradient_of(self._deformation, self.w.size)
         at, system = pull[self._track.vertices], self.system
         slopes, self._bends = self._barrier()
@@ -218,20 +219,20 @@ class SlidingDescent(NewtonDescent):
         ahead, curvature = self._track.frame(self._s, np.ones(at.size, dtype=bool))
         back, curvature_back = self._track.frame(self._s, ~kink)
         slope, slope_back = _along(ahead, at) + slopes, _along(back, at) + slopes
-        # Of the sides to which the energy falls, the steeper one.
+        # If the energy decreases to both sides, take the steeper one.
         turned = kink & (slope_back > np.maximum(-slope, 0))
         rests = kink & (slope >= 0) & (slope_back <= 0)
         tangent = np.where(rests, 0, np.where(turned, back, ahead))
         system.tangent = tangent
         self.forces = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * 2.0**self.exponent
-        # A vertex leaves a kink by the side it was given only.
+        # A vertex may leave a kink only to the chosen side.
         self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
         gradient = pull[system.free]
         gradient[system.at] = np.where(tangent == 0, 0, _along(tangent, at) + slopes)
         return gradient
 
     def _barrier(self) -> tuple[FloatArray, FloatArray]:
-        """The barrier's derivatives: by the sliding vertices' lengths, in units, and edge by edge (e, 2, 2)."""
+        """Derivatives of the barrier in units: first by the sliding vertices' lengths, second per edge (e, 2, 2)."""
         by_ends, by_both = self.deviation_barrier.derivatives(self._s)
         unit = self.weight * 2.0**self.exponent
         slopes = np.zeros(self._s.size)
@@ -258,7 +259,7 @@ class SlidingDescent(NewtonDescent):
         return direction, expected_decrease, newton
 
     def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
-        """Move along a direction, as far as is good; False where no step lowers the energy enough."""
+        """Line search along a direction; return False if no step lowers the energy enough."""
         if not expected_decrease > 0:
             return False
         at, vertices = self.system.at, self._track.vertices
@@ -270,7 +271,7 @@ class SlidingDescent(NewtonDescent):
         start, s = self.w, self._s
 
         def going(stops: Sequence[bool]) -> Trial[_State]:
-            """Lay a step back onto the curves, over kinks or stopping at them."""
+            """Evaluate steps projected to the curves, across kinks or stopping at them."""
 
             def trial(t: float, bound: float) -> tuple[float, _State | None]:
                 value, there = np.inf, None
@@ -293,10 +294,10 @@ class SlidingDescent(NewtonDescent):
     def _laid(
         self, w: ComplexArray, s: FloatArray, step: FloatArray, bound: float, *, stop: bool
     ) -> tuple[float, _State | None]:
-        """The energy with the boundary moved along its curves, and the state there if that is good."""
+        """Return the objective with the boundary moved along its curves, and the state if it is accepted."""
         there = self._track.advance(s, step, stop=stop)
         if stop and np.array_equal(there, self._track.advance(s, step)):
-            return np.inf, None  # no kink in the way, and this has been tried
+            return np.inf, None  # no kink within the step, so this repeats the previous trial
         barrier = self.weight * self.deviation_barrier.value(there)
         if barrier == np.inf or not self._track.in_order(there):
             return np.inf, None

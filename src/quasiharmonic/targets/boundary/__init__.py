@@ -1,4 +1,4 @@
-"""Which boundary vertex goes where on an outline.
+"""Correspondence of boundary vertices to positions on an outline.
 
 The package builds on the outlines and on `problem`. Start reading in `boundary_to`, then `correspondence`.
 """

@@ -1,4 +1,7 @@
-"""The boundary of a surface onto an outline: which loop to which contour, which vertex to which place."""
+"""Target positions on an outline for the whole boundary of a surface.
+
+Matches boundary loops to contours, and vertices to positions on them.
+"""
 
 from __future__ import annotations
 
@@ -34,15 +37,16 @@ def boundary_to(
     corners: Corners | Literal["auto"] | None = None,
     corner_angle: float = 20.0,
 ) -> tuple[IntArray, FloatArray]:
-    """Lay the whole boundary of a surface along an outline: ``injective_map(V, F, *boundary_to(V, F, outline))``.
+    """Place the whole boundary of a surface on an outline: ``injective_map(V, F, *boundary_to(V, F, outline))``.
 
-    The boundary loop that encloses the largest area in space goes to the outer contour, the others to
-    the holes that lie nearest to where they are when the surface, its holes filled, is laid into the
-    outer contour. Along each contour vertices are spread by arc length; its corners get vertices of
-    their own. The outer loop begins where it and its contour resemble each other most without being
-    turned (see `arc_length`); holes are turned such that Tutte's embedding is stretched least. Among
-    starts like these one is chosen that leaves room for chords, interior edges between two boundary
-    vertices. Where none does, `flattened_edges` tells which edges to split.
+    The boundary loop that encloses the largest area in space goes to the outer contour. To match the other loops to
+    holes, the surface with filled holes is embedded in the outer contour. Each loop then goes to a hole near its
+    position there. Along each contour, vertices are spread by arc length, and each corner of the contour gets a vertex.
+
+    The outer loop starts where it resembles its contour most without rotation (see `arc_length`). Holes are rotated so
+    that Tutte's embedding has the least stretch. Among these starts, one is chosen that leaves space for chords,
+    interior edges between two boundary vertices. If no start leaves space for all chords, `flattened_edges` lists the
+    edges to split.
 
     Parameters
     ----------
@@ -51,38 +55,40 @@ def boundary_to(
     F : (f, 3) array of int
         Triangles of one connected surface without handles.
     outline : list of (k, 2) float, one (k, 2) float, or str or path
-        An outer contour and as many holes as the surface has further boundary loops, wound as they like.
-        None may cross or touch itself or another. Or the words for one, as `outline` takes them: ``"letter:R"``,
-        ``"rect:2x1"``, ``"drawing.svg"``; its holes are filled for a surface that has none.
+        An outer contour, and one hole for each further boundary loop of the surface, in either orientation. Contours
+        must not cross or touch themselves or each other. A string or path specifies an outline as in `outline`:
+        ``"letter:R"``, ``"rect:2x1"``, ``"drawing.svg"``. Its holes are then filled if the surface has only one
+        boundary loop.
     corners : sequence of int, mapping from int, or "auto", optional
-        Boundary vertices that go to corners of the outline. In a sequence there is one for every corner
-        of its contour, in order from the contour's first (an outline without corners has its first
-        point). A mapping says for every vertex which corner, counted from 0, or which point (x, y) on
-        the outline. The rest is spread between them, so that every run of the boundary keeps to its
-        own side. ``"auto"`` chooses by angle, on the loop and for the contour outside: see
-        `boundary_corners`; convex corners go to convex ones, long sides to long ones.
+        Boundary vertices that go to corners of the outline. A sequence has one vertex for every corner of its contour,
+        in order from the contour's first corner. An outline without corners uses its first point instead. A mapping
+        gives for each vertex the corner's number, counted from 0, or a point (x, y) on the outline. The other vertices
+        are spread between them, so each part of the boundary stays on its side. ``"auto"`` chooses corners of the outer
+        loop by angle (see `boundary_corners`); convex corners go to convex ones, long sides to long ones.
     corner_angle : float
-        Degrees by which an outline turns at a corner, at the least. Lesser bends belong to a curve.
+        Minimum angle in degrees by which an outline turns at a corner. Smaller bends belong to a curve.
 
     Returns
     -------
     fixed : (b,) int64
         The boundary vertices, loop by loop in order.
     target : (b, 2) float64
-        Their places.
+        Their target positions.
 
     Raises
     ------
     ValueError
-        As `Problem` for a malformed, closed or disconnected mesh; as `nested` for contours that meet
-        themselves or each other; when the surface has a handle; when loops and contours differ in
-        number, or the outline is in several pieces; when a contour has more corners than its loop has
-        vertices, or the boundary has so few that it would cross itself; when a corner vertex is not on
-        the boundary, its place not on the outline, or they follow each other in different orders.
+        - As `Problem` for a malformed, closed or disconnected mesh.
+        - As `nested` for contours that meet themselves or each other.
+        - When the surface has a handle, the numbers of loops and contours differ, or the outline has several pieces.
+        - When a contour has more corners than its loop has vertices, or the loop has so few vertices that the boundary
+          would cross itself.
+        - When a corner vertex is not on the boundary, its target is not on the outline, or vertices and targets follow
+          each other in different orders.
     """
     surface = Domain(V, F, [])
     count = surface.n
-    # Numbers of corners are the user's, whichever way the outline runs: the first of them stays the first point.
+    # Corner numbers refer to the user's outline in its own orientation, so its first corner stays the first.
     given = _contours(outline, surface)
     found = arranged(given)
     if not found:
@@ -106,7 +112,7 @@ def boundary_to(
     )
     to = dict(pins.contour_of)
     if 0 not in to.values():
-        # Of the loops that may go anywhere the one around the largest area goes outside.
+        # Of the loops without a given contour, the one that encloses the largest area goes to the outer contour.
         free = [i for i in range(len(loops)) if i not in to]
         to[free[outermost([loops[i] for i in free], space)]] = 0
     outer = next(i for i, contour in to.items() if contour == 0)
@@ -129,19 +135,19 @@ def boundary_to(
 
 
 def _contours(outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str], surface: Domain) -> list[ArrayLike]:
-    """The contours that were given, or that the words for them mean."""
+    """The given contours, or those that the specification describes."""
     if isinstance(outline, str | PathLike):
         meant = specified(outline)
         return list(filled(meant)) if len(surface.loops) == 1 else list(meant)
     if not isinstance(outline, Iterable):
         raise ValueError(f'outline must be contours (k, 2), or words as "letter:R", not {kind_of(outline)}')
     contours = list(outline)
-    # Rows of two numbers are the points of one contour.
+    # A list of pairs of numbers is a single contour.
     return [contours] if contours and all(np.ndim(row) == 1 for row in contours) else contours
 
 
 def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
-    """Raise unless the surface and what the contours enclose are of one topology."""
+    """Raise unless the surface and the region inside the contours have the same topology."""
     loops, f = len(surface.loops), len(surface.F)
     euler = surface.n - len(surface.edges.interior) - len(surface.edges.boundary) + f
     handles = (2 - loops - euler) // 2
@@ -175,7 +181,7 @@ def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
 
 
 def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
-    """Raise when the target is no boundary of a region: too few vertices cut corners until they meet."""
+    """Raise if the target does not bound a region, because too few vertices cut off parts of the outline."""
     places = np.zeros((n, 2))
     places[np.concatenate(loops)] = target
     _, reasons = judge_loops(loops, places)

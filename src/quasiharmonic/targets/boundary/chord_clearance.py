@@ -1,9 +1,8 @@
-"""Corners moved along the boundary so that chords have room.
+"""Choice of the vertices at corners so that chords have space.
 
-A chord, an interior edge between two boundary vertices, cuts off a part of the surface. That part has
-room only if the target bends to the left somewhere between the chord's ends. On a polygon it has to
-have a convex corner there; so the vertices that go to convex corners must be chosen such that no chord
-has both ends on what lies between two of them.
+A chord, an interior edge between two boundary vertices, cuts off a part of the surface. That part has positive area
+only if the target bends to the left between the chord's ends. On a polygon, there must be a convex corner between them.
+So the vertices at convex corners must be chosen such that no chord has both ends between (or at) two successive ones.
 """
 
 from __future__ import annotations
@@ -16,25 +15,25 @@ from quasiharmonic.targets.boundary.correspondence import Held, Stretch, arc, st
 from quasiharmonic.targets.outlines.contours import corners, turns
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# A bend to the left that is one, and not a straight line rounded; radians.
+# Minimum left turn in radians, larger than that of a rounded straight line.
 _BEND = 1e-9
-# How far a vertex may be moved to a corner, as a share of the way around: beyond it the target is not the outline's
-# likeness to the surface any more, and splitting edges does less harm.
+# Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
+# and splitting edges is better.
 FARTHEST = 0.2
 
 
 def make_room(
     s: FloatArray, contour: FloatArray, pins: Held, *, corner_angle: float, chords: IntArray
 ) -> list[tuple[int, float]] | None:
-    """Choose vertices for the convex corners of a contour, near to them along the way, so that chords have room.
+    """Choose vertices for the convex corners of a contour, near them along the loop, so that chords have space.
 
     Parameters
     ----------
     s : (n,) float64
-        Where the vertices of the loop lie along it.
+        Parameters of the vertices along their loop.
     contour : (k, 2) float64
     pins : sequence of (int, float)
-        Vertices with a given place along the contour, in order around; at least one.
+        Vertices with given parameters along the contour, in order around; at least one.
     corner_angle : float
         Degrees.
     chords : (c, 2) int64
@@ -43,9 +42,8 @@ def make_room(
     Returns
     -------
     list of (int, float) or None
-        The pins and the chosen vertices with their corners, in order around; None if no choice makes
-        room for all chords, or only one that moves a vertex by more than a fifth of the way around.
-        Chords across a pin are not looked at.
+        The pins, and the chosen vertices with their corners, in order around. None if no choice leaves space for all
+        chords, or only one that shifts a vertex by more than a fifth of the loop. Chords across a pin are ignored.
     """
     t, bends = arc(contour), turns(contour)
     sharp = corners(contour, corner_angle)
@@ -66,18 +64,18 @@ def make_room(
 
 @dataclass(frozen=True)
 class ChordRoom:
-    """What the convex corners of a stretch must leave between them, side by side.
+    """Conditions on the vertices at convex corners of a stretch.
 
     Attributes
     ----------
     reach : (c + 1,) int64
-        For every vertex of the stretch the least end of a chord that begins there or later. Ascending.
+        For every vertex of the stretch, the smallest end of a chord that begins there or later. Ascending.
     straight : (w + 1,) bool
-        Whether each side, from one convex corner to the next, bends nowhere to the left.
+        Whether each side, from one convex corner to the next, has no left turn.
     spare : (w + 1,) int64
-        Vertices that it needs for other corners.
+        Number of vertices that each side needs for other corners.
     farthest : float
-        How far a vertex may be from the place it takes.
+        Maximum distance of a vertex from the corner that it takes.
     """
 
     reach: IntArray
@@ -87,9 +85,9 @@ class ChordRoom:
 
 
 def reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
-    """`Room.reach` of a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
+    """Compute `ChordRoom.reach` for a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
     count = len(stretch.run) - 1
-    # Either way around the loop; what goes beyond the stretch does not matter.
+    # Chords in both directions around the loop; those that leave the stretch are ignored.
     begin = (np.concatenate([chords[:, 0], chords[:, 1]]) - stretch.run[0]) % n
     length = np.concatenate([chords[:, 1] - chords[:, 0], chords[:, 0] - chords[:, 1]]) % n
     within = begin + length <= count
@@ -99,23 +97,23 @@ def reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
 
 
 def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
-    """How many of some places lie strictly between each two successive ones of ``wanted``, and before and after."""
+    """Numbers of ``others`` before the first, strictly between successive, and after the last of ``wanted``."""
     ends = np.concatenate([[0.0], wanted, [1.0]])
     return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")
 
 
 def choose(along: FloatArray, wanted: FloatArray, room: ChordRoom) -> IntArray | None:
-    """Vertices for wanted places with the least sum of squared distances that leaves room; None if none does.
+    """Choose vertices for wanted parameters with the least sum of squared distances that leave space, or None.
 
-    Row j of ``cost`` holds, for every vertex, the best that can be done for the places up to j when j
-    takes that vertex. The next place may take a vertex that the reach of this one does not include.
+    Row j + 1 of ``cost`` has, for every vertex, the lowest cost of the parameters up to j if j takes that vertex. On a
+    straight side, the next corner must come before the end of any chord that begins at or after this one.
     """
     count = len(along) - 1
     vertex = np.arange(count + 1)
-    # The pin at the beginning is all there is before the first place.
+    # Row 0: before the first parameter there is only the pin at the start.
     cost = [np.where(vertex == 0, 0.0, np.inf)]
     for j in range(len(wanted) + 1):
-        # Those before this vertex that leave room for a chord up to it, and for other corners.
+        # Candidates before this vertex that leave space for a chord up to it, and vertices for other corners.
         low = np.searchsorted(room.reach, vertex, side="right") if room.straight[j] else np.zeros(count + 1, np.int64)
         best = _least(cost[j], low, vertex - room.spare[j])
         if j < len(wanted):
@@ -136,8 +134,8 @@ def choose(along: FloatArray, wanted: FloatArray, room: ChordRoom) -> IntArray |
 
 
 def _least(values: FloatArray, low: IntArray, high: IntArray) -> FloatArray:
-    """The least of ``values[low[i]:high[i]]`` for every i; infinite where that is empty."""
-    # Row k holds the least of every 2ᵏ successive values; any range is two such that overlap.
+    """Minimum of ``values[low[i]:high[i]]`` for every i; infinite where the range is empty."""
+    # Row k has the minimum of every 2ᵏ successive values. Two overlapping ranges of this length cover any range.
     rows = [values]
     while 2 ** len(rows) <= values.size:
         half = 2 ** (len(rows) - 1)

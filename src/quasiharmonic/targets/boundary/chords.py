@@ -1,4 +1,4 @@
-"""Chords, interior edges between two boundary vertices, which have to fit into the target in one piece."""
+"""Chords: interior edges between two boundary vertices, for which the target must leave space."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
 )
 
-# How far a line may bend outwards and count as straight, as a share of the outline's larger side.
+# Maximum outward bend of a straight line, as a share of the outline's larger side.
 STRAIGHT = 1e-9
 
 
 def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
-    """Interior edges between two vertices of a loop, as positions in it, the smaller one first; (c, 2) int64.
+    """Interior edges between two vertices of a loop, as positions in the loop, smaller first; (c, 2) int64.
 
     Parameters
     ----------
@@ -41,23 +41,23 @@ def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
 
 
 def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolerance: float = STRAIGHT) -> IntArray:
-    """Interior edges that the target lays along its own boundary, so that what they cut off has no room.
+    """Interior edges that the target places along its own boundary, so that the part they cut off has no area.
 
-    Between the ends of such an edge the boundary bends nowhere outwards: it runs straight, as along a
-    side of a polygon, or goes around a notch. A triangle with two boundary edges on one side of a
-    rectangle is the common case. No map without inverted triangles exists then (`diagnose` proves it
-    on the exact coordinates, which may say otherwise by a rounding error); `refine` splits the edges.
+    Between the ends of such an edge, the target boundary does not bend outwards. It is straight, like a side of a
+    polygon, or goes around a notch. A common case is a triangle with two boundary edges on one side of a rectangle.
+    Then no map without inverted triangles exists. (`diagnose` proves this on the exact coordinates, where rounding may
+    change the answer.) `refine` splits these edges.
 
     Parameters
     ----------
     F : (f, 3) array of int
         Triangles of a surface.
     fixed : (k,) array of int
-        Vertices with given positions, the whole boundary among them.
+        Fixed vertices, including the whole boundary.
     target : (k, 2) float
-        Their positions.
+        Their target positions.
     tolerance : float
-        How far outwards counts as straight, as a share of the target's larger side.
+        Maximum outward bend of a straight line, as a share of the target's larger side.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     missing = np.setdiff1d(found.boundary, fixed)
     if missing.size:
         raise ValueError(f"the boundary {named('vertex', 'vertices', missing)} not in fixed")
-    # Of magnitude about one, so that nothing over- or underflows.
+    # Scale to magnitude about one, to avoid overflow and underflow.
     places = np.ldexp(places, -int(np.frexp(np.abs(places).max(initial=0))[1]))
     position = np.full((n, 2), np.nan)
     position[fixed] = places
@@ -91,7 +91,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
 
 
 def flat_chords(chords: IntArray, places: FloatArray, least: float) -> Iterator[int]:
-    """Rows of chords between whose ends the loop's places reach outwards by no more than ``least``."""
+    """Yield rows of chords between whose ends the loop bends outwards by at most ``least``."""
     w = as_complex(places)
     for k, (i, j) in enumerate(chords.tolist()):
         if min(_bulge(w[i : j + 1]), _bulge(np.concatenate([w[j:], w[: i + 1]]))) <= least:
@@ -99,7 +99,7 @@ def flat_chords(chords: IntArray, places: FloatArray, least: float) -> Iterator[
 
 
 def _bulge(w: NDArray[np.complex128]) -> float:
-    """How far a curve reaches to the right of the straight line from its beginning to its end."""
+    """Maximum distance of a curve to the right of the line from its first point to its last."""
     across = w[-1] - w[0]
     if across == 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""Corners of a boundary onto the corners of its contour, found by angle: which goes to which."""
+"""Match the corners of a boundary, found by angle, to the corners of its contour."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from quasiharmonic.targets.boundary.turning import BoundaryLoop, mean_turns
 from quasiharmonic.targets.outlines.contours import as_complex, corners, turns
 from quasiharmonic.util.arrays import FloatArray
 
-# How far the likeness of corners and sides, 2 at best, may fall short of the best for the sake of an upright map.
+# Maximum loss of similarity, relative to the best value (2 at most), that is accepted for an upright map.
 _AS_GOOD = 0.1
 
 
 def pins_by_angle(
     loop: BoundaryLoop, flat: FloatArray, contour: FloatArray, corner_angle: float
 ) -> list[tuple[int, float]]:
-    """Find as many corners of a boundary loop as a contour has, and where along the contour each goes.
+    """Find as many corners of a boundary loop as a contour has, and assign them to the contour's corners.
 
-    They follow each other as the contour's do; what is left is which one is the first. Turnings decide and the lengths
-    between them: convex corners go to convex ones, long sides to long ones. Where these leave it open, as for a square,
-    the corners are to be as little turned against those of the contour as they can.
+    The corners keep their cyclic order, so only the first one must be chosen. Turning angles and the lengths between
+    corners determine it: convex corners go to convex ones, long sides to long ones. If several choices are about
+    equally good, as for a square, the one with the least rotation is taken.
 
     Parameters
     ----------
     loop : BoundaryLoop
     flat : (l, 2) float64
-        How it looks in the plane.
+        The loop projected to the plane.
     contour : (k, 2) float64
         Of about unit size.
     corner_angle : float
-        Degrees by which the contour turns at a corner, at the least.
+        Minimum turning angle of the contour's corners in degrees.
 
     Returns
     -------
     list of (int, float)
-        Positions in the loop and places from 0 to 1 along the contour, in order around; none for a contour without
+        Positions in the loop and parameters from 0 to 1 along the contour, in order around; empty for a contour without
         corners.
 
     Raises
@@ -60,11 +60,11 @@ def pins_by_angle(
 
 
 def _gaps(along: FloatArray) -> FloatArray:
-    """How far it is from each of some places around a curve of length 1 to the next."""
+    """Distances from each of some parameters on a closed curve of length 1 to the next."""
     return np.asarray((np.roll(along, -1) - along) % 1.0)
 
 
 def _likeness(one: np.ndarray, other: np.ndarray) -> FloatArray:
-    """Correlation of two cyclic sequences of complex numbers, the first begun at each of its elements; 1 at most."""
+    """Correlation of two cyclic complex sequences, for each cyclic shift of the first; at most 1."""
     size = np.linalg.norm(one) * np.linalg.norm(other)
     return np.array([np.vdot(other, np.roll(one, -k)).real for k in range(len(one))]) / (size or 1.0)

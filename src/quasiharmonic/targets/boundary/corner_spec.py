@@ -1,4 +1,4 @@
-"""Corners of a boundary as a user writes them: vertices, places, or ``auto``; and which vertices that are."""
+"""Corners of a boundary as a user specifies them (vertices, positions, or ``auto``), and the vertices they refer to."""
 
 from __future__ import annotations
 
@@ -26,29 +26,30 @@ Goal: TypeAlias = int | tuple[float, float]
 
 @dataclass(frozen=True)
 class AskedCorners:
-    """Corners that somebody asks for, whatever the surface.
+    """User-specified corners, independent of the surface.
 
     Attributes
     ----------
     entries : tuple of (int or (x, y, z), int or (x, y) or None), or "auto"
-        A vertex, or a place in space to which the nearest boundary vertex is meant; and the corner or the point of the
-        outline to which it goes. None where corners go to those of the outline in order; then for all.
+        Each entry has a vertex and its target. The vertex may be given by a position in space, which stands for the
+        nearest boundary vertex. The target is a corner's number or a point of the outline. If the vertices go to the
+        outline's corners in order, all targets are None.
     """
 
     entries: tuple[tuple[int | Place, Goal | None], ...] | Literal["auto"]
 
     def within(self, vertices: IntArray) -> AskedCorners | None:
-        """The corners asked for of an island, by its own numbers.
+        """Return the corners of one island, with vertices in the island's numbering.
 
         Parameters
         ----------
         vertices : (m,) int64
-            Which vertex of the mesh each of its own is, ascending; of one that is there twice the first is meant.
+            Mesh vertex of each island vertex, ascending. If a mesh vertex occurs twice, the first is used.
 
         Returns
         -------
         AskedCorners or None
-            Without those of other islands; None if none is left.
+            Without corners of other islands; None if no corner is left.
         """
         if isinstance(self.entries, str) or np.array_equal(vertices, np.arange(len(vertices))):
             return self
@@ -60,7 +61,7 @@ class AskedCorners:
         return AskedCorners(tuple(own)) if own else None
 
     def on(self, V: ArrayLike, F: ArrayLike) -> Corners | Literal["auto"]:
-        """The corners of a surface, as `boundary_to` takes them.
+        """Return the corners for a surface, in the form that `boundary_to` accepts.
 
         Parameters
         ----------
@@ -70,7 +71,7 @@ class AskedCorners:
         Raises
         ------
         ValueError
-            When a vertex is asked for twice.
+            When a vertex is specified twice.
         """
         if isinstance(self.entries, str):
             return "auto"
@@ -90,15 +91,15 @@ class AskedCorners:
 
 
 def read_corners(text: str) -> AskedCorners:
-    """Read what is written of corners, or the file that it names.
+    """Parse corners from a string, or from the text file that it names.
 
     Parameters
     ----------
     text : str
-        ``auto``; or ``V,V,…`` with vertices counted from 0, for the outline's corners in order. In the place of ``V``
-        there may stand ``near:x,y,z``, the boundary vertex nearest to a place; and ``V:K`` or ``V:X:Y``, for the corner
-        ``K`` or the point ``(X, Y)`` of the outline. Or a text file with one of these on each line, blanks in the place
-        of colons if need be, ``#`` before comments.
+        ``auto``, or ``V,V,…`` with vertices counted from 0, for the outline's corners in order. ``near:x,y,z`` may
+        replace ``V`` and means the boundary vertex nearest to a position. ``V:K`` or ``V:X:Y`` gives the corner ``K``
+        or the point ``(X, Y)`` of the outline. Or the name of a text file with one entry per line; blanks may replace
+        colons, and ``#`` begins a comment.
 
     Returns
     -------
@@ -107,7 +108,7 @@ def read_corners(text: str) -> AskedCorners:
     Raises
     ------
     ValueError
-        When that is not what stands there.
+        When the text cannot be parsed, or only some entries have a target.
 
     Examples
     --------
@@ -133,7 +134,7 @@ def read_corners(text: str) -> AskedCorners:
 
 @accepts_mesh
 def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArray:
-    """Find the boundary vertex nearest to each of some places.
+    """Find the boundary vertex nearest to each given position.
 
     Parameters
     ----------
@@ -142,12 +143,12 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
     F : (f, 3) array of int
         Triangles, consistently oriented.
     places : (k, 3) or (k, 2) array
-        What they lack of a third coordinate is 0, as with vertices.
+        Positions. A missing third coordinate is 0, here and in ``V``.
 
     Returns
     -------
     (k,) int64
-        Of several equally near ones the first, as of those along a cut.
+        The smallest index if several vertices are equally near, such as copies along a cut.
 
     Raises
     ------
@@ -160,7 +161,7 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
         raise ValueError("the surface is closed: it has no boundary vertices")
     border = np.sort(np.concatenate(loops))
     here, there = _spatial(points[border]), _spatial(wanted)
-    # In units of the largest coordinate, a power of two, so that no square overflows or vanishes.
+    # Scale by a power of two near the largest coordinate, so that squares neither overflow nor underflow.
     exponent = int(np.frexp(max(np.abs(here).max(), np.abs(there).max(initial=0)))[1])
     here, there = np.ldexp(here, -exponent), np.ldexp(there, -exponent)
     return np.array([border[np.argmin(((here - place) ** 2).sum(axis=1))] for place in there], dtype=np.int64)
@@ -171,7 +172,7 @@ def _spatial(points: FloatArray) -> FloatArray:
 
 
 def _parted(text: str) -> list[str]:
-    """Entries with commas between them; a place has two of its own."""
+    """Split a list of entries at commas; a position contains two commas of its own."""
     parts, entries = [part.strip() for part in text.split(",")], []
     while parts:
         size = 3 if parts[0].startswith(_NEAR) else 1
@@ -181,7 +182,7 @@ def _parted(text: str) -> list[str]:
 
 
 def _entry(text: str) -> tuple[int | Place, Goal | None]:
-    """A vertex or a place, and where it goes if that is said."""
+    """Parse a vertex or a position, with its target if given."""
     vertex, *goal = text.removeprefix(_NEAR).split(":")
     try:
         who = _place(vertex) if text.startswith(_NEAR) else integer(vertex.strip().encode())

@@ -1,4 +1,4 @@
-"""Which boundary vertex goes to which place of an outline."""
+"""Correspondence between boundary vertices and positions on an outline."""
 
 from __future__ import annotations
 
@@ -11,49 +11,46 @@ from numpy.typing import ArrayLike
 from quasiharmonic.targets.outlines.contours import checked, corners, signed_area
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Vertices of a loop and where along a contour they go.
+# Vertices of a loop with their parameters along a contour.
 Held = Sequence[tuple[int, float]]
 
 
 def arc_length(
     loop: ArrayLike, outline: ArrayLike, *, start: int | None = None, corner_angle: float = 20.0
 ) -> FloatArray:
-    """Lay a boundary loop along an outline, in proportion to its length.
+    """Place a boundary loop along an outline, in proportion to arc length.
 
-    The corners of the outline stay corners: the vertices that come nearest to them along the way
-    are moved onto them, and those between are spread in proportion to the lengths of their edges.
-    No two vertices coincide and their order is kept.
+    Corners of the outline are kept. At each corner, the vertex nearest along the loop is moved onto it, and the
+    vertices between are spread in proportion to the lengths of their edges. No two vertices coincide, and their order
+    is kept.
 
-    Whether a map with this boundary exists is another matter. Where the mesh has an interior edge
-    between two boundary vertices, or a triangle with all its vertices on the boundary, their places
-    decide alone whether that edge stays inside the outline and that triangle is not inverted.
+    A map with this boundary need not exist. An interior edge between two boundary vertices may leave the outline. A
+    triangle with all its vertices on the boundary may be inverted. The target positions alone determine both.
 
     Parameters
     ----------
     loop : (n, 2) or (n, 3) float
-        Rest positions of the vertices of one boundary loop in order, triangles to the left (as
-        `quasiharmonic.geometry.mesh.topology.boundary_loops` lists them).
+        Rest positions of the vertices of one boundary loop in order, triangles to the left (as returned by
+        `quasiharmonic.geometry.mesh.topology.boundary_loops`).
     outline : (k, 2) float
-        The contour they go to, its inside to the left: an outer contour counterclockwise, a hole
-        clockwise.
+        The target contour, with its inside to the left: an outer contour counterclockwise, a hole clockwise.
     start : int, optional
-        The position in ``loop`` of the vertex that goes to ``outline[0]``. By default the one for
-        which loop and outline resemble each other most without being turned; a curved loop is seen
-        against its own plane, from the side where it runs counterclockwise, with the y-axis upwards.
+        The position in ``loop`` of the vertex that goes to ``outline[0]``. By default, the start with the best match of
+        loop and outline without rotation. A loop in space is projected along its normal, from the side where it is
+        counterclockwise, with the y-axis upwards.
     corner_angle : float
-        Degrees by which an outline turns at a corner, at the least. Lesser bends belong to a curve.
+        Minimum angle in degrees by which an outline turns at a corner. Smaller bends belong to a curve.
 
     Returns
     -------
     (n, 2) float64
-        Places on the outline, in the order of ``loop``.
+        Target positions, in the order of ``loop``.
 
     Raises
     ------
     ValueError
-        When the arrays are no curves of finite points; when the loop has fewer vertices than the
-        outline has corners; when two successive vertices of the loop coincide, or all but; when
-        there is no vertex ``start``.
+        When an array is not a curve of finite points, the loop has fewer vertices than the outline has corners, two
+        successive vertices of the loop (almost) coincide, or ``start`` is out of range.
     """
     points = checked(loop, "loop", (2, 3))
     contour = checked(outline, "outline")
@@ -74,24 +71,24 @@ def places_along(
     corner_angle: float,
     names: IntArray | None = None,
 ) -> FloatArray:
-    """Find places along a contour for a loop, some of them given; each corner gets the vertex nearest along the way.
+    """Find parameters along a contour for a loop with given pins; each corner gets the vertex nearest along the loop.
 
     Parameters
     ----------
     s : (n,) float64
-        Where the vertices lie along their loop, as `arc` tells.
+        Parameters of the vertices along their loop, as returned by `arc`.
     contour : (k, 2) float64
     pins : sequence of (int, float)
-        Vertices of the loop and where along the contour they go, both in order around; at least one.
+        Vertices of the loop and their parameters along the contour, both in order around; at least one.
     corner_angle : float
         Degrees.
     names : (n,) int64, optional
-        What the vertices are called in messages; by default their positions in the loop.
+        Vertex numbers for messages; by default positions in the loop.
 
     Returns
     -------
     (n,) float64
-        Where along the contour the vertices go, from 0 to 1, as `arc` tells; for `at`.
+        Parameters of the vertices along the contour, from 0 to 1, as in `arc`; input of `at`.
 
     Raises
     ------
@@ -116,7 +113,7 @@ def places_along(
                 raise ValueError(f"{pair} coincide")
             raise ValueError(f"{pair} come to one place: sides of the outline are too short beside the others")
         place[run[:-1]] = (stretch.begin + stretch.gap * way[:-1]) % 1.0
-        # Without rounding, so that corners are met exactly.
+        # Assign corners without rounding, so that they are met exactly.
         place[run[chosen]] = t[here]
         place[run[0]] = stretch.begin
     return place
@@ -124,18 +121,18 @@ def places_along(
 
 @dataclass(frozen=True)
 class Stretch:
-    """Everything from one pin to the next, both included.
+    """The part of a loop from one pin to the next, both included.
 
     Attributes
     ----------
     run : (c + 1,) int64
         Vertices of the loop.
     along : (c + 1,) float64
-        Where they lie, from 0 to 1.
+        Their parameters along the stretch, from 0 to 1.
     begin : float
-        Where along the contour the first one goes.
+        Parameter of the first pin along the contour.
     gap : float
-        How far from there the last one goes.
+        Distance along the contour from the first pin to the last.
     """
 
     run: IntArray
@@ -144,7 +141,7 @@ class Stretch:
     gap: float
 
     def within(self, t: FloatArray, some: IntArray) -> tuple[IntArray, FloatArray]:
-        """Those of some points of the contour that lie strictly in this stretch, in order, and where from 0 to 1."""
+        """Return the given contour points strictly inside this stretch, in order, with local parameters from 0 to 1."""
         local = (t[some] - self.begin) % 1.0 / self.gap
         order = np.argsort(local)
         order = order[(local[order] > 0) & (local[order] < 1)]
@@ -152,12 +149,12 @@ class Stretch:
 
 
 def stretches(s: FloatArray, pins: Held) -> Iterator[Stretch]:
-    """Take a loop apart at its pins."""
+    """Split a loop at its pins."""
     n = len(s)
     for (first, begin), (last, end) in zip(pins, [*pins[1:], pins[0]], strict=True):
         run = (first + np.arange(((last - first) % n or n) + 1)) % n
         along = (s[run] - s[first]) % 1.0
-        # All the way around a single pin is not nowhere.
+        # With a single pin, the stretch is the whole loop, not empty.
         along[-1] = along[-1] or 1.0
         yield Stretch(run, along / along[-1], begin, (end - begin) % 1.0 or 1.0)
 
@@ -176,7 +173,7 @@ def _too_few(first: int, last: int, free: int, wanted: int) -> ValueError:
 
 
 def arc(points: FloatArray) -> FloatArray:
-    """Where the points lie along their closed curve, the whole of which has length 1; (n,) from 0."""
+    """Parameters of points along their closed curve of total length 1; (n,) from 0."""
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     ends = np.cumsum(steps)
     if ends[-1] == 0:
@@ -185,25 +182,25 @@ def arc(points: FloatArray) -> FloatArray:
 
 
 def at(contour: FloatArray, place: FloatArray) -> FloatArray:
-    """Points of a contour by where they lie along it, from 0 to 1; (n, 2)."""
+    """Points of a contour at parameters from 0 to 1; (n, 2)."""
     t = np.append(arc(contour), 1.0)
     closed = np.concatenate([contour, contour[:1]])
     return np.stack([np.interp(place, t, closed[:, axis]) for axis in range(2)], axis=1)
 
 
 def off(contour: FloatArray, along: FloatArray, places: FloatArray) -> float:
-    """How far a contour's points are at most from the straight sides that a loop's vertices span in their place.
+    """Maximum distance of a contour's points from the sides of the polygon formed by a loop's target positions.
 
     Parameters
     ----------
     contour : (k, 2) float64
     along : (n,) float64
-        Where along the contour the vertices are, in order around;
+        Parameters of the vertices along the contour, in order around.
     places : (n, 2) float64
-        and where that is.
+        Target positions of the vertices.
     """
     order = np.argsort(along, kind="stable")
-    # Points before the first vertex belong to the side that leads to it from the last one.
+    # Points before the first vertex belong to the side from the last vertex to it.
     last = order[np.searchsorted(along[order], arc(contour), side="right") - 1]
     begin = places[last]
     side = places[(last + 1) % len(places)] - begin
@@ -213,17 +210,17 @@ def off(contour: FloatArray, along: FloatArray, places: FloatArray) -> float:
 
 
 def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
-    """Give every wanted place a vertex of its own, in order, with the least sum of squared distances.
+    """Assign a separate vertex to every wanted parameter, in order, minimising the sum of squared distances.
 
-    Both ascend. Row j of ``cost`` holds, for every vertex, the best that can be done for the places
-    up to j when j takes that vertex.
+    Both sequences ascend. Row j of ``cost`` has, for every vertex, the lowest cost of the first j + 1 parameters if
+    parameter j takes that vertex.
     """
     cost = np.empty((wanted.size, along.size))
     for j, place in enumerate(wanted):
         cost[j] = (along - place) ** 2
         if j:
             cost[j, 1:] += np.minimum.accumulate(cost[j - 1])[:-1]
-        # The first j vertices are the least the places before take.
+        # The parameters before need at least j vertices.
         cost[j, :j] = np.inf
     chosen = np.empty(wanted.size, dtype=np.int64)
     end = along.size
@@ -234,17 +231,17 @@ def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
 
 
 def best_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
-    """Vertex to begin with so that a loop and a contour are as close as they can be.
+    """Return the start vertex for which a loop and a contour are closest.
 
-    With z and w the curves as complex functions of arc length, ∫ |z(s + δ) − w(s)|² ds is least
-    where Re ∫ z(s + δ) w̄(s) ds is greatest: a correlation, for all δ at once by FFT.
+    With the curves z and w as complex functions of arc length, ∫ |z(s + δ) − w(s)|² ds is minimal where Re ∫ z(s + δ)
+    w̄(s) ds is maximal. This correlation is computed for all δ at once by FFT.
 
     Parameters
     ----------
     s : (n,) float64
-        Where the vertices lie along the loop.
+        Parameters of the vertices along the loop.
     flat : (n, 2) float64
-        How the loop looks in the plane.
+        The loop projected to the plane.
     contour : (k, 2) float64
     """
     t = arc(contour)
@@ -261,7 +258,7 @@ def best_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
 
 
 def seen_flat(points: FloatArray, contour: FloatArray) -> FloatArray:
-    """A loop as it looks from where it runs as the contour does, the y-axis upwards; (n, 2)."""
+    """Project a loop to the plane from the side where it has the contour's orientation, y-axis upwards; (n, 2)."""
     if points.shape[1] == 2:
         return points
     centred = points - points.mean(axis=0)
@@ -270,10 +267,10 @@ def seen_flat(points: FloatArray, contour: FloatArray) -> FloatArray:
 
 
 def upright(normal: FloatArray) -> FloatArray:
-    """Right, up and towards the viewer for one who looks against ``normal``, the y-axis upwards.
+    """Right, up and towards-the-viewer axes of a viewer who looks against ``normal``, with the y-axis upwards.
 
-    From above and below, where the y-axis has no direction, −z and z are up. Without a normal the
-    viewer looks against the z-axis.
+    For a viewer along the y-axis, up is −z from above and z from below. For a zero normal the viewer looks against the
+    z-axis.
 
     Returns
     -------

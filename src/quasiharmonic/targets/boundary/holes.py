@@ -1,4 +1,4 @@
-"""Which hole of a surface goes to which hole of an outline, and how it is turned."""
+"""Match the holes of a surface to the holes of an outline, and choose their rotation."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.targets.outlines.contours import as_complex
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
-# Choices for a loop that are looked into closely.
+# Number of choices per loop for which the full energy is computed.
 _PROMISING = 8
 
 
 def match_holes(
     surface: Domain, outer: int, places: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
 ) -> dict[int, int]:
-    """Give every loop without a contour one that lies near to it.
+    """Assign a nearby contour to every loop that has none.
 
-    The surface, its holes filled, is laid into the outer contour by Tutte's embedding; the sum of
-    squared distances between its holes' middles and those of the contours is to be least.
+    The surface, its holes filled, is mapped into the outer contour by Tutte's embedding. The assignment minimises the
+    sum of squared distances between the centres of its holes and those of the contours.
 
     Parameters
     ----------
     surface : Domain
-        The mesh; its own positions play no part.
+        The mesh; its positions are not used.
     outer : int
-        Which of its loops goes to the outer contour,
+        The loop that goes to the outer contour.
     places : (l, 2) float64
-        and where.
+        Target positions of this loop.
     contours : list of (k, 2) float64
     to : mapping of int to int
-        Contours of loops that are given, ``outer`` among them.
+        Contours of loops that are already assigned, including ``outer``.
 
     Returns
     -------
     dict of int to int
-        Contours of the others.
+        Contours of the other loops.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -55,33 +55,32 @@ def match_holes(
 def least_stretch(
     surface: Domain, given: Mapping[int, FloatArray], choices: Mapping[int, list[FloatArray]]
 ) -> dict[int, FloatArray]:
-    """Choose among places for some loops those for which Tutte's embedding has the least Dirichlet energy.
+    """Choose positions of loops for which Tutte's embedding has the least Dirichlet energy.
 
-    A hole that is turned against the surface around it winds the embedding up, and its energy shows it.
-    The energy is a quadratic form in the boundary's positions. Its part that is linear in those of one
-    loop shrinks where that loop does as the others, given or shrunk to points, would have it; it takes
-    one solve for all choices and leaves the few most promising, for which the whole form is found. Then
-    one loop after another takes its best choice until none changes.
+    A hole that is rotated against the surrounding surface twists the embedding, which increases the energy. The energy
+    is a quadratic form in the boundary's positions. Its part linear in one loop's positions, with the other loops given
+    or shrunk to points, needs one solve for all choices. It selects the few most promising choices, for which the whole
+    form is computed. Then each loop in turn takes its best choice until none changes.
 
     Parameters
     ----------
     surface : Domain
-        The mesh; its own positions play no part.
+        The mesh; its positions are not used.
     given : mapping of int to (l, 2) float64
-        Places of some loops.
+        Positions of some loops.
     choices : mapping of int to list of (l, 2) float64
-        For every other loop the places it may take.
+        Possible positions of every other loop.
 
     Returns
     -------
     dict of int to (l, 2) float64
-        The chosen ones.
+        The chosen positions.
     """
     loops = surface.loops
     if all(len(places) == 1 for places in choices.values()):
         return {i: places[0] for i, places in choices.items()}
     pattern = Laplacian(surface.F, surface.n, np.concatenate(loops))
-    # Equilateral triangles, but for a factor.
+    # Weights of equilateral triangles, up to a factor.
     laplacian = pattern.factor(np.full((3, len(surface.F)), -1.0))
 
     def forces(places: Mapping[int, ComplexArray]) -> ComplexArray:
@@ -110,7 +109,7 @@ def least_stretch(
         alone = [work(i, [offset], answer)[0] for offset, answer in zip(offsets[i], answers[i], strict=True)]
         own[i] = linear[kept[i]] + alone
     taken = {i: int(np.argmin(own[i])) for i in choices}
-    # Descent over finitely many combinations ends; rounding must not keep it going.
+    # The descent ends after finitely many combinations, but rounding could make it cycle.
     for _ in range(100):
         before = dict(taken)
         for i in choices:
@@ -122,15 +121,15 @@ def least_stretch(
 
 
 def _middles(surface: Domain, outer: int, places: FloatArray) -> ComplexArray:
-    """Where the middles of the holes come to lie, each filled by a fan around it; a number for every loop."""
+    """Positions of the centres of the holes, each filled by a fan; one complex number for every loop."""
     fans = [surface.F]
     for i, loop in enumerate(surface.loops):
         if i != outer:
-            # The loop has the surface to its left, and the fan to its right.
+            # The surface is to the left of the loop, the fan to its right.
             apex = np.full(len(loop), surface.n + i)
             fans.append(np.stack([np.roll(loop, -1), loop, apex], axis=1))
     F, n = np.concatenate(fans), surface.n + len(surface.loops)
-    # The outer loop's own number stands for no vertex, and is held like its loop.
+    # The extra index of the outer loop is not a vertex of any triangle, so it is fixed as well.
     fixed = np.append(surface.loops[outer], surface.n + outer)
     laplacian = Laplacian(F, n, fixed).factor(np.full((3, len(F)), -1.0))
     w = np.zeros(n, dtype=np.complex128)
@@ -139,7 +138,7 @@ def _middles(surface: Domain, outer: int, places: FloatArray) -> ComplexArray:
 
 
 def _centroid(contour: FloatArray) -> complex:
-    """Centre of the area within a contour."""
+    """Centroid of the area inside a contour."""
     w = as_complex(contour - contour[0])
     following = np.roll(w, -1)
     cross = (w.conj() * following).imag

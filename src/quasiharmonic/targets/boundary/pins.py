@@ -1,4 +1,4 @@
-"""Boundary vertices whose places on an outline the user chooses."""
+"""Boundary vertices whose target positions on an outline the user chooses."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from quasiharmonic.targets.outlines.contours import corners as corners_of
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, kind_of, named
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
-# How far from the outline a point may lie that is said to be on it, as a share of its larger side.
+# Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
 _ON = 1e-6
 _MOST_LISTED = 12
 
 
 class Pins:
-    """Boundary vertices with a place of their own, as the user names them.
+    """Boundary vertices with target positions chosen by the user.
 
     Parameters
     ----------
     corners
-        As `boundary_to` takes them.
+        As in `boundary_to`.
     loops : list of (l,) int64
     contours : list of (k, 2) float64
-        Divided by a power of two; each from its first corner on.
+        Contours in unit scale, each starting at its first corner.
     backwards : list of bool
-        Whether a contour runs against the one that the user gave.
+        Whether each contour is reversed relative to the one that the user gave.
     corner_angle : float
         Degrees.
     exponent : int
-        Of that power.
+        Binary exponent of the contours' unit.
     n : int
-        Number of the surface's vertices.
+        Number of vertices of the surface.
 
     Attributes
     ----------
     contour_of : dict of int to int
-        The contours of loops that have vertices with points, which say it.
+        Contours of the loops for which the user gave points.
     """
 
     def __init__(
@@ -56,13 +56,14 @@ class Pins:
     ) -> None:
         self.loops, self.contours, self.exponent = loops, contours, exponent
         self.sharp = [corners_of(c, corner_angle) for c in contours]
-        # An outline without corners is entered by its first point.
+        # An outline without corners uses its first point as its only corner.
         self.sharp = [marks if marks.size else np.zeros(1, dtype=np.int64) for marks in self.sharp]
-        # In the order that the user has them in, from the first.
+        # In the user's order, starting with the first.
         turned = zip(self.sharp, backwards, strict=True)
         self.sharp = [np.roll(marks[::-1], 1) if back else marks for marks, back in turned]
         self.contour_of: dict[int, int] = {}
-        # For every loop the positions in it, and what they go to: a corner's number, or a place along the contour.
+        # For every loop, a dict from position in the loop to target: a corner's number, or a parameter along the
+        # contour.
         self.wanted: dict[int, dict[int, int | float]] = {}
         self.all_corners = corners is not None and not isinstance(corners, Mapping)
         if corners is None:
@@ -102,7 +103,7 @@ class Pins:
             raise ValueError(f"{named('vertex', 'vertices', inner)} in corners, but not on the boundary")
 
     def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
-        """Positions in a loop and where along its contour they go, in order around."""
+        """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""
         wanted = self.wanted.get(loop, {})
         marks, t = self.sharp[contour], arc(self.contours[contour])
         if self.all_corners and wanted and len(wanted) != len(marks):
@@ -140,16 +141,16 @@ class Pins:
         return list(zip(positions.tolist(), places, strict=True))
 
     def _listed(self, contour: int) -> str:
-        """The corners of a contour with their numbers."""
+        """List the corners of a contour with their numbers, for messages."""
         points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
         named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
         return ", ".join(named[:_MOST_LISTED]) + (", …" if len(named) > _MOST_LISTED else "")
 
     def _nearest(self, point: FloatArray, vertex: int) -> tuple[int, float]:
-        """The contour on which a point lies, and where along it."""
+        """Return the contour on which a point lies and the parameter along it."""
         if point.shape != (2,) or not np.isfinite(point).all():
             raise ValueError(f"vertex {vertex} goes to a corner's number or a point (x, y), not to {point.tolist()}")
-        # A point far off a tiny outline must not overflow.
+        # Clip, so that a point far from a tiny outline does not overflow.
         with np.errstate(over="ignore"):
             near = np.clip(np.ldexp(point, -self.exponent), -1e9, 1e9)
         least = _ON * float(np.ptp(self.contours[0], axis=0).max())
@@ -159,7 +160,7 @@ class Pins:
             from_points = np.linalg.norm(contour - near, axis=1)
             k = int(np.argmin(from_points))
             if from_points[k] <= least:
-                # A corner that is meant is met exactly.
+                # Snap exactly to a contour point within the tolerance.
                 return c, float(t[k])
             side = np.roll(contour, -1, axis=0) - contour
             share = np.clip(((near - contour) * side).sum(axis=1) / (side**2).sum(axis=1), 0, 1)

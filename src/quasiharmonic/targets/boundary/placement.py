@@ -1,4 +1,4 @@
-"""One boundary loop laid along one contour: where it starts, and which of its vertices take the corners."""
+"""Placement of one boundary loop along one contour: the start, and the vertices at corners."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from quasiharmonic.targets.boundary.chords import STRAIGHT, flat_chords
 from quasiharmonic.targets.boundary.correspondence import Held, at, best_start, off, places_along
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Starts that are tried, nearest to the best fit first, where chords have no room.
+# Maximum number of starts to try, nearest to the best fit first, if chords lack space.
 _MOST_STARTS = 256
-# Ways around to turn a hole.
+# Number of rotations to try for a hole.
 _TURNS = 48
-# How much further a target may stray from its contour for the sake of chords, as a share of the larger side.
+# Additional deviation of a target from its contour allowed for chords, as a share of the larger side.
 _STRAY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """One boundary loop and the contour that it goes to.
+    """One boundary loop and its contour.
 
     Attributes
     ----------
     s : (n,) float64
-        Where the vertices lie along the loop.
+        Parameters of the vertices along the loop.
     contour : (k, 2) float64
     pins : list of (int, float)
-        Vertices whose place along the contour is given.
+        Vertices with given parameters along the contour.
     chords : (c, 2) int64
         Interior edges between vertices of the loop.
     names : (n,) int64
@@ -47,7 +47,7 @@ class Placement:
     corner_angle: float
 
     def laid(self, start: int = 0) -> tuple[FloatArray, bool]:
-        """Places, and whether chords have room; ``start`` goes to the contour's first point if nothing is given."""
+        """Return positions and whether chords have space; without pins, ``start`` goes to the contour's first point."""
         pins: Held = self.pins or [(start, 0.0)]
         along = self._along(pins)
         places = at(self.contour, along)
@@ -58,7 +58,7 @@ class Placement:
             return places, False
         moved = self._along(roomy)
         other = at(self.contour, moved)
-        # Vertices that are drawn away from a bend cut it off.
+        # Vertices moved away from a bend cut it off, so limit the deviation.
         allowed = off(self.contour, along, places) + _STRAY * float(np.ptp(self.contour, axis=0).max())
         near = off(self.contour, moved, other) <= allowed
         return (other, True) if near and self._fits(other) else (places, False)
@@ -67,7 +67,7 @@ class Placement:
         return places_along(self.s, self.contour, pins, corner_angle=self.corner_angle, names=self.names)
 
     def _fits(self, places: FloatArray) -> bool:
-        """Whether chords have room, and the places are in order around a region."""
+        """Whether chords have space and the positions bound a region."""
         least = STRAIGHT * float(np.ptp(self.contour, axis=0).max())
         if next(flat_chords(self.chords, places, least), None) is not None:
             return False
@@ -75,7 +75,7 @@ class Placement:
         return not len(contacts(places, np.stack([here, np.roll(here, -1)], axis=1), 0).pairs)
 
     def fitted(self, flat: FloatArray) -> FloatArray:
-        """Places from the start that fits best, or the nearest one that leaves chords room if there is any."""
+        """Positions from the best start, or from the nearest start that leaves chords space if one exists."""
         first = best_start(self.s, flat, self.contour)
         best, roomy = self.laid(first)
         away = np.minimum((self.s - self.s[first]) % 1.0, (self.s[first] - self.s) % 1.0)
@@ -87,7 +87,7 @@ class Placement:
         return best
 
     def choices(self) -> list[FloatArray]:
-        """Places from starts all around; only those that leave chords room if there are any."""
+        """Positions from starts all around the loop, restricted to those that leave chords space if any do."""
         if self.pins:
             return [self.laid()[0]]
         wanted = np.arange(_TURNS) / _TURNS

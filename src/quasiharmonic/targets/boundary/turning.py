@@ -1,14 +1,15 @@
-"""How the boundary of a surface turns, measured along the surface, and where its corners are.
+"""Turning angles of a surface's boundary, measured along the surface, and detection of its corners.
 
-At a boundary vertex the boundary turns by π less the angles of the triangles there: by π/2 at the corner of a square,
-however the square is bent in space, by nothing along a straight side, by less than nothing at a notch. A single vertex
-tells little where the boundary is ragged, as that of a scan is. So corners are sought together: as many as asked for,
-such that the runs between them are as straight as they can be. With Φ the direction in which the boundary runs, which
-leaps at each vertex by the turning there, that is the sum over runs of ∫ (Φ − mean of Φ)² ds, to be least: Φ is
-approached by a function with so many steps.
+At a boundary vertex, the boundary turns by π minus the sum of the triangles' angles there. At the corner of a square
+this is π/2, however the square is bent in space. It is zero along a straight side and negative at a notch. On a ragged
+boundary, such as that of a scan, a single vertex says little. So a given number of corners is found jointly, such that
+the runs between them are as straight as possible. Let Φ be the direction of the boundary, which jumps at each vertex by
+the turning angle. The corners minimise the sum over runs of ∫ (Φ − mean of Φ)² ds: they approximate Φ by a step
+function.
 
-Corners are taken away one after another, that one for which the sum grows least; its turning goes to its neighbours as
-a load on a beam goes to the ends. Then each moves to the best place between its neighbours until all are there.
+Starting from all vertices, corners are removed one after another, each time the one that increases the sum least. Its
+turning is distributed to its neighbours like a load on a beam to its supports. Then each corner moves to the best
+vertex between its neighbours until the corners converge.
 """
 
 from __future__ import annotations
@@ -25,29 +26,29 @@ from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array, whole_number
 
-# Radians by which a straight loop is taken to turn in all, evenly: corners on a straight side divide it evenly then.
+# Total turning in radians that is added, spread evenly, so that corners divide a straight side evenly.
 _BEND = 0.01
-# Times that corners move; the first few lower the sum by nearly all that can be had.
+# Maximum number of passes of moves. The first few give nearly all of the decrease.
 _MOST_ROUNDS = 50
-# What a move must lower the sum by, as a share: more than rounding does.
+# Minimum relative decrease of the sum for a move, larger than rounding errors.
 _LEAST = 1e-9
-# Edges of no length get this, as a share of the loop's.
+# Minimum edge length, as a share of the loop's length.
 _SHORTEST = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class BoundaryLoop:
-    """A boundary loop of a surface and how it turns.
+    """A boundary loop of a surface with its turning angles.
 
     Attributes
     ----------
     vertices : (l,) int64
-        In order, the surface to the left.
+        In order, with the surface to the left.
     lengths : (l,) float64
-        Of the edges from each vertex to the next, in the surface's unit.
+        Lengths of the edges from each vertex to the next, in the surface's unit.
     turning : (l,) float64
-        Radians by which the loop turns at each vertex: π less the angles of the triangles there, positive at a corner
-        of the surface, negative at a notch. Of a disk they sum to 2π less the curvature within (Gauss and Bonnet).
+        Turning angle at each vertex in radians: π minus the triangles' angles there, positive at a corner, negative at
+        a notch. On a disk the sum is 2π minus the total curvature inside (Gauss and Bonnet).
     """
 
     vertices: IntArray
@@ -55,24 +56,24 @@ class BoundaryLoop:
     turning: FloatArray
 
     def corners(self, count: int) -> tuple[IntArray, FloatArray]:
-        """Find vertices between which the loop is as straight as it can be; on a circle they are evenly spread.
+        """Find vertices between which the loop is as straight as possible; on a circle they are evenly spaced.
 
         Parameters
         ----------
         count : int
-            How many, at least one.
+            Number of corners, at least one.
 
         Returns
         -------
         positions : (count,) int64
-            In ``vertices``, ascending.
+            Positions in ``vertices``, ascending.
         turning : (count,) float64
-            Radians from the mean direction of the run before each to that of the run after it.
+            Angle in radians from the mean direction of the run before each corner to that of the run after it.
 
         Raises
         ------
         ValueError
-            When the loop has fewer vertices, or they coincide.
+            When the loop has fewer vertices, or all its vertices coincide.
         """
         whole_number("count", count, least=1)
         if count > len(self.vertices):
@@ -91,19 +92,19 @@ class BoundaryLoop:
 
 @accepts_mesh
 def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
-    """Measure how the boundary of a surface turns at each of its vertices.
+    """Measure the turning angle of a surface's boundary at each boundary vertex.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
-        Triangles, consistently oriented; in as many pieces as they like.
+        Triangles, consistently oriented, in one or more pieces.
 
     Returns
     -------
     list of BoundaryLoop
-        In the order of `quasiharmonic.geometry.mesh.topology.boundary_loops`; none where the surface is closed.
+        In the order of `quasiharmonic.geometry.mesh.topology.boundary_loops`; empty for a closed surface.
 
     Raises
     ------
@@ -119,7 +120,7 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    # In units of their size, a power of two, so that no square overflows or vanishes.
+    # Scale by a power of two to unit size, so that squares neither overflow nor underflow.
     exponent = int(np.frexp(np.abs(V).max())[1])
     V = np.ldexp(V, -exponent)
     loops = boundary_loops(F, len(V))
@@ -136,10 +137,11 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
 
 @accepts_mesh
 def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
-    """Find corners of a surface by angle: boundary vertices between which the boundary is as straight as it can be.
+    """Find corners of a surface by angle: boundary vertices between which the boundary is as straight as possible.
 
-    Angles are measured along the surface, so that a sheet has its corners however it is bent. Where there are fewer
-    than asked for, the others divide what is straight or round evenly; a ragged boundary's zigzag does not count.
+    Angles are measured along the surface, so bending a sheet does not change its corners. If the boundary has fewer
+    distinct corners than requested, the others divide straight or round parts evenly. Zigzags of a ragged boundary do
+    not count as corners.
 
     Parameters
     ----------
@@ -148,13 +150,13 @@ def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
     F : (f, 3) array of int
         Triangles, consistently oriented.
     count : int
-        How many.
+        Number of corners.
 
     Returns
     -------
     (count,) int64
-        Vertices of the boundary loop that encloses the largest area, in order, the surface to the left; as
-        `boundary_to` takes them for ``corners``. `boundary_turning` has the other loops' too.
+        Vertices of the boundary loop that encloses the largest area, in order, with the surface to the left.
+        `boundary_to` accepts them as ``corners``. For other loops use `boundary_turning`.
 
     Raises
     ------
@@ -180,9 +182,9 @@ def mean_turns(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> F
     Parameters
     ----------
     lengths : (l,) float64
-        Of the edges from each vertex to the next; positive.
+        Lengths of the edges from each vertex to the next; positive.
     turning : (l,) float64
-        Radians.
+        Turning angles in radians.
     corners : (k,) int64
         Ascending.
 
@@ -193,31 +195,31 @@ def mean_turns(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> F
     """
     mean, whole = np.empty(len(corners)), np.empty(len(corners))
     for j, run in enumerate(_runs(corners, len(lengths))):
-        # From the direction in which the run begins.
+        # Relative to the direction at the start of the run.
         direction = np.cumsum(turning[run]) - turning[run[0]]
         mean[j], whole[j] = (lengths[run] * direction).sum() / lengths[run].sum(), direction[-1]
     return np.asarray(np.roll(whole - mean, 1) + turning[corners] + mean)
 
 
 def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
-    """Which of some loops encloses the largest area, given positions (n, 3) of about unit size."""
+    """Index of the loop that encloses the largest area, given positions (n, 3) of about unit size."""
     return int(np.argmax([np.linalg.norm(_vector_area(space[loop])) for loop in loops]))
 
 
 def in_space(V: FloatArray) -> FloatArray:
-    """Positions (n, 3) of about unit size around the origin, so that nothing made of them overflows."""
+    """Return positions (n, 3), centred and scaled to about unit size to avoid overflow."""
     V = np.column_stack([V, np.zeros(len(V))]) if V.shape[1] == 2 else V
     V = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
     return np.asarray(V - V.mean(axis=0))
 
 
 def _vector_area(points: FloatArray) -> FloatArray:
-    """Area that a closed curve in space encloses, as a vector normal to it; its shadow's area along any direction."""
+    """Vector area of a closed curve in space: its component along a direction is the projected area."""
     return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0) / 2)
 
 
 def _angle_sums(V: FloatArray, F: IntArray) -> FloatArray:
-    """Sum of the triangles' angles at every vertex, radians; a triangle without area has what its edges say."""
+    """Sum of the triangles' angles at every vertex in radians; degenerate triangles use their edge directions."""
     z1, z2 = rest_frames(V, F)
     sides = z1 + 0j, z2 - z1, -z2
     total = np.zeros(len(V))
@@ -227,15 +229,15 @@ def _angle_sums(V: FloatArray, F: IntArray) -> FloatArray:
 
 
 def _runs(corners: IntArray, n: int) -> list[IntArray]:
-    """The edges of a closed curve of ``n`` from each corner to the next, all around a single one."""
+    """Edges of a closed curve of ``n`` edges from each corner to the next; the whole curve for a single corner."""
     after = np.roll(corners, -1)
     return [(c + np.arange((d - c) % n or n)) % n for c, d in zip(corners.tolist(), after.tolist(), strict=True)]
 
 
 def _left_over(lengths: FloatArray, turning: FloatArray, count: int) -> IntArray:
-    """Corners that are left when all others are taken away, each time that one for which the sum grows least."""
+    """Remove corners, each time the one that increases the sum least, until ``count`` are left."""
     n = len(lengths)
-    # Of the run that begins at a corner, its length; of each corner, what it turns by, and its neighbours.
+    # ``run`` has the length of the run that begins at each corner, ``turn`` the corner's turning angle.
     run, turn = lengths.tolist(), turning.tolist()
     before, after = [(i - 1) % n for i in range(n)], [(i + 1) % n for i in range(n)]
 
@@ -265,7 +267,7 @@ def _left_over(lengths: FloatArray, turning: FloatArray, count: int) -> IntArray
 
 
 def _settled(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> IntArray:
-    """Move each corner to the best place between its neighbours until all are there."""
+    """Move each corner to the best vertex between its neighbours until all corners have converged."""
     n, count = len(lengths), len(corners)
     if count == 1:
         return corners
@@ -277,7 +279,7 @@ def _settled(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> Int
             run = (first + np.arange((corners[(j + 1) % count] - first) % n or n)) % n
             length, direction = lengths[run], np.cumsum(turning[run]) - turning[first]
             direction -= (length * direction).sum() / length.sum()
-            # A step at each of these lowers the sum by as much.
+            # Decrease of the sum for a step at each of these vertices.
             so_far, along = np.cumsum(length * direction)[:-1], np.cumsum(length)[:-1]
             lowered = so_far**2 * length.sum() / (along * (length.sum() - along))
             here, best = (int(corners[j]) - first) % n - 1, int(np.argmax(lowered))

@@ -1,4 +1,4 @@
-"""Seams found: few and short, and yet such that what is cut along them lies flat with little distortion."""
+"""Find cuts that are few and short, and that let the surface be flattened with little distortion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from quasiharmonic.targets.cuts.shortening import shortened
 from quasiharmonic.targets.cuts.topological import opening_cuts
 from quasiharmonic.util.arrays import IntArray, check_range, index_array, triangle_array, vertex_array
 
-# An edge that is not to be cut costs so many times its length: more than any way around.
+# Cost factor of forbidden edges; it exceeds the length of any detour.
 _DEAR = 1e6
 
 
@@ -31,45 +31,45 @@ def find_cuts(
     forbidden_edges: ArrayLike | None = None,
     min_gain: float = 0.1,
 ) -> IntArray:
-    """Find edges along which to cut a surface so that each of its parts is a disk and lies flat with little distortion.
+    """Find edges along which to cut a surface so that each part is a disk and flattens with little distortion.
 
-    First comes what topology asks for: handles and further boundary loops are opened, closed surfaces without handles
-    cut from one end to the other. Then cuts go to what sticks out or is saddled, wherever a map without them would
-    have to shrink or stretch most, as long as they are worth their length. All of them are then made shorter. They
-    prefer creases, inward ones above all.
+    First, cuts are made that the topology requires. They open handles and connect boundary loops; a closed surface
+    without handles is cut along a long path. Then cuts are extended to protruding or saddle-shaped parts, where a map
+    would otherwise shrink or stretch most, as long as the gain justifies their length. Finally all cuts are shortened.
+    Cuts prefer creases, above all concave ones.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
-        Vertices. Their unit and place do not matter.
+        Vertices. The result does not depend on their unit and origin.
     F : (f, 3) array of int
-        Triangles of any number of surfaces, each treated as if it were alone: closed or not, with handles and holes.
+        Triangles of any number of surfaces, closed or not, with handles and holes. Each surface is treated separately.
     edges : (l, 2) array of int, optional
-        Edges to be cut in any case. Where they cut a part off, that part is one to be made a disk. One alone with both
-        ends inside opens nothing and is ignored.
+        Edges to cut in any case. If they separate a part, that part is made a disk too. A single edge with both ends in
+        the interior opens nothing and is ignored.
     forbidden_edges : (d, 2) array of int, optional
-        Edges not to be cut, such as diagonals of faces of four corners; every vertex must have others.
+        Edges not to cut, such as diagonals of quadrilateral faces. Every vertex must have other edges.
     min_gain : float
-        By how much a cut must lower the mean symmetric Dirichlet energy (0 without distortion), for each piece of
-        its length that is as long as the square root of the surface's area. An end inside counts as a tenth of such a
-        piece. Positive; more of it means fewer cuts, and `numpy.inf` none but those that make disks.
+        Minimum decrease of the mean symmetric Dirichlet energy (0 without distortion) per unit length of a cut. The
+        unit is the square root of the surface's area. A loose end of a cut in the interior counts as a tenth of this
+        unit. Positive; larger values give fewer cuts. `numpy.inf` gives only the cuts that make disks.
 
     Returns
     -------
     (k, 2) int64
-        Edges, smaller vertex first, in ascending order: those given, as far as they are not on the boundary, and the
-        ones found. None if there is nothing to cut.
+        Edges, smaller vertex first, in ascending order: the given interior edges and the edges found. Empty if no cut
+        is needed.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape or refers to what there is not, a coordinate is not finite, ``min_gain`` is
-        not positive, or the triangles are no surface: edges of three triangles, mixed winding, a vertex twice in a
-        triangle. The message names the first elements.
+        When an array has the wrong shape or an index is out of range, a coordinate is not finite, or ``min_gain`` is
+        not positive. When the triangles are not a surface: an edge has three triangles, the winding is inconsistent, or
+        a triangle repeats a vertex. The message lists the first elements.
 
     Examples
     --------
-    A starfish is cut to the end of each of its three arms and nearly the shortest way from one to the next:
+    A starfish is cut to the end of each of its three arms; the cuts between the arms are nearly the shortest:
 
     >>> import numpy as np
     >>> from quasiharmonic import find_cuts
@@ -88,7 +88,7 @@ def find_cuts(
         raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
     inner = manifold_edges(F, len(V)).interior
     inner_key = edge_keys(inner[:, 0], inner[:, 1], len(V))
-    # Open along what is given, and where surfaces touch at a vertex, each is one of its own.
+    # Open along the given edges. Surfaces that touch at a vertex are also separated.
     FT, origin = opened_along(F, given, len(V))
     found = [inner[np.isin(inner_key, _open_keys(F, FT, given, len(V)))]]
     for vertices, triangles in _parts(FT, len(origin)):
@@ -103,7 +103,7 @@ def find_cuts(
 
 
 def _cut_part(graph: EdgeGraph, min_gain: float) -> IntArray:
-    """The edges (k, 2) that a connected surface is cut along."""
+    """Return the edges (k, 2) along which to cut a connected surface."""
     cut = shortened(graph, opening_cuts(graph))
     if np.isfinite(min_gain):
         cut = reached(graph, cut, min_gain)
@@ -124,7 +124,7 @@ def _keys(pairs: IntArray, n: int) -> IntArray:
 
 
 def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:
-    """Keys of the given edges that are open, their two sides no longer one edge."""
+    """Keys of the given edges that are open, so that their two sides are separate edges."""
     tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
     key = edge_keys(tail, head, n)
     there = np.isin(key, edge_keys(given[:, 0], given[:, 1], n))
@@ -134,7 +134,7 @@ def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:
 
 
 def _parts(F: IntArray, n: int) -> list[tuple[IntArray, IntArray]]:
-    """Vertices and triangles of every connected surface, by its smallest vertex."""
+    """Return vertices and triangles of every connected surface, ordered by smallest vertex."""
     label = components(F, n)[F[:, 0]]
     order = np.argsort(label, kind="stable")
     pieces = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)

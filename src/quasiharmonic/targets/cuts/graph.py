@@ -1,7 +1,7 @@
-"""The edges of a surface as a graph in which cuts are paths: how long they are, and what they cost.
+"""The edges of a surface as a graph in which cuts are paths, with the lengths and costs of edges.
 
-An edge costs its length, less where the surface is creased: a seam is best hidden there, and a crease has much of the
-curvature that a cut sets free. Halved at most, so that no path is longer than twice the shortest.
+An edge costs its length, or less where the surface is creased. A crease hides a seam, and a cut there releases much of
+the curvature. Creases at most halve the cost, so no path is longer than twice the shortest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# An edge in a fold inwards of this angle, or in one outwards of twice as much, has half its cost.
+# A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
 _SHARP = 0.5 * np.pi
 _SAVED = 0.5
 
@@ -31,11 +31,11 @@ class EdgeGraph:
         Positions, in a unit in which the surface has area 1.
     F : (f, 3) int64
     ends : (e, 2) int64
-        Ends of the edges, smaller first, in ascending order.
+        Vertices of the edges, smaller first, in ascending order.
     side : (3, f) int64
-        Which edge the sides of each triangle are, from corner 0 to 1, 1 to 2 and 2 to 0.
+        Edge of each side of each triangle: from corner 0 to 1, 1 to 2 and 2 to 0.
     rim : (e,) bool
-        Which edges are on the boundary.
+        Whether each edge is on the boundary.
     length, cost : (e,) float64
         Positive.
     """
@@ -55,22 +55,22 @@ class EdgeGraph:
 
     @cached_property
     def rim_vertices(self) -> BoolArray:
-        """Which vertices are on the boundary; (n,)."""
+        """Mask (n,) of the boundary vertices."""
         return self.touched(self.rim)
 
     def touched(self, chosen: BoolArray) -> BoolArray:
-        """Which vertices are ends of some chosen (e,) edges; (n,)."""
+        """Mask (n,) of the vertices that belong to any of the chosen edges (e,)."""
         found = np.zeros(self.n, dtype=bool)
         found[self.ends[chosen]] = True
         return found
 
     def numbers(self, tail: IntArray, head: IntArray) -> IntArray:
-        """Which edges join pairs of vertices; pairs that are none are not looked for."""
+        """Indices of the edges between pairs of vertices; every pair must be an edge."""
         own = edge_keys(self.ends[:, 0], self.ends[:, 1], self.n)
         return np.searchsorted(own, edge_keys(tail, head, self.n))
 
     def distances(self, sources: IntArray, weight: FloatArray, limit: float = np.inf) -> tuple[FloatArray, IntArray]:
-        """How far each vertex is from the nearest of some sources, and the vertex before it on the way from there.
+        """Distance of each vertex from the nearest source, and its predecessor on the shortest path.
 
         Parameters
         ----------
@@ -78,16 +78,16 @@ class EdgeGraph:
         weight : (e,) float64
             `length` or `cost`; positive.
         limit : float
-            Ways longer than that are not looked for.
+            Maximum length of a path.
 
         Returns
         -------
         distance : (n,) float64
-            Infinite where there is no way.
+            Infinite where no path exists.
         before : (n,) int64
-            Negative at sources and where there is no way.
+            Negative at sources and where no path exists.
         """
-        # SciPy's walks in graphs took indices of 32 bits alone before 1.17.
+        # Before version 1.17, SciPy's graph searches accept 32-bit indices only.
         tail, head = self.ends.astype(np.int32).T
         graph = csr_array((weight, (tail, head)), shape=(self.n, self.n))
         distance, before, _ = dijkstra(
@@ -96,7 +96,7 @@ class EdgeGraph:
         return distance, before.astype(np.int64)
 
     def way_back(self, before: IntArray, start: int) -> IntArray:
-        """The edges from a vertex back to the source, in this order; ``before`` as `distances` has it."""
+        """Edges of the path from a vertex back to its source, in order; ``before`` as returned by `distances`."""
         way = [start]
         while before[way[-1]] >= 0:
             way.append(int(before[way[-1]]))
@@ -104,7 +104,7 @@ class EdgeGraph:
 
 
 def edge_graph(V: FloatArray, F: IntArray) -> EdgeGraph:
-    """The edges of a surface, measured.
+    """Build the `EdgeGraph` of a surface, with lengths and costs.
 
     Parameters
     ----------
@@ -138,9 +138,9 @@ def edge_graph(V: FloatArray, F: IntArray) -> EdgeGraph:
 
     along = space[ends[:, 1]] - space[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
-    # No length is zero, which would be no edge at all.
+    # Lengths must be positive, because zeros are not edges in a sparse graph.
     length = np.maximum(length, max(1e-12 * float(length.mean()), np.finfo(np.float64).tiny))
-    # Of the two triangles of an edge, that in which it leads from the smaller vertex to the larger, and the other.
+    # ``left`` is the triangle in which the edge runs from the smaller vertex to the larger, ``right`` the other.
     triangle = np.broadcast_to(np.arange(len(F)), side.shape)
     left, right = np.zeros(len(ends), dtype=np.int64), np.zeros(len(ends), dtype=np.int64)
     left[side[tail < head]], right[side[tail > head]] = triangle[tail < head], triangle[tail > head]

@@ -1,12 +1,12 @@
-"""Cuts that go where they save distortion, weighed against their length.
+"""Extension of cuts to places where they reduce distortion, balanced against their length.
 
-What is made small is a *price*: the energy of the map that cuts let be, as `shrinking` tells it, and so much for each
-unit of their length. An end inside counts like some length, too, since nobody wants to sew a hundred nicks.
+The minimised *price* is the energy of the map after cutting, as estimated by `shrinking`, plus a cost per unit length
+of cut. A loose end in the interior counts as extra length, to avoid many short cuts, which are laborious to sew.
 
-Whether a cut is worth its length shows when it is made: the scale is largest at the tip of a limb, a cut goes there
-from the others, and stays if the price falls (Gu, Gortler and Hoppe [1]_ cut to where a map stretches most, whatever it
-costs). Then stretches are exchanged for shorter ones, as far as the price falls by that, and limbs that have been
-reached otherwise in the meantime lose their cuts. Each of these makes room for the others, so there are some rounds.
+A cut is made first and then evaluated. The scale is largest at the tip of a limb. A cut from the existing cuts to this
+tip is kept if the price decreases. (Gu, Gortler and Hoppe [1]_ cut to where a map stretches most, whatever the cost.)
+Then stretches are exchanged for shorter ones as long as the price decreases. Finally, cuts of limbs that another cut
+now reaches are removed. Each of these steps can enable the others, so they are repeated for a few rounds.
 
 References
 ----------
@@ -22,32 +22,33 @@ from quasiharmonic.targets.cuts.shortening import shortened, stretches
 from quasiharmonic.targets.cuts.shrinking import Shrinking
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# A loose end costs as much as a cut of this length, the surface having area 1.
+# A loose end costs as much as a cut of this length, in units in which the surface has area 1.
 _END = 0.1
-# So many places one after another to which no cut is worth its length, and no more are tried. Once one is not, neither
-# are those nearer to it than this part of the way to the cuts.
+# Stop after this many successive tips whose cuts do not lower the price. After a failure, also skip vertices closer to
+# the tip than this share of its distance from the cuts.
 _FAILURES, _NEAR = 6, 0.5
-# Lengths that change by less than this part need no cut, and places this near to the most shrunk one are as good.
+# Scale changes below the first value need no cut. Vertices whose scale is within the second value of the largest count
+# as equal.
 _EVEN, _TIES = 1e-3, 1e-6
 _ROUNDS = 3
 
 
 def reached(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
-    """Lead cuts to what sticks out as far as it is worth their length, and shorten them.
+    """Extend cuts to protruding parts as far as the gain justifies their length, and shorten them.
 
     Parameters
     ----------
     graph : EdgeGraph
         Of a connected surface.
     cut : (e,) bool
-        Edges whose cutting makes it a disk.
+        Cut edges that make the surface a disk.
     min_gain : float
-        What a unit of length costs, the surface having area 1, in units of the mean energy.
+        Cost of a unit of length, in units of the mean energy; the surface has area 1.
 
     Returns
     -------
     (e,) bool
-        Edges whose cutting makes it a disk.
+        Cut edges that make the surface a disk.
     """
     balance = _Balance(graph, min_gain)
     if not balance.shrinking.area.any():
@@ -61,7 +62,7 @@ def reached(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
 
 
 class _Balance:
-    """Energy and length of cuts weighed against each other."""
+    """Price of cuts: energy plus weighted length."""
 
     def __init__(self, graph: EdgeGraph, min_gain: float) -> None:
         self.graph = graph
@@ -71,25 +72,25 @@ class _Balance:
         self._prices: dict[bytes, float] = {}
 
     def price(self, cut: BoolArray) -> float:
-        """What cuts cost, their length and the energy of the map that they let be."""
+        """Price of cuts: their weighted length plus the estimated energy of the map."""
         key = np.packbits(cut).tobytes()
         if key not in self._prices:
             self._weigh(cut)
         return self._prices[key]
 
     def _weigh(self, cut: BoolArray) -> FloatArray:
-        """The scale w under cuts, whose price is known from then on."""
+        """Return the scale w under given cuts, and store their price."""
         w = self.shrinking.of(self._rim | self.graph.touched(cut))
         length = float(self.graph.length[cut].sum()) + _END * int(self._loose(cut).sum())
         self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.min_gain * length
         return w
 
     def _loose(self, cut: BoolArray) -> BoolArray:
-        """Which vertices are loose ends of cuts; (n,)."""
+        """Mask (n,) of the vertices that are loose ends of cuts."""
         return (np.bincount(self.graph.ends[cut].ravel(), minlength=self.graph.n) == 1) & ~self._rim
 
     def extended(self, cut: BoolArray) -> BoolArray:
-        """Cuts, and more of them to where the scale is most, while that lowers the price."""
+        """Extend cuts to the vertices with the largest scale, while that lowers the price."""
         w = self._weigh(cut)
         given_up = np.zeros(self.graph.n, dtype=bool)
         failures = 0
@@ -97,7 +98,7 @@ class _Balance:
             height = np.where(given_up, 0.0, np.abs(w))
             if not height.max() > _EVEN:
                 break
-            # The first of those that differ by rounding.
+            # The first of the vertices that are equal up to rounding.
             tip = int(np.argmax(height >= (1 - _TIES) * height.max()))
             opened = np.flatnonzero(self._rim | self.graph.touched(cut))
             distance, before = self.graph.distances(opened, self.graph.cost)
@@ -113,7 +114,7 @@ class _Balance:
         return cut
 
     def pruned(self, cut: BoolArray) -> BoolArray:
-        """Cuts without stretches to loose ends that raise the price, the shortest tried first."""
+        """Remove stretches to loose ends that raise the price, shortest first."""
         kept = set[bytes]()
         while fresh := [way for way in self._twigs(cut) if way.tobytes() not in kept]:
             way = min(fresh, key=lambda way: (self.graph.length[way].sum(), way[0]))
@@ -125,7 +126,7 @@ class _Balance:
         return cut
 
     def _twigs(self, cut: BoolArray) -> list[IntArray]:
-        """The stretches with a loose end."""
+        """Return the stretches with a loose end."""
         loose = self._loose(cut)
         ways = stretches(self.graph, cut)
         return [way for way in ways if loose[self.graph.ends[way[[0, -1]]]].any()]

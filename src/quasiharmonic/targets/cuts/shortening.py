@@ -1,9 +1,9 @@
-"""Cuts shortened one stretch at a time, the surface a disk throughout.
+"""Shortening of cuts, one stretch at a time; the cut surface remains a disk.
 
-A stretch leads from one node, where cuts part, end, or meet the boundary, to the next. Without it the disk is sewn to
-itself along a line: a ring, and every way from the one side of the ring to the other opens it again. The cheapest takes
-the stretch's place, wherever it begins and ends, and so the nodes move as well. A stretch with a loose end keeps that
-end, and gets the cheapest way from there to the other cuts.
+A stretch is a path between two nodes, where cuts branch, end or meet the boundary. Closing the cut along a stretch
+turns the disk into a ring. Every path across the ring opens it again, and the cheapest replaces the stretch. That path
+may begin and end anywhere, so the nodes move too. A stretch with a loose end keeps that end and gets the cheapest path
+from there to the other cuts.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from quasiharmonic.geometry.mesh.opening import opened_along
 from quasiharmonic.targets.cuts.graph import EdgeGraph
 from quasiharmonic.util.arrays import BoolArray, IntArray
 
-# A stretch is exchanged for one that saves this part of it at least.
+# Minimum relative saving for which a stretch is exchanged.
 _SAVES = 1e-6
-# Rounds of all stretches at most. Most cuts are at rest after three.
+# Maximum number of rounds over all stretches. Most cuts converge after three.
 _ROUNDS = 8
 
 
 def shortened(graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], float] | None = None) -> BoolArray:
-    """Exchange stretches of cuts for cheaper ones until there is none.
+    """Exchange stretches of cuts for cheaper ones until none can be improved.
 
     Parameters
     ----------
     graph : EdgeGraph
     cut : (e,) bool
-        Edges whose cutting makes a connected surface a disk.
+        Cut edges that make a connected surface a disk.
     price : callable, optional
-        Of cuts (e,) as a whole; no exchange may raise it.
+        Price of all cuts (e,) together; every exchange must lower it.
 
     Returns
     -------
     (e,) bool
-        Such edges again, with the same loose ends.
+        Cut edges that make the surface a disk, with the same loose ends.
     """
     lowest = np.inf if price is None else price(cut)
     disk = _Disk(graph, cut)
     for _ in range(_ROUNDS):
         before, tried = disk, set[bytes]()
-        # The costliest first. What an exchange does to the others is seen before they are tried.
+        # Costliest first. Stretches are computed again after each exchange, because it may change the others.
         while fresh := [way for way in stretches(graph, disk.cut) if way.tobytes() not in tried]:
             way = max(fresh, key=lambda way: (graph.cost[way].sum(), -way[0]))
             tried.add(way.tobytes())
@@ -65,7 +65,7 @@ def shortened(graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], flo
 
 
 def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
-    """The paths of which cuts consist, as edges in order, each once."""
+    """Split cuts into their paths between nodes, each as edges in order."""
     on_rim = graph.rim_vertices
     beside: dict[int, list[tuple[int, int]]] = {}
     for number, (i, j) in zip(np.flatnonzero(cut).tolist(), graph.ends[cut].tolist(), strict=True):
@@ -88,10 +88,10 @@ def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
 
 
 class _Disk:
-    """A surface cut into a disk, to be sewn up along a stretch and opened elsewhere.
+    """A surface cut into a disk, which can be closed along one stretch and opened elsewhere.
 
-    Every edge has its ends on its left, seen from the smaller to the larger, and on its right, as copies; -1 where the
-    surface ends.
+    For every edge, the vertex copies at its ends are stored for its left side, seen from the smaller to the larger
+    vertex, and for its right side. They are -1 outside the surface.
     """
 
     def __init__(self, graph: EdgeGraph, cut: BoolArray) -> None:
@@ -107,7 +107,7 @@ class _Disk:
         self._right[graph.side[~leads_up]] = copies[~leads_up][:, ::-1]
 
     def cheapest(self, way: IntArray) -> IntArray | None:
-        """What may take a stretch's place, as edges; None if nothing is cheaper."""
+        """Return edges that replace a stretch at lower cost, or None."""
         graph = self.graph
         others = self.cut.copy()
         others[way] = False
@@ -123,7 +123,7 @@ class _Disk:
         return graph.way_back(before, int(loose[0])) if np.isfinite(distance[loose[0]]) else None
 
     def _across(self, way: IntArray, others: BoolArray, held: BoolArray, limit: float) -> IntArray | None:
-        """The cheapest way across the ring that is left without a stretch; None if none is cheaper than a limit."""
+        """Cheapest path across the ring that remains without a stretch; None if all cost more than ``limit``."""
         graph, m = self.graph, self._origin.size
         sewn = _joined(np.concatenate([self._left[way], self._right[way]], axis=1)[:, [0, 2, 1, 3]].reshape(-1, 2), m)
         border = others | graph.rim
@@ -132,7 +132,7 @@ class _Disk:
         loop = _joined(sides, m)
         on_border = np.zeros(m, dtype=bool)
         on_border[sides] = True
-        # An end of the stretch is on the one loop, and its other end on the other.
+        # The two ends of the stretch lie on different loops of the ring.
         first = graph.ends[way[0]]
         start = sewn[self._left[way[0], int(np.argmax(held[first]))]]
         near = on_border & (loop == loop[start])
@@ -154,6 +154,6 @@ class _Disk:
 
 
 def _joined(pairs: IntArray, m: int) -> IntArray:
-    """Labels below ``m`` of as many elements, those of a pair alike."""
+    """Component labels of ``m`` elements connected by pairs."""
     ones = np.ones(len(pairs), dtype=np.int8)
     return connected_components(csr_array((ones, pairs.T), shape=(m, m)), directed=False)[1].astype(np.int64)

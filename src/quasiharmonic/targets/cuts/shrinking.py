@@ -1,11 +1,11 @@
-"""How much a surface that is cut must shrink here and stretch there to lie flat, told without flattening it.
+"""Estimate how much a cut surface must shrink or stretch to be flattened, without flattening it.
 
-A conformal map multiplies lengths by e⁻ʷ. It flattens the surface where Δw = -K, K the curvature, and of all such maps
-the one that leaves lengths at the boundary as they are, w = 0 there, has the least difference of scales (Springborn,
-Schröder and Pinkall [1]_; Sawhney and Crane [2]_). Cuts are boundary, so they set w = 0 where they are: what they do to
-the map is one linear system with as many unknowns as the uncut surface has vertices, the same pattern whatever is cut.
-w is large where something sticks out that no cut reaches, an arm or an ear, and grows with its length over its width.
-Sharp and Crane [3]_ let cuts flow down such an energy; here it judges paths.
+A conformal map multiplies lengths by e⁻ʷ. It flattens the surface where Δw = -K with the curvature K. Of all these
+maps, the one that keeps lengths at the boundary, w = 0 there, has the smallest variation of scale (Springborn, Schröder
+and Pinkall [1]_; Sawhney and Crane [2]_). Cuts become boundary, so w = 0 on them. Their effect is computed by one
+linear system with one unknown per vertex of the uncut surface. Its sparsity pattern does not depend on the cuts. w is
+large on protruding parts, such as an arm or an ear, that no cut reaches. It grows with the ratio of their length to
+their width. Sharp and Crane [3]_ let cuts follow the gradient of a similar energy; here it is used to evaluate paths.
 
 References
 ----------
@@ -22,7 +22,7 @@ from quasiharmonic.linsolve import make_solver
 from quasiharmonic.targets.cuts.graph import EdgeGraph
 from quasiharmonic.util.arrays import BoolArray, FloatArray
 
-# No angle of a triangle counts as less, so that slivers do not have infinite cotangents.
+# Lower bound of angles in radians, so that cotangents of slivers stay finite.
 _LEAST_ANGLE = 1e-3
 
 
@@ -54,12 +54,12 @@ class Shrinking:
         self._solver = make_solver(indptr, indices)
 
     def of(self, open_at: BoolArray) -> FloatArray:
-        """The logarithm w of how many times smaller the map is than the surface.
+        """Logarithm w of the factor by which the map shrinks lengths.
 
         Parameters
         ----------
         open_at : (n,) bool
-            Vertices on cuts or on the boundary; some.
+            Vertices on cuts or on the boundary; at least one.
 
         Returns
         -------
@@ -76,12 +76,12 @@ class Shrinking:
         return self._solver.solve(np.where(open_at, 0.0, self.curvature))
 
     def energy(self, w: FloatArray) -> float:
-        """About the mean symmetric Dirichlet energy that a map of least energy has.
+        """Estimate the lowest mean symmetric Dirichlet energy of a map.
 
-        Where scales differ little from the median c, by w - c, the map is all but conformal and the energy
-        ``2 e²ˣ + 2 e⁻²ˣ - 4 ≈ 8 x²``, x = w - c. What sticks out far is not shrunk to nothing as a conformal map does
-        it, but keeps its area: a tube of radius r becomes a ring of radius R with R R' = r, whose energy (R / r)² +
-        (r / R)² grows with the tube's length over r, and so with x.
+        Let x = |w - c| with the median c of w. Where x is small, the map is nearly conformal, with energy
+        ``2 e²ˣ + 2 e⁻²ˣ - 4 ≈ 8 x²``. Unlike a conformal map, a map of least energy does not shrink long protrusions to
+        almost nothing but keeps their area. A tube of radius r becomes a ring of radius R with R R' = r. Its energy (R
+        / r)² + (r / R)² grows with the tube's length over r, and so with x.
         """
         order = np.argsort(w, kind="stable")
         below = np.cumsum(self.area[order])
@@ -91,7 +91,7 @@ class Shrinking:
 
 
 def _angles(graph: EdgeGraph) -> FloatArray:
-    """Angles at the corners of all triangles, (3, f), in each triangle π in all and none very small."""
+    """Angles at the corners of all triangles, (3, f), bounded below and with sum π in each triangle."""
     sides = np.stack([graph.V[graph.F[:, (k + 1) % 3]] - graph.V[graph.F[:, k]] for k in range(3)])
     back = -sides[(2, 0, 1), :]
     sine = np.linalg.norm(np.cross(sides, back), axis=2)

@@ -1,11 +1,11 @@
-"""Cuts that a surface needs whatever its shape: across handles and between boundary loops, as short as they get.
+"""Cuts required by the topology of a surface, across handles and between boundary loops, as short as possible.
 
-A tree of triangles, joined across edges, unfolds to a disk; cut are the edges that it does not cross. Most of these are
-of use to nobody: what remains without their loose ends is a few paths. Which, the tree decides. Here it is the one of
-Erickson and Whittlesey [1]_: a shortest path leads from every vertex back to the boundary (to one vertex, where there
-is none), and the tree crosses the edges that close the longest ways. The others, two for each handle and one for each
-further loop, with the paths at both ends of each, are the shortest set of cuts of that kind. `shortening` then lets
-them go from where they were tied.
+A spanning tree of triangles, joined across edges, unfolds to a disk. Cutting all edges that it does not cross opens the
+surface. Most of these cuts are unnecessary: after removing loose ends, only a few paths remain, which depend on the
+tree. The tree used here is that of Erickson and Whittlesey [1]_. Shortest paths lead from every vertex to the boundary
+(to one vertex on closed surfaces). The tree crosses the edges that close the longest loops. The remaining edges, two
+per handle and one per further boundary loop, together with the paths from both their ends, form the shortest set of
+cuts of this kind. `shortening` then moves them away from the root.
 
 References
 ----------
@@ -32,8 +32,8 @@ def opening_cuts(graph: EdgeGraph) -> BoolArray:
     Returns
     -------
     (e,) bool
-        Which edges are cut; none of a disk. A closed surface without handles is cut along a path between two vertices
-        far from each other.
+        Mask of the cut edges; all False for a disk. A closed surface without handles is cut along a path between two
+        distant vertices.
     """
     cut = np.zeros(len(graph.ends), dtype=bool)
     closed = not graph.rim.any()
@@ -50,7 +50,10 @@ def opening_cuts(graph: EdgeGraph) -> BoolArray:
 
 
 def without_loose_ends(graph: EdgeGraph, cut: BoolArray) -> BoolArray:
-    """Cuts (e,) less all paths that end inside: a disk stays one, and a tree leaves nothing."""
+    """Remove from cuts (e,) all paths that end in the interior.
+
+    A disk remains a disk. A tree of cuts is removed completely.
+    """
     cut = cut.copy()
     on_rim = graph.rim_vertices
     while True:
@@ -62,7 +65,7 @@ def without_loose_ends(graph: EdgeGraph, cut: BoolArray) -> BoolArray:
 
 
 def _extra_edges(graph: EdgeGraph, distance: FloatArray, before: IntArray) -> IntArray:
-    """The edges that neither the forest of shortest paths uses nor the tree of triangles crosses."""
+    """Edges that are neither in the forest of shortest paths nor crossed by the tree of triangles."""
     free = ~graph.rim
     reached = np.flatnonzero(before >= 0)
     free[graph.numbers(reached, before[reached])] = False
@@ -74,10 +77,10 @@ def _extra_edges(graph: EdgeGraph, distance: FloatArray, before: IntArray) -> In
     keep = free[number]
     number, one, other = number[keep], one[keep], other[keep]
     around = graph.cost[number] + distance[graph.ends[number]].sum(axis=1)
-    # The least of such weights, none of them zero, are the longest ways around; their order is all that counts.
+    # Ranks as weights: the longest loops get the lowest rank. No rank is zero, and only their order matters.
     rank = np.empty(number.size)
     rank[np.lexsort((number, -around))] = np.arange(1, number.size + 1)
-    # SciPy before 1.17 has spanning trees of graphs with 32-bit indices only.
+    # Before version 1.17, SciPy's spanning trees accept 32-bit indices only.
     ends = one.astype(np.int32), other.astype(np.int32)
     tree = minimum_spanning_tree(csr_array((rank, ends), shape=(len(graph.F), len(graph.F))))
     crossed = np.isin(rank, tree.data)
@@ -85,7 +88,7 @@ def _extra_edges(graph: EdgeGraph, distance: FloatArray, before: IntArray) -> In
 
 
 def _long_path(graph: EdgeGraph) -> IntArray:
-    """A path between two vertices of a closed surface far from each other; two edges at least, or nothing opens."""
+    """Path between two distant vertices of a closed surface; at least two edges, since one edge opens nothing."""
     start = int(np.argmax(np.linalg.norm(graph.V - graph.V.mean(axis=0), axis=1)))
     for _ in range(2):
         away, _ = graph.distances(np.array([start]), graph.length)
@@ -93,7 +96,7 @@ def _long_path(graph: EdgeGraph) -> IntArray:
     _, before = graph.distances(np.array([end]), graph.cost)
     path = graph.way_back(before, start)
     if path.size == 1:
-        # Around a vertex that is a neighbour of both ends.
+        # Go through a common neighbour of both ends.
         corners = graph.F[np.isin(graph.F, (start, end)).sum(axis=1) == 2][0]
         around = int(corners[(corners != start) & (corners != end)][0])
         path = graph.numbers(np.array([start, around]), np.array([around, end]))

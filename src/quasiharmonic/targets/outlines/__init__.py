@@ -1,4 +1,4 @@
-"""Outlines to map onto: shapes, letters, words, SVG files, polygons.
+"""Outlines as targets: shapes, letters, words, SVG files, polygons.
 
 The package builds on `geometry.curves`. Start reading in `shapes`.
 """

@@ -1,8 +1,8 @@
-"""Closed contours in the plane: area, corners, and curves flattened into them.
+"""Closed contours in the plane: area, corners, and conversion of curves to contours.
 
-A contour is a (k, 2) float64 array of points, the last joined to the first, none repeated. An
-outline is a list of contours, the outer ones counterclockwise and holes clockwise: the filled side
-lies to the left, as the triangles do along the boundary loops of a mesh.
+A contour is a (k, 2) float64 array of distinct points; the last is joined to the first. An outline is a list of
+contours, outer ones counterclockwise and holes clockwise. So the region lies to the left, like the triangles along the
+boundary loops of a mesh.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_finite, real_array
 
-# A path of lines and Bézier curves: the control points (degree + 1, 2) of each piece, joined end to start.
+# A path of lines and Bézier curves, joined end to start, as control points (degree + 1, 2) of each piece.
 Pieces = list[FloatArray]
 
-# No outline needs more, and a hostile file must not ask for more.
+# Limit that protects against malicious files; no real outline needs more.
 MOST_POINTS = 1_000_000
 
 
 def signed_area(contour: ArrayLike) -> float:
-    """Area within a contour, positive when it runs counterclockwise.
+    """Area inside a contour, positive if it is counterclockwise.
 
     Parameters
     ----------
@@ -38,26 +38,26 @@ def signed_area(contour: ArrayLike) -> float:
 
 
 def as_complex(points: FloatArray) -> ComplexArray:
-    """Points (k, 2) as complex numbers x + iy, (k,)."""
+    """Return points (k, 2) as complex numbers x + iy, (k,)."""
     return np.ascontiguousarray(points).view(np.complex128).ravel()
 
 
 def in_unit(contours: Sequence[FloatArray]) -> tuple[list[FloatArray], int]:
-    """Contours shrunk or blown up to coordinates of about 1 at most, so that no square of theirs over- or underflows.
+    """Scale contours to coordinates of at most about 1, so that squares neither overflow nor underflow.
 
     Returns
     -------
     contours : list of (k, 2) float64
-        The same divided by a power of two, which rounds nothing.
+        The contours divided by a power of two, which causes no rounding.
     exponent : int
-        Of that power.
+        Exponent of that power.
     """
     exponent = max(int(np.frexp(np.abs(c).max())[1]) for c in contours)
     return [np.ldexp(c, -exponent) for c in contours], exponent
 
 
 def checked(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> FloatArray:
-    """A closed curve as float64; `ValueError` unless it has at least three points, all finite."""
+    """Return a closed curve as float64; raise ValueError unless it has at least three points, all finite."""
     points = real_array(name, curve)
     if points.ndim != 2 or points.shape[1] not in widths or len(points) < 3:
         wanted = " or ".join(f"(k, {w})" for w in widths)
@@ -67,7 +67,7 @@ def checked(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> Floa
 
 
 def turns(contour: FloatArray) -> FloatArray:
-    """Angle by which a contour turns at each point, (k,) radians in [-π, π], positive to the left."""
+    """Turning angle of a contour at each point, (k,) radians in [-π, π], positive to the left."""
     ahead = np.roll(contour, -1, axis=0) - contour
     before = np.roll(ahead, 1, axis=0)
     cross = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
@@ -75,15 +75,15 @@ def turns(contour: FloatArray) -> FloatArray:
 
 
 def corners(contour: FloatArray, angle: float) -> IntArray:
-    """Indices of the points where a contour turns by at least so many degrees, ascending."""
+    """Indices of the points where a contour turns by at least ``angle`` degrees, ascending."""
     return np.flatnonzero(np.abs(turns(contour)) >= np.radians(angle))
 
 
 def from_corner(contour: FloatArray, angle: float, backwards: bool = False) -> FloatArray:
-    """The same contour from its first corner on, so that no side is cut in two where it happens to begin.
+    """Rotate a contour's points to start at its first corner, so that no side is split at the start.
 
-    ``backwards`` if the contour was turned around, its first point left where it is: the first corner
-    is then the one that was the first before.
+    Set ``backwards`` if the contour was reversed with its first point kept. The start is then the corner that was the
+    first before the reversal.
     """
     marks = corners(contour, angle)
     if not marks.size:
@@ -93,19 +93,19 @@ def from_corner(contour: FloatArray, angle: float, backwards: bool = False) -> F
 
 
 def flatten(pieces: Pieces, tolerance: float) -> FloatArray:
-    """Turn a closed path of lines and Bézier curves into a contour.
+    """Convert a closed path of lines and Bézier curves to a contour.
 
     Parameters
     ----------
     pieces : list of (degree + 1, 2) float64
-        Each begins where the one before ends; a straight line closes the path if need be.
+        Each begins where the one before ends; if needed, a straight line closes the path.
     tolerance : float
-        How far the contour may stray from the path. Points nearer than this to the one before are left out.
+        Maximum deviation of the contour from the path. Points closer than this to the one before are dropped.
 
     Raises
     ------
     ValueError
-        When that takes a million points.
+        When the contour would have more than a million points.
     """
     steps = [_steps(control, tolerance) for control in pieces]
     if sum(steps) > MOST_POINTS:
@@ -115,10 +115,10 @@ def flatten(pieces: Pieces, tolerance: float) -> FloatArray:
 
 
 def _steps(control: FloatArray, tolerance: float) -> float:
-    """Equal steps in the parameter that a Bézier curve takes to stay within a tolerance.
+    """Number of equal parameter steps for which a polyline stays within a tolerance of a Bézier curve.
 
-    A polyline of n of them strays at most max |b''| / (8 n²), and the second derivative of a curve of
-    degree d is bounded by d (d - 1) times the second differences of its control points.
+    A polyline of n steps deviates by at most max |b''| / (8 n²). The second derivative of a curve of degree d is at
+    most d (d - 1) times the largest second difference of its control points.
     """
     degree = len(control) - 1
     if degree == 1:
@@ -128,11 +128,11 @@ def _steps(control: FloatArray, tolerance: float) -> float:
 
 
 def _bezier(control: FloatArray, steps: float) -> FloatArray:
-    """Points at equal steps on a Bézier curve, its first one left out."""
+    """Points at equal parameter steps on a Bézier curve, without its first point."""
     if len(control) == 2:
         return control[1:]
     t = (np.arange(1, steps + 1) / steps)[:, None]
-    # de Casteljau's construction, for all parameters at once.
+    # De Casteljau's algorithm, for all parameters at once.
     points = np.repeat(control[:, None, :], int(steps), axis=1)
     while len(points) > 1:
         points = (1 - t) * points[:-1] + t * points[1:]
@@ -140,9 +140,9 @@ def _bezier(control: FloatArray, steps: float) -> FloatArray:
 
 
 def distinct(contour: FloatArray, least: float) -> FloatArray:
-    """Drop points that lie within ``least`` of the last one kept, going around; the first one stays."""
+    """Drop points within ``least`` of the last kept point, cyclically; the first point is always kept."""
     kept = [0]
-    # Plain doubles: one element of an array at a time takes several times as long.
+    # Python floats, because reading array elements one by one is several times slower.
     x, y = contour[:, 0].tolist(), contour[:, 1].tolist()
     for i in range(1, len(x)):
         if abs(x[i] - x[kept[-1]]) > least or abs(y[i] - y[kept[-1]]) > least:

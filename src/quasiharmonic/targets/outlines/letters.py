@@ -16,38 +16,36 @@ from quasiharmonic.util.arrays import FloatArray
 
 Font = str | PathLike[str]
 _FONT_FILES = ".ttf", ".otf", ".ttc"
-# In matplotlib's data.
+# Folder within matplotlib's data.
 _BUNDLED = "fonts", "ttf"
 
 
 def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4) -> list[FloatArray]:
-    """Outlines of one character of a font.
+    """Outline of one character of a font.
 
     Parameters
     ----------
     character : str
-        Exactly one, with something to see.
+        A single visible character.
     font : str or path, optional
-        A font file (TrueType or OpenType), or the name of an installed font, with a weight and a slant
-        after colons if need be: ``"DejaVu Serif:bold:italic"``. DejaVu Sans Bold, which comes with
-        matplotlib, by default.
+        A font file (TrueType or OpenType), or the name of an installed font, optionally with weight and slant:
+        ``"DejaVu Serif:bold:italic"``. By default DejaVu Sans Bold, which comes with matplotlib.
     tolerance : float
-        How far the contours may stray from the font's curves, in units of the font size.
+        Maximum deviation of the contours from the font's curves, in units of the font size.
 
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area, so the first is the outer one; counterclockwise where the
-        letter lies inside and clockwise around its holes. The font size is 1 and the base line
-        y = 0.
+        The contours by decreasing area, so the first is an outer one. Outer contours are counterclockwise, holes
+        clockwise. The font size is 1 and the base line is y = 0.
 
     Raises
     ------
     ValueError
-        When ``character`` is not a single one, or the font has no outline for it, or no font has this
-        name, or the file is no font.
+        When ``character`` is not a single character, the font has no outline for it, no installed font has this name,
+        or the file is not a font.
     FileNotFoundError
-        When there is no such font file.
+        When the font file does not exist.
     """
     if len(character) != 1:
         raise ValueError(f"an outline is made of one character, not of {character!r}")
@@ -62,20 +60,20 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
 
 
 def _contours(character: str, font: Font | None, tolerance: float) -> list[FloatArray]:
-    """Contours of a character as the font winds them, counterclockwise or not."""
+    """Contours of a character, in the font's orientation."""
     contours = [flatten(pieces, tolerance) for pieces in glyph_paths(character, font)]
     return [contour for contour in contours if len(contour) > 2 and signed_area(contour) != 0]
 
 
 def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
-    """The closed paths of lines and Bézier curves that a character is drawn by; raises as `letter`."""
+    """Closed paths of lines and Bézier curves of a character; raises as `letter`."""
     file = _font_file(font)
     plain = truetype.glyph(file, character)
     return _by_matplotlib(file, character) if plain is None else plain
 
 
 def _by_matplotlib(file: FilePath, character: str) -> list[Pieces]:
-    """The paths of a character in any font, or what is the matter with it."""
+    """Read the paths of a character in any font with matplotlib, or raise a ValueError that states the problem."""
     from matplotlib.font_manager import FontProperties, get_font
     from matplotlib.path import Path
     from matplotlib.textpath import text_to_path
@@ -93,14 +91,14 @@ def _by_matplotlib(file: FilePath, character: str) -> list[Pieces]:
 
 
 def _pieces(path: Any) -> list[Pieces]:
-    """Take a matplotlib path of lines and Bézier curves apart into its closed parts."""
+    """Split a matplotlib path of lines and Bézier curves into closed parts."""
     parts: list[Pieces] = []
     here = np.zeros((0, 2))
     for flat, code in path.iter_segments(simplify=False):
         control = flat.reshape(-1, 2)
         if code == path.MOVETO:
             parts.append([])
-        elif code == path.CLOSEPOLY:  # its point says nothing
+        elif code == path.CLOSEPOLY:  # its point has no meaning
             continue
         else:
             parts[-1].append(np.concatenate([here, control]))
@@ -120,7 +118,7 @@ def _font_file(font: Font | None) -> FilePath:
 
 
 def _bundled(name: str) -> FilePath:
-    """A file of the fonts that come with matplotlib, which is not imported where they lie in its own folder."""
+    """Path of a font that comes with matplotlib; imports matplotlib only if its data are not in its own folder."""
     found = find_spec("matplotlib")
     for folder in (found and found.submodule_search_locations) or []:
         file = FilePath(folder, "mpl-data", *_BUNDLED, name)
@@ -132,7 +130,7 @@ def _bundled(name: str) -> FilePath:
 
 
 def _installed(name: str) -> FilePath:
-    """The file of an installed font."""
+    """Path of the file of an installed font."""
     from difflib import get_close_matches
 
     from matplotlib.font_manager import FontProperties, findfont, get_font_names

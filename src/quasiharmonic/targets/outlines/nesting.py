@@ -1,4 +1,4 @@
-"""Which contours of an outline are holes, and whether they bound a region at all: decided exactly."""
+"""Nesting of an outline's contours: which are holes, and whether they bound a region, computed exactly."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.targets.outlines.contours import checked, distinct, in_unit, signed_area
 from quasiharmonic.util.arrays import FloatArray
 
-# Meeting sides that are looked for; the first of them is told.
+# Maximum number of meeting sides to find; the first is reported.
 _MOST_MEETINGS = 100
 
 
 class Arranged(NamedTuple):
-    """A contour among others.
+    """A contour and its nesting among the others.
 
     Attributes
     ----------
     points : (k, 2) float64
-        As given, but for points that repeat the one before.
+        As given, without consecutive duplicates.
     depth : int
-        How many other contours are around it; a hole has an odd number.
+        Number of other contours around it; odd for a hole.
     clockwise : bool
-        How it runs.
+        Its orientation.
     """
 
     points: FloatArray
@@ -36,20 +36,20 @@ class Arranged(NamedTuple):
 
     @property
     def reversed(self) -> bool:
-        """Whether it runs the other way than its depth asks for: counterclockwise outside, clockwise around holes."""
+        """Whether its orientation is wrong for its depth: outer contours are counterclockwise, holes clockwise."""
         return self.clockwise == (self.depth % 2 == 0)
 
     @property
     def wound(self) -> FloatArray:
-        """Its points, running the right way; the first one stays the first."""
+        """Its points in the correct orientation, with the same first point."""
         return np.roll(self.points[::-1], 1, axis=0) if self.reversed else self.points
 
 
 def nested(contours: Sequence[ArrayLike]) -> list[FloatArray]:
-    """Order contours by decreasing area and wind them: counterclockwise outside, clockwise around holes.
+    """Order contours by decreasing area and orient them: outer ones counterclockwise, holes clockwise.
 
-    What lies within an odd number of others is a hole (the even-odd rule). The contours may be wound
-    as they like. A point that repeats the one before it is dropped.
+    A contour inside an odd number of others is a hole (the even-odd rule). Input contours may have either orientation.
+    A point equal to the one before it is dropped.
 
     Parameters
     ----------
@@ -58,24 +58,24 @@ def nested(contours: Sequence[ArrayLike]) -> list[FloatArray]:
     Returns
     -------
     list of (k, 2) float64
-        Each from its own first point on.
+        Each starts at its first given point.
 
     Raises
     ------
     ValueError
-        When a contour is no array of at least three finite points, or encloses no area; when one
-        crosses, touches or goes back along itself or another one.
+        When a contour is not an array of at least three finite points, or encloses no area; when a contour crosses,
+        touches or doubles back on itself or another one.
     """
     return [one.wound for one in arranged(contours)]
 
 
 def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
-    """An outline without its holes: the contours that no other one is around, each running as it did.
+    """Return an outline without its holes: the contours not inside another one, in their given orientation.
 
     Parameters
     ----------
     contours : sequence of (k, 2) float
-        As `nested` takes them.
+        As in `nested`.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
 
 
 def arranged(contours: Sequence[ArrayLike]) -> list[Arranged]:
-    """Contours by decreasing area, and how they lie in each other; raises as `nested`."""
+    """Return contours by decreasing area with their nesting; raises as `nested`."""
     found = [distinct(checked(c, f"contour {i}"), 0.0) for i, c in enumerate(contours)]
     if not found:
         return []
@@ -104,7 +104,7 @@ def arranged(contours: Sequence[ArrayLike]) -> list[Arranged]:
     for i, contour in enumerate(found):
         turns, _ = winding(anchors, contour, np.roll(contour, -1, axis=0))
         around[i] = turns != 0
-    # Its own anchor is on a contour, not within it.
+    # A contour's own anchor is on it, not inside it.
     np.fill_diagonal(around, val=False)
     depth = around.sum(axis=0)
     order = sorted(range(len(found)), key=lambda i: -areas[i])
@@ -118,14 +118,14 @@ def collinear(contour: FloatArray) -> bool:
 
 
 def _clockwise(contour: FloatArray) -> bool:
-    # At its lexicographically first point a simple contour turns, and the way it runs.
+    # A simple contour turns at its lexicographically first point in the direction of its orientation.
     first = int(np.lexsort((contour[:, 1], contour[:, 0]))[0])
     before, here, after = contour[first - 1], contour[first], contour[(first + 1) % len(contour)]
     return bool(orientation(before, here, after) < 0)
 
 
 def _check_simple(contours: list[FloatArray]) -> None:
-    """Raise when sides of contours have more in common than the point that joins them."""
+    """Raise if two sides of contours share more than the point that joins them."""
     length = np.array([len(c) for c in contours])
     start = np.concatenate([[0], np.cumsum(length)])
     owner = np.repeat(np.arange(len(contours)), length)
@@ -135,7 +135,7 @@ def _check_simple(contours: list[FloatArray]) -> None:
     met = contacts(points, np.stack([np.arange(start[-1]), following], axis=1), _MOST_MEETINGS)
     if not len(met.pairs):
         return
-    # What goes back along itself also touches what is beside it.
+    # A side that doubles back also touches neighbouring sides, so report spikes first.
     spike = (following[met.pairs] == met.pairs[:, ::-1]).any(axis=1)
     first = int(np.lexsort((*met.pairs.T[::-1], ~spike))[0])
     (i, j), relation = met.pairs[first].tolist(), met.relation[first]

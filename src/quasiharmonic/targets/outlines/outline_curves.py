@@ -1,4 +1,4 @@
-"""Outlines as the curves that they are, and not as chords: what a boundary slides along."""
+"""Outlines as exact curves instead of polylines, for boundaries that slide along them."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from quasiharmonic.targets.specification import TOLERANCE, outline
 
 
 def outline_curves(specification: str | PathLike[str], *, font: Font | None = None) -> list[Curve]:
-    """The curves of an outline that a few words or a file specify, one for each contour.
+    """Return the curves of an outline that a string or a file specifies, one for each contour.
 
     Parameters
     ----------
     specification : str or path
-        As `outline` takes it. Circles and ellipses are such; letters, words and drawings the lines, arcs and Bézier
-        curves that they are drawn by; files of points are polygons.
+        As in `outline`. Circles and ellipses are exact. Letters, words and drawings consist of their lines, arcs and
+        Bézier curves. Files of points are polygons.
     font : str or path, optional
         For letters and words.
 
     Returns
     -------
     list of Curve
-        Closed, in no certain order, and wound as they are drawn.
+        Closed, in no particular order, oriented as drawn.
 
     Raises
     ------
     ValueError, OSError, ModuleNotFoundError
-        As `outline`; when letters of a word touch so flatly that their curves cannot be joined.
+        As `outline`; when letters of a word touch at so small an angle that their curves cannot be joined.
 
     Examples
     --------
     >>> [curve.corners(20.0).size for curve in outline_curves("letter:G")]
     [8]
     """
-    # Whatever is wrong with it is said there.
+    # Raises for invalid specifications.
     contours = outline(specification, font=font)
     text = fspath(specification)
     name, _, argument = text.partition(":")
@@ -67,7 +67,7 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
 
 
 def _contours(paths: list[Pieces]) -> list[Curve]:
-    """Closed curves of those paths that are more than a point."""
+    """Return closed curves for the paths that are longer than a point."""
     return [
         Curve.contour(pieces)
         for pieces in paths

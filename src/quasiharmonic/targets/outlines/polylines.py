@@ -1,4 +1,4 @@
-"""Outlines from plain files of points."""
+"""Outlines from text files of points."""
 
 from __future__ import annotations
 
@@ -20,22 +20,21 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     Parameters
     ----------
     path : str or path-like
-        One point a line: x and y between blanks, tabs, commas or semicolons. A blank line ends a
-        contour, ``#`` begins a comment, and the first line may be a heading, as ``x,y``. Contours are
-        closed by themselves; repeating the first point at the end does no harm.
+        One point per line: x and y, separated by blanks, tabs, commas or semicolons. A blank line ends a contour, ``#``
+        begins a comment, and the first line may be a heading such as ``x,y``. Contours are closed automatically; the
+        first point may be repeated at the end.
 
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area, each as it stands in the file, from its first point on, be it
-        counterclockwise or clockwise; `nested` winds them.
+        The contours by decreasing area. Each keeps its first point and its orientation from the file; `nested` orients
+        contours.
 
     Raises
     ------
     MeshFileError
-        With the line, for anything but two numbers on it, for a contour of fewer than three points or
-        without area, for an empty file and for one of more than a million points; as `nested` for
-        contours that meet themselves or each other.
+        With the line number, when a line does not have two numbers, a contour has fewer than three points or no area,
+        or the file has more than a million points or none. As `nested` for contours that meet themselves or each other.
     """
     loops: list[list[tuple[float, float]]] = [[]]
     starts, count = [0], 0
@@ -43,7 +42,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         text, comment, _ = raw.partition(b"#")
         words = text.replace(b",", b" ").replace(b";", b" ").split()
         if not words:
-            # A line that is nothing but a comment stands within a contour.
+            # A comment line does not end a contour.
             if loops[-1] and not comment:
                 loops.append([])
                 starts.append(line)

@@ -14,17 +14,17 @@ def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
     ----------
     radius : float
     points : int
-        How many, spread evenly.
+        Number of evenly spaced points.
 
     Returns
     -------
     (points, 2) float64
-        Counterclockwise.
+        Counterclockwise from ``(radius, 0)``.
 
     Raises
     ------
     ValueError
-        When the radius is not positive, or there are fewer than three points.
+        When the radius is not positive, or ``points`` is less than three.
     """
     _positive(radius=radius)
     return ellipse(radius, radius, points)
@@ -38,7 +38,7 @@ def ellipse(a: float, b: float, points: int = 256) -> FloatArray:
     a, b : float
         Half axes along x and y.
     points : int
-        Points on it, evenly spaced in angle for ``a = b``.
+        Number of points, evenly spaced in the ellipse's parameter.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def ellipse(a: float, b: float, points: int = 256) -> FloatArray:
     Raises
     ------
     ValueError
-        When a half axis is not positive or there are fewer than three points.
+        When a half axis is not positive, or ``points`` is less than three.
     """
     _positive(a=a, b=b)
     return _polar(points) * (a, b)
@@ -99,13 +99,13 @@ def regular_polygon(corners: int, radius: float = 1.0) -> FloatArray:
 
 
 def star(tips: int, inner: float = 0.5) -> FloatArray:
-    """Outline of a star around the origin, its tips on the unit circle.
+    """Outline of a star around the origin, with its tips on the unit circle.
 
     Parameters
     ----------
     tips : int
     inner : float
-        Distance of the corners between the tips from the origin, below 1.
+        Distance from the origin of the corners between the tips, below 1.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def star(tips: int, inner: float = 0.5) -> FloatArray:
 
 
 def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
-    """Outline of the unit disk around the origin without a concentric smaller one.
+    """Outline of the unit disk around the origin with a concentric circular hole.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
     Raises
     ------
     ValueError
-        When ``inner`` is not between 0 and 1 or there are fewer than three points.
+        When ``inner`` is not between 0 and 1, or ``points`` is less than three.
     """
     if not 0 < inner < 1:
         raise ValueError(f"the inner radius of a ring is between 0 and 1, not {inner}")
@@ -152,7 +152,7 @@ def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
 
 
 def _polar(points: int, start: float = 0.0) -> FloatArray:
-    """Points evenly spaced on the unit circle, counterclockwise from the angle ``start``."""
+    """Points evenly spaced on the unit circle, counterclockwise from the angle ``start`` in radians."""
     whole_number("points", points, least=3)
     angle = start + np.arange(points) * (2 * np.pi / points)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -1,8 +1,7 @@
 """Outlines from SVG drawings: the geometry of shapes and paths, with transforms and groups.
 
-Fill, stroke and opacity play no part: every closed shape is a contour, an open one is closed by a
-straight line, and what lies within an odd number of others is a hole. Nothing outside the file is
-ever fetched.
+Fill, stroke and opacity are ignored. Every closed shape is a contour, an open one is closed by a straight line, and a
+contour inside an odd number of others is a hole. References to other files or addresses are not followed.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ MOST_BYTES = 64 << 20
 _DEEPEST = 200
 _MOST_TRANSFORMS = 1000
 _TOO_MANY = f"more than {MOST_POINTS:,} pieces in all"
-# Squares of coordinates, and their sums, must neither overflow nor vanish.
+# Bound that keeps squares of coordinates and their sums from overflow and underflow.
 _LARGEST = 1e150
 _CONTAINERS = "svg", "g", "a", "switch"
-# What shows in a drawing and has no outline of its own here.
+# Visible elements that the reader cannot convert to outlines.
 _FOREIGN = {
     "text": "turn the text into paths (in Inkscape: Path > Object to Path)",
     "use": "turn the clone into a path (in Inkscape: Edit > Clone > Unlink Clone)",
@@ -40,7 +39,7 @@ _FOREIGN = {
 _LENGTH = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([a-z%]*)\s*", re.IGNORECASE)
 _UNITS = {"": 1.0, "px": 1.0, "in": 96.0, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 96 / 72, "pc": 16.0}
 _TRANSFORM = re.compile(r"[\s,]*([a-zA-Z]+)\s*\(([^()]*)\)[\s,]*")
-# What a style may say that an attribute of the same name would have to: it is not read there, and not passed over.
+# Style properties that would change the geometry. They are not read, so they raise an error.
 _SHAPING = re.compile(
     r"(?:^|[;{\s])\s*(transform(?:-origin)?|translate|rotate|scale|offset-path|d|[cr]?[xy]|r)\s*:", re.IGNORECASE
 )
@@ -53,26 +52,27 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     Parameters
     ----------
     path : str or path-like
-        The file: ``path``, ``rect``, ``circle``, ``ellipse``, ``polygon`` and ``polyline`` elements, in
-        groups and with transforms.
+        A file with ``path``, ``rect``, ``circle``, ``ellipse``, ``polygon`` and ``polyline`` elements, in groups and
+        with transforms.
     tolerance : float
-        How far the contours may stray from the drawing's curves, as a share of its larger side; at
-        least 1e-7.
+        Maximum deviation of the contours from the drawing's curves, as a share of its larger side; at least 1e-7.
 
     Returns
     -------
     list of (k, 2) float64
-        The contours by decreasing area, in the units of the file with the y-axis turned upwards, so
-        that the outline looks as the drawing does. Each runs as it is drawn, from its first point on,
-        be it counterclockwise or clockwise; `nested` winds them.
+        The contours by decreasing area, in the units of the file. The y-axis is reversed to point upwards, so the
+        outline looks like the drawing. Each contour keeps its first point and its orientation; `nested` orients
+        contours.
 
     Raises
     ------
     MeshFileError
-        With the line, when the file is no SVG drawing, breaks its rules, declares entities, has text or
-        clones, which are not outlines, or style sheets that move or shape what is drawn, is larger than
-        64 MiB, nested more than 200 deep, or draws nothing that encloses an area; as `nested` for
-        contours that meet themselves or each other.
+        With the line number:
+
+        - when the file is not an SVG drawing, is malformed or declares entities;
+        - when it has text or clones, which are not outlines, or styles that move or shape elements;
+        - when it is larger than 64 MiB, nested more than 200 deep, or draws nothing that encloses an area;
+        - as `nested` for contours that meet themselves or each other.
     ValueError
         When the tolerance is out of range.
     """
@@ -103,7 +103,7 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
 
 
 def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Pieces]:
-    """The paths that an SVG file draws, as `read_svg` reads it; with ``arcs`` as `parse_path` has them."""
+    """Paths that an SVG file draws, as read by `read_svg`; ``arcs`` as in `parse_path`."""
     if os.path.isfile(path) and os.path.getsize(path) > MOST_BYTES:
         raise MeshFileError(path, f"is larger than {MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -111,30 +111,30 @@ def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Piece
 
 
 def _breadth(contour: FloatArray) -> float:
-    """Area of the triangles that a contour's sides span with its first point: 0 only if all lies on one line."""
+    """Sum of the areas of the triangles that the sides span with the first point; 0 only for collinear points."""
     w = as_complex(contour - contour[0])
     return float(np.abs((w.conj() * np.roll(w, -1)).imag).sum()) / 2
 
 
 class _Drawing:
-    """Walks through the elements of a drawing and collects its paths, transformed."""
+    """Traverse the elements of a drawing and collect their transformed paths."""
 
     def __init__(self, path: str | os.PathLike[str], arcs: bool) -> None:
         self.path, self.arcs = path, arcs
-        # Shapes as path data, with their elements, lines and transforms; read when all has been counted.
+        # Tag, line, path data and transform of each shape; parsed after the limits have been checked.
         self.shapes: list[tuple[str, int, str, FloatArray]] = []
         self.elements = self.commands = 0
-        # A transform of homogeneous points for every open container.
+        # Transform of homogeneous coordinates for every open container.
         self.transforms = [np.diag([1.0, -1.0, 1.0])]
         self.depth = 0
-        # The depth of the element whose contents are passed over.
+        # Depth of the element whose contents are skipped; 0 if none.
         self.skipped = 0
         self.parser = expat.ParserCreate(namespace_separator=" ")
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
         self.parser.EntityDeclHandler = self._entity
         self.parser.CharacterDataHandler = self._text
-        # The text of the style sheet that is being read.
+        # Text of the current style sheet.
         self.sheet: list[str] | None = None
 
     def read(self, data: bytes) -> list[Pieces]:
@@ -180,7 +180,7 @@ class _Drawing:
             raise self._error(f"elements nested more than {_DEEPEST} deep")
         namespace, _, tag = name.rpartition(" ")
         if tag == "style" and namespace in ("", _SVG):
-            # Wherever it stands, be it among definitions that draw nothing.
+            # Style sheets apply even inside definitions that draw nothing.
             self.sheet = []
         if self.skipped:
             return
@@ -205,7 +205,7 @@ class _Drawing:
                 transform = transform @ _affine(1, 0, 0, 1, _length(attributes, "x"), _length(attributes, "y"))
             if tag in _SHAPES:
                 self._note(tag, _SHAPES[tag](attributes), transform)
-                # Titles and animations within a shape draw nothing.
+                # Children of a shape, such as titles and animations, draw nothing.
                 self.skipped = self.depth
             else:
                 self.transforms.append(transform)
@@ -235,12 +235,12 @@ def _transformed(pieces: list[Any], transform: FloatArray) -> list[Any]:
 
 
 def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> FloatArray:
-    """The matrix that SVG writes matrix(a, b, c, d, e, f)."""
+    """Matrix of the SVG transform ``matrix(a, b, c, d, e, f)``."""
     return np.array([(a, c, e), (b, d, f), (0, 0, 1)], dtype=np.float64)
 
 
 def _transform(text: str) -> FloatArray:
-    """Read the attribute ``transform``: a product of matrix, translate, scale, rotate, skewX and skewY."""
+    """Parse the attribute ``transform``: a product of matrix, translate, scale, rotate, skewX and skewY."""
     text = text.rstrip()
     product, at, count = np.eye(3), 0, 0
     while at < len(text):
@@ -266,7 +266,7 @@ def _rotation(degrees: float, x: float = 0.0, y: float = 0.0) -> FloatArray:
     return _affine(1, 0, 0, 1, x, y) @ _affine(c, s, -s, c, 0, 0) @ _affine(1, 0, 0, 1, -x, -y)
 
 
-# How many numbers each transform takes, and its matrix.
+# Allowed numbers of arguments of each transform, and its matrix.
 _TRANSFORMS: dict[str, tuple[tuple[int, ...], Callable[..., FloatArray]]] = {
     "matrix": ((6,), _affine),
     "translate": ((1, 2), lambda x, y=0.0: _affine(1, 0, 0, 1, x, y)),
@@ -278,7 +278,10 @@ _TRANSFORMS: dict[str, tuple[tuple[int, ...], Callable[..., FloatArray]]] = {
 
 
 def _length(attributes: dict[str, str], name: str, default: float = 0.0) -> float:
-    """A length in user units; `ValueError` for a negative radius or side, and for units without a fixed size."""
+    """Return a length in user units.
+
+    Raises ValueError for negative radii or sides, and for units without a fixed size.
+    """
     if name not in attributes:
         return default
     found = _LENGTH.fullmatch(attributes[name])
@@ -319,7 +322,7 @@ def _polygon(attributes: dict[str, str]) -> str:
     return f"M{points}z" if (points := attributes.get("points", "").strip()) else ""
 
 
-# Every shape as path data.
+# Conversion of every shape to path data.
 _SHAPES: dict[str, Callable[[dict[str, str]], str]] = {
     "path": lambda attributes: attributes.get("d", ""),
     "rect": _rect,

@@ -1,4 +1,4 @@
-"""The path language of SVG (the attribute ``d``) as Bézier curves.
+"""Parser of SVG path data (the attribute ``d``), which returns Bézier curves.
 
 W3C, Scalable Vector Graphics (SVG) 2, chapter 9 and appendix B.2, https://www.w3.org/TR/SVG2/paths.html.
 """
@@ -19,35 +19,35 @@ from quasiharmonic.targets.outlines.contours import MOST_POINTS, Pieces
 _BLANKS = re.compile(r"[ \t\r\n\f]*")
 _COMMA = re.compile(r"[ \t\r\n\f]*,?[ \t\r\n\f]*")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-# Numbers that each command takes at a time; F is a flag, a single 0 or 1.
+# Arguments of each command: x is a number, F a flag, a single 0 or 1.
 _ARGUMENTS = {"M": "xx", "L": "xx", "H": "x", "V": "x", "C": "x" * 6, "S": "x" * 4, "Q": "x" * 4, "T": "xx"}
 _ARGUMENTS |= {"A": "xxxFFxx", "Z": ""}
-# Cubic curves in half a turn of an arc: each strays from a circle by 6.6e-8 of the radius.
+# Number of cubic curves per half turn of an arc. Each deviates from a circle by 6.6e-8 of the radius.
 _HALF_TURN = 8
-# A letter, other than that of an exponent, and what follows up to the next one.
+# A letter other than e and E, and the text up to the next such letter.
 _COMMAND = re.compile(r"([A-DF-Za-df-z])([^A-DF-Za-df-z]*)")
 
 
 def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
-    """Read path data.
+    """Parse path data.
 
     Parameters
     ----------
     d : str
-        Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as [1]_ has them.
+        Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as in SVG 2.
     arcs : bool
-        Leave arcs what they are, as `quasiharmonic.geometry.curves.Arc`.
+        Whether to return arcs as `quasiharmonic.geometry.curves.Arc` instead of Bézier curves.
 
     Returns
     -------
     list of list of (degree + 1, 2) float64
-        For every subpath its pieces, each a Bézier curve by its control points. Arcs are cubic curves
-        within 1e-7 of their larger radius. Subpaths that draw nothing are left out.
+        The pieces of every subpath, each a Bézier curve given by its control points. Arcs become cubic curves with an
+        error below 1e-7 of their larger radius. Empty subpaths are left out.
 
     Raises
     ------
     ValueError
-        With the place, where the data break the rules.
+        When the path data are invalid; the message gives the position.
     """
     pen = _Pen(arcs)
     scan = _Scanner(d)
@@ -66,20 +66,20 @@ def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
 
 
 def commands(d: str, most: int) -> int:
-    """How many commands there are in path data, counted in a small part of the time that reading them takes.
+    """Count the commands in path data, much faster than parsing them.
 
-    An arc counts for as many as half a turn is curves.
+    An arc counts as the number of curves of half a turn.
 
     Parameters
     ----------
     d : str
     most : int
-        More of them are not counted.
+        Counting stops above this number.
 
     Returns
     -------
     int
-        Too few only where the flags of arcs are written together with what follows them.
+        Too low only if the flags of arcs are written without a separator after them.
     """
     total = 0
     for letter, numbers in map(re.Match.groups, _COMMAND.finditer(d)):
@@ -92,7 +92,7 @@ def commands(d: str, most: int) -> int:
 
 
 class _Scanner:
-    """Takes numbers and commands off path data."""
+    """Read numbers and commands from path data."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -100,7 +100,7 @@ class _Scanner:
         self._skip()
 
     def command(self, previous: str) -> str | None:
-        """The next command; what follows its arguments without a letter repeats it."""
+        """Return the next command; arguments without a letter repeat the previous command."""
         if self.at == len(self.text):
             return None
         character = self.text[self.at]
@@ -110,7 +110,7 @@ class _Scanner:
             return character
         if previous in ("", "z", "Z") or not _NUMBER.match(self.text, self.at):
             raise self.error("a command is needed")
-        # Further pairs after a move are lines.
+        # Further pairs of numbers after a move are lines.
         return {"M": "L", "m": "l"}.get(previous, previous)
 
     def number(self) -> float:
@@ -139,15 +139,15 @@ class _Scanner:
 
 
 class _Pen:
-    """Follows the commands of a path; points are complex numbers x + iy."""
+    """Execute the commands of a path; points are complex numbers x + iy."""
 
     def __init__(self, arcs: bool) -> None:
-        # Control points, and arcs if they are left what they are.
+        # Control points, and `Arc` objects if arcs are kept.
         self.subpaths: list[list[Any]] = []
         self.count = 0
         self.arcs = arcs
         self.here = self.start = 0j
-        # The last control point of the curve before, and of which kind it was.
+        # The last control point of the previous curve, and its command.
         self.control = 0j
         self.before = ""
 
@@ -177,7 +177,10 @@ class _Pen:
         self.before = kind
 
     def _reflected(self, alike: str) -> complex:
-        """The control point that continues the curve before smoothly, if that was of the same degree."""
+        """Control point that continues the previous curve smoothly.
+
+        The current point if the previous command is not a curve of the same degree.
+        """
         return 2 * self.here - self.control if self.before and self.before in alike else self.here
 
     def _line(self, end: complex) -> None:
@@ -191,14 +194,14 @@ class _Pen:
         self.count += 1
 
     def _arc(self, rx: float, ry: float, turn: float, large: bool, sweep: bool, end: complex) -> None:
-        """An elliptical arc, by its centre (appendix B.2.4 of [1]_)."""
+        """Append an elliptical arc, converted to its centre and angles (SVG 2, appendix B.2.4)."""
         rx, ry = abs(rx), abs(ry)
         if end == self.here:
             return
         if rx == 0 or ry == 0:
             self._line(end)
             return
-        # In coordinates that make the ellipse the unit circle.
+        # In coordinates in which the ellipse is the unit circle.
         axis = cmath.exp(1j * turn)
 
         def inward(z: complex) -> complex:
@@ -207,14 +210,14 @@ class _Pen:
 
         half = inward((self.here - end) / 2)
         size = abs(half)
-        if size > 1:  # too small to reach: the radii grow until it does
+        if size > 1:  # radii too small: scale them up until the ellipse reaches both ends
             rx, ry, half, size = rx * size, ry * size, half / size, 1.0
         middle = half * 1j * math.sqrt(max(0.0, 1 - size**2)) / size
         if large != sweep:
             middle = -middle
         first, last = cmath.phase(half - middle), cmath.phase(-half - middle)
         angle = (last - first) % (2 * math.pi) if sweep else -((first - last) % (2 * math.pi))
-        # Unit circle to ellipse, moved so that the arc's ends are where they are to be.
+        # Map the unit circle to the ellipse through both end points.
         centre = (self.here + end) / 2 + axis * complex(middle.real * rx, middle.imag * ry)
 
         if self.arcs:

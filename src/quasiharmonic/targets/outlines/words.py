@@ -1,4 +1,4 @@
-"""Outlines of words: letters pushed into each other, as contours and as the curves that these are chords of."""
+"""Outlines of words, made of overlapping letters: as contours, and as the exact curves of the contours."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
 from quasiharmonic.targets.outlines.nesting import filled, nested
 from quasiharmonic.util.arrays import FloatArray
 
-# Points of a united outline nearer to each other than this, in units of the font size, are one.
+# Points of a united outline closer than this, in units of the font size, are merged.
 _ONE = 1e-12
-# Steps to where two curves meet; they have met when they are nearer than this share of their size.
+# Maximum number of Newton steps to the intersection of two curves, and its tolerance as a share of the curve's size.
 _STEPS, _MEET = 30, 1e-14
-# Curves are as long as their chords but for this share. Chords that cross at a small angle do so far from where their
-# curves do: so many tolerances at most.
+# A curve and its chords may differ in length by at most this share. Where chords cross at a small angle, the
+# intersection of the curves may be far away: at most this many tolerances.
 _ALIKE, _STRAYS = 0.01, 100.0
 _FLATLY = (
     "letters of the word touch so flatly that their curves cannot be joined: choose others, or have the boundary slide "
@@ -26,34 +26,33 @@ _FLATLY = (
 
 
 def word(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[FloatArray]:
-    """Outline of several letters, set so tightly that they make one piece.
+    """Outline of several letters that overlap and form one piece.
 
-    A connected surface can fill no outline of several pieces, so the letters of a word have to overlap.
+    A connected surface cannot fill an outline of several pieces, so the letters must overlap.
 
     Parameters
     ----------
     text : str
-        Characters with something to see.
+        Visible characters.
     font : str or path, optional
         As for `letter`.
     overlap : float
-        How far each letter is pushed into the one before, in units of the font size.
+        Overlap of each letter with the one before, in units of the font size.
     tolerance : float
         As for `letter`.
 
     Returns
     -------
     list of (k, 2) float64
-        One outer contour, counterclockwise, and holes, clockwise. The first letter stands as `letter`
-        has it.
+        One outer contour, counterclockwise, and holes, clockwise. The first letter has the position of `letter`.
 
     Raises
     ------
     ValueError
-        As for `letter`; when the overlap is not positive; when a part of a letter touches no other, as
-        the dot of an i.
+        As for `letter`; when the overlap is not positive; when a part of a letter, such as the dot of an i, touches no
+        other.
     FileNotFoundError
-        When there is no such font file.
+        When the font file does not exist.
     ModuleNotFoundError
         When Shapely, which unites the letters, is not installed.
     """
@@ -68,12 +67,12 @@ def word(text: str, font: Font | None = None, *, overlap: float = 0.03, toleranc
 
 
 def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[Curve]:
-    """The curves that the contours of `word` are chords of: pieces of the letters' own, which meet where letters do.
+    """Return the exact curves of the contours of `word`: pieces of the letters' curves, joined at their intersections.
 
     Parameters
     ----------
     text, font, overlap, tolerance
-        As for `word`; letters stand where it puts them.
+        As for `word`, with the same positions of the letters.
 
     Returns
     -------
@@ -83,7 +82,7 @@ def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, t
     Raises
     ------
     ValueError
-        As for `word`; when letters touch so flatly that it is not to be told where one goes over into the other.
+        As for `word`; when letters touch at so small an angle that the intersection of their curves cannot be found.
     FileNotFoundError, ModuleNotFoundError
         As for `word`.
     """
@@ -98,7 +97,7 @@ def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, t
 
 
 def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tuple[list[list[FloatArray]], list[float]]:
-    """The letters of a word in their places, and how far to the left each has been moved."""
+    """Return the contours of each letter in its position, and each letter's shift to the left."""
     if not 0 < overlap < np.inf:
         raise ValueError(f"overlap must be positive and finite, not {overlap}")
     if not text:
@@ -113,10 +112,10 @@ def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tupl
 
 
 def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
-    """The curve that a united contour is made of chords of, from those of the letters."""
+    """Return the curve of which a united contour is a polyline, made of pieces of the letters' curves."""
     middles = (contour + np.roll(contour, -1, axis=0)) / 2
     by_point, by_middle = (np.stack([one.nearest(points)[1] for one in drawn]) for points in (contour, middles))
-    # A chord is on the curve to which its middle and both of its ends are near, and be it that others cross it there.
+    # A chord belongs to the curve closest to its middle and both its ends. Other curves may cross it there.
     own = np.argmin(by_point + by_middle + np.roll(by_point, -1, axis=1), axis=0)
     begins = np.flatnonzero(own != np.roll(own, 1))
     if not begins.size:
@@ -124,7 +123,7 @@ def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     contour, own = np.roll(contour, -begins[0], axis=0), np.roll(own, -begins[0])
     runs = np.split(np.arange(len(contour)), begins[1:] - begins[0])
     curves = [drawn[own[run[0]]] for run in runs]
-    # Where each run begins, on the curve before and on its own.
+    # Start of each run, on the previous curve and on its own.
     meetings = [_meeting(curves[k - 1], curves[k], contour[run[0]]) for k, run in enumerate(runs)]
     pieces = []
     for k, (one, run) in enumerate(zip(curves, runs, strict=True)):
@@ -144,7 +143,7 @@ def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
 
 
 def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
-    """Where two curves meet near a point, as lengths along each: Newton's method, from its nearest points."""
+    """Intersection of two curves near a point, as arc lengths along each, by Newton's method."""
     s, t = (curve.nearest(near[None])[0] for curve in (one, other))
     ahead = np.ones(1, dtype=bool)
     for _ in range(_STEPS):
@@ -161,7 +160,7 @@ def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
 
 
 def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
-    """How far one letter can move to the left until it touches another, on some level of both."""
+    """Distance by which one letter can move to the left until it touches another."""
     low, high = (
         [extreme([extreme(c[:, 1]) for c in shape]) for shape in (before, after)] for extreme in (np.min, np.max)
     )
@@ -171,7 +170,7 @@ def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
 
 
 def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
-    """Where a shape begins on horizontal lines, infinite where it does not meet them."""
+    """Smallest x of a shape on each horizontal line, ``inf`` where the line misses the shape."""
     a = np.concatenate(shape)
     b = np.concatenate([np.roll(contour, -1, axis=0) for contour in shape])
     y = levels[:, None]
@@ -181,7 +180,7 @@ def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
 
 
 def _united(shapes: list[list[FloatArray]]) -> list[FloatArray]:
-    """The outline of all that some shapes cover; each is an outline of its own, wound as `nested` does."""
+    """Outline of the union of shapes, each of them an outline oriented as in `nested`."""
     try:
         import shapely
     except ModuleNotFoundError as error:
@@ -197,5 +196,5 @@ def _united(shapes: list[list[FloatArray]]) -> list[FloatArray]:
         for contours in shapes
     ]
     rings = shapely.get_rings(shapely.get_parts(shapely.union_all(covered)))
-    # The last point of a ring is its first again.
+    # A ring repeats its first point at the end.
     return nested([shapely.get_coordinates(ring)[:-1] for ring in rings])
