@@ -53,7 +53,7 @@ class DoubtfulDerivative(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class Layer(ABC):
-    """A map as a function of arrays. Layers with the same settings are equal, so programs are compiled once for them."""
+    """A map as a function of arrays. Layers with equal settings are equal, so programs are compiled once for them."""
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and isinstance(other, Layer) and self._settings == other._settings
