@@ -1,11 +1,11 @@
-"""Collision avoidance by way of bijectivity: elastic shapes, and the air between them (§11.2, Figure 20).
+"""Collision avoidance by bijectivity: elastic shapes and the air between them (§11.2, Figure 20).
 
-Shapes and air together are one triangle mesh. As long as none of its triangles is inverted, and the frame does not
-cross itself, no two shapes overlap, nor does a shape overlap itself, an obstacle or the container. So contact needs no
-detection and no response: shapes come to rest in the injective map of least energy. The air has next to no weight in
-that energy, and it is triangulated anew whenever time goes on, so that things can slide past each other.
+Shapes and air form one triangle mesh. As long as no triangle is inverted and the frame does not cross itself, no shape
+overlaps another shape, itself, an obstacle or the container. So no collision detection or response is needed: the
+shapes converge to the injective map of minimum energy. The air has a very small weight in that energy. It is
+triangulated again at every time step, so that shapes can slide past each other.
 
-    moved frame ──injective map──▶ valid again ──least energy──▶ at rest ──new air──▶ next frame
+    moved frame ──injective map──▶ valid ──minimum energy──▶ converged ──new air──▶ next frame
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ from quasiharmonic.util.arrays import (
     triangle_array,
 )
 
-#: ARAP, and what keeps triangles from collapsing.
+#: ARAP, and a barrier that keeps triangles from collapsing.
 _ELASTIC = Combination((1.0, ARAP()), (0.1, AreaBarrier()))
-# Of a Newton step's promise, relative to the energy: shapes are at rest.
+# Shapes have converged when a Newton step predicts a relative decrease of the energy below this.
 _AT_REST = 1e-4
-# Of the way that a frame is to go: steps are halved down to this.
+# Steps of the frame are halved down to this fraction of its movement.
 _SHORTEST = 1 / 64
 
 
 @dataclass(frozen=True, eq=False)
 class AirMeshState:
-    """Shapes, frame and air at one time.
+    """Shapes, frame and air at one time step.
 
     Attributes
     ----------
     points : (n + k, 2) float64
-        The shapes' vertices, then the frame's, loop by loop.
+        Vertices of the shapes, then those of the frame, loop by loop.
     F : (f, 3) int64
-        The shapes' triangles.
+        Triangles of the shapes.
     air : (a, 3) int64
-        The air's triangles, of the same points.
+        Triangles of the air, with indices into the same points.
     certificate : Certificate
-        The exact verdict on shapes and air together: no overlap if it is bijective.
+        The exact certificate of shapes and air together; there is no overlap if it is bijective.
     energy : float
         Mean elastic energy of the shapes.
     """
@@ -70,36 +70,35 @@ class AirMeshState:
 
 
 class AirMesh:
-    """Elastic shapes in a container with obstacles that move.
+    """Elastic shapes in a container with moving obstacles.
 
     Parameters
     ----------
     points : (n, 2) array
-        Vertices of the shapes at rest and at the start. Every one belongs to a triangle.
+        Rest positions of the shapes' vertices, also their initial positions. Every vertex belongs to a triangle.
     F : (f, 3) array of int
         Triangles of one or more shapes, with or without holes, counterclockwise.
     frame : sequence of (k, 2) arrays
-        The container's corners, counterclockwise, then those of each obstacle. Long sides are better given
-        several points.
+        Corners of the container, counterclockwise, then those of each obstacle. Long sides should have several points.
     gap : float, optional
-        Air thinner than this pushes what is around it apart, in the unit of the points; a hundredth of the
-        shapes' mean edge by default.
+        Air thinner than this pushes its surroundings apart, in the unit of the points; a hundredth of the shapes'
+        mean edge length by default.
     air_weight : float
-        Weight of the air in the energy, against 1 for the shapes; small, but not 0, or the first
-        triangle of air to collapse would stop everything.
+        Weight of the air in the energy, relative to 1 for the shapes; small but positive. With 0, the first collapsed
+        air triangle would block all movement.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape, a triangle is not counterclockwise, or shapes, container and
-        obstacles overlap or touch at the start.
+        If an array has the wrong shape, a triangle is not counterclockwise, or shapes, container and obstacles
+        overlap or touch at the start.
     ImportError
-        When Shapely, which triangulates the air, is not installed.
+        If Shapely, which triangulates the air, is not installed.
 
     Attributes
     ----------
-    moment : Moment
-        The present.
+    moment : AirMeshState
+        The current state.
     """
 
     def __init__(
@@ -136,30 +135,29 @@ class AirMesh:
             raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")
 
     def advance(self, frame: Sequence[ArrayLike], *, max_iterations: int = 300) -> AirMeshState:
-        """Move the frame and let the shapes come to rest.
+        """Move the frame, and converge the shapes.
 
-        Edges of air between points of the frame can forbid a move that is not forbidden in itself. So what cannot
-        be done at once is done in shorter steps along straight lines, with fresh air at each.
+        Air edges between points of the frame can forbid a move that is possible without them. If the whole move is not
+        possible, it is done in shorter steps along straight lines, each with new air.
 
         Parameters
         ----------
         frame : sequence of (k, 2) arrays
-            As many loops of as many points as at the start.
+            As many loops, with as many points, as at the start.
         max_iterations : int
-            Linear solves at most to make the mesh valid after a step.
+            Maximum number of linear solves to make the mesh valid after a step.
 
         Returns
         -------
-        Moment
-            Certified; also kept as ``moment``.
+        AirMeshState
+            The new state, certified; also stored as ``moment``.
 
         Raises
         ------
         ValueError
-            When loops have other sizes than at the start, or a point is not finite.
+            If loops have other sizes than at the start, or a point is not finite.
         RuntimeError
-            When that does not help: the frame leaves no room, or crosses itself or what it may not. The present is
-            then as it was.
+            If the move fails: the frame leaves no space, or crosses itself or a shape. The state is then unchanged.
         """
         there = self._stacked(frame)
         n, present = len(self._rest), self.moment
@@ -183,17 +181,17 @@ class AirMesh:
         return self.moment
 
     def _step(self, frame: FloatArray, max_iterations: int) -> AirMeshState | None:
-        """The present with the frame elsewhere, at rest; None where that cannot be."""
+        """The converged state with a moved frame; None if there is none."""
         try:
             moved = self._moved(frame, max_iterations)
             reached = None if moved is None else self._at_rest(moved)
         except ValueError:
-            # What has been checked when it was given is a frame by its form only: it may meet itself or the shapes.
+            # Only the frame's shape and values were checked, so the moved frame may cross itself or the shapes.
             return None
         return reached if reached is not None and reached.certificate.bijective else None
 
     def _moved(self, frame: FloatArray, max_iterations: int) -> FloatArray | None:
-        """The points with the frame elsewhere and no triangle inverted; None where the air does not let it."""
+        """The points with a moved frame and without inverted triangles; None if no such map was found."""
         n, then = len(self._rest), self.moment
         everything = np.concatenate([then.F, then.air])
         moved = np.concatenate([then.points[:n], frame])
@@ -204,14 +202,15 @@ class AirMesh:
         return result.uv if result.injective else None
 
     def _at_rest(self, points: FloatArray) -> AirMeshState:
-        """Let shapes come to rest from a valid state, with fresh air before and after."""
+        """Converge the shapes from a valid state, with new air before and after."""
         n = len(self._rest)
         fixed = np.arange(n, len(points))
         last = np.inf
         while True:
             air = self._triangulated(points)
             everything = np.concatenate([self._F, air])
-            # The shapes' triangles at rest are those of the start, the air's those of the present, unless too thin.
+            # Rest triangles of the shapes are those at the start. Those of the air are the current ones, thickened if
+            # too thin.
             energy = DeformationEnergy(
                 np.concatenate([self._rest, thickened(points[air], self._gap).reshape(-1, 2)]),
                 everything,
@@ -224,7 +223,7 @@ class AirMesh:
                 pass
             points = descent.positions(descent.w)
             elastic = self._elastic(points)
-            # Fresh air may let them slide further.
+            # New air may let shapes slide further.
             if elastic > (1 - 1e-2) * last:
                 break
             last = elastic
@@ -235,7 +234,7 @@ class AirMesh:
         return DeformationEnergy(self._rest, self._F, _ELASTIC).value(in_units(points[: len(self._rest)], 0))
 
     def _stacked(self, frame: Sequence[ArrayLike]) -> FloatArray:
-        """The frame's points, loop by loop, checked."""
+        """Check the frame's points, and return them loop by loop."""
         loops = _loops_of(frame)
         sizes = [len(loop) for loop in loops]
         if sizes != self._sizes:
@@ -245,12 +244,12 @@ class AirMesh:
         return np.concatenate(loops)
 
     def _triangulated(self, points: FloatArray) -> IntArray:
-        """Triangulate what neither shapes nor obstacles cover, without new points."""
+        """Triangulate the space outside shapes and obstacles, without new points."""
         return air_between(points, self._loops, self._sizes)
 
 
 def _loops_of(frame: Iterable[ArrayLike]) -> list[FloatArray]:
-    """The loops of a frame, one or more, each as an array (k, 2) of real numbers, a copy."""
+    """Convert the loops of a frame, one or more, to new arrays (k, 2) of real numbers."""
     if isinstance(frame, str | bytes) or not isinstance(frame, Iterable):
         raise ValueError(
             f"frame must be a list of loops (k, 2), the container's and those of obstacles, not {kind_of(frame)}"
@@ -272,11 +271,11 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     Parameters
     ----------
     points : (n, 2) float64
-        All vertices; the last ``sum(frame)`` are the frame's, loop by loop.
+        All vertices; the last ``sum(frame)`` belong to the frame, loop by loop.
     loops : list of (l,) int64
-        Boundary loops of the shapes, each shape to its loop's left.
+        Boundary loops of the shapes, with the shape on the left.
     frame : sequence of int
-        Sizes of the frame's loops, the container's first.
+        Sizes of the frame's loops, with the container first.
 
     Returns
     -------
@@ -286,9 +285,9 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     Raises
     ------
     ValueError
-        When loops cross or touch, or one is not inside the container; the message names them.
+        If loops cross or touch, or one is not inside the container; the message names them.
     ImportError
-        When Shapely is not installed.
+        If Shapely is not installed.
     """
     shapely = _shapely()
     ends = len(points) - sum(frame) + np.cumsum(frame)
@@ -300,7 +299,7 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
         + ["the container", *(f"obstacle {k}" for k in range(len(obstacles)))],
     )
     solid = [*(loop for loop in around if signed_area(loop) > 0), *obstacles]
-    # Spaces with air in them: the container, and the holes of shapes. A thing lies in the smallest one around it.
+    # Air fills the container and the holes of shapes. Each solid belongs to the smallest of these regions around it.
     spaces = [container, *(loop for loop in around if signed_area(loop) < 0)]
     rooms = [shapely.Polygon(space) for space in spaces]
     inside: list[list[FloatArray]] = [[] for _ in rooms]
@@ -321,7 +320,7 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
 
 
 def _check_apart(loops: Sequence[FloatArray], names: Sequence[str]) -> None:
-    """Refuse loops that meet, be it in a single point."""
+    """Raise ValueError if loops share a point."""
     shapely = _shapely()
     rings = [shapely.LinearRing(loop) for loop in loops]
     first, second = shapely.STRtree(rings).query(rings, predicate="intersects")
@@ -332,20 +331,20 @@ def _check_apart(loops: Sequence[FloatArray], names: Sequence[str]) -> None:
 
 
 def thickened(corners: FloatArray, gap: float) -> FloatArray:
-    """Triangles laid on their longest sides, those lower than a gap raised to it.
+    """Lay triangles on their longest sides, and raise heights below a gap to it.
 
-    Without this, air that is squeezed thinner at each step, and is at rest as it is at the next, would vanish.
+    Otherwise, air whose rest triangles are its current ones would become thinner at each step and vanish.
 
     Parameters
     ----------
     corners : (a, 3, 2) float64
-        Counterclockwise.
+        Corners of counterclockwise triangles.
     gap : float
 
     Returns
     -------
     (a, 3, 2) float64
-        Congruent to the given ones where these are higher than the gap.
+        Congruent to the given triangles if their height exceeds the gap.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     first = sides.argmax(axis=1)

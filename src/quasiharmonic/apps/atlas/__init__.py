@@ -1,7 +1,7 @@
-"""Maps with seams: what the library does to one surface, done to each island.
+"""Maps with seams: the library's functions, applied to each island.
 
-Every function takes a `SeamedMesh` in the place of ``V, F, uv`` and has the name of the function for one surface. The
-package builds on `apps.flattening` and `solver`. Start reading in `working`. The names are imported at their first use.
+Every function takes a `SeamedMesh` in place of ``V, F, uv`` and has the name of the function for one surface. The
+package builds on `apps.flattening` and `solver`. Start reading in `working`. Names are imported at their first use.
 """
 
 from __future__ import annotations

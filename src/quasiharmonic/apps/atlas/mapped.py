@@ -1,4 +1,4 @@
-"""What is done to the islands of a mesh, one after another, and what came out."""
+"""Apply an operation to each island of a mesh, and collect the results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quasiharmonic.geometry.mesh.surface import manifold_edges
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# An atlas is as far as the island that comes first here; of others, as the first one.
+# The status of an atlas is the first of these that one of its islands has; without any, that of the first island.
 _FURTHEST_LAST = (
     Status.INTERRUPTED,
     Status.IMPOSSIBLE,
@@ -32,16 +32,16 @@ _FURTHEST_LAST = (
 
 @dataclass(frozen=True, eq=False)
 class MappedIsland:
-    """What became of an island.
+    """The result for one island.
 
     Attributes
     ----------
     triangles : (k,) int64
-        Its triangles of the mesh, ascending.
+        Triangles of the island, as indices of the mesh, ascending.
     mirrored : bool
-        Whether it was, and is, mirrored; the result then is of its reflection at the v axis.
+        Whether the island is mirrored. If so, ``result`` belongs to its reflection about the v axis.
     result : MapResult
-        By the island's own numbers.
+        The result, in the island's own numbering.
     """
 
     triangles: IntArray
@@ -49,7 +49,7 @@ class MappedIsland:
     result: MapResult
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The result for JSON."""
         return {
             "first_triangle": int(self.triangles[0]),
             "triangles": len(self.triangles),
@@ -60,14 +60,15 @@ class MappedIsland:
 
 @dataclass(frozen=True, eq=False)
 class MappedAtlas:
-    """A map with seams, island by island.
+    """A map with seams and the results of its islands.
 
     Attributes
     ----------
     mesh : SeamedMesh
-        The surface with its new places.
+        The surface with its new positions.
     islands : tuple of MappedIsland
-        By their first triangle. Those that Ctrl-C came before are not there, and are where they were.
+        Results in the order of each island's first triangle. After Ctrl-C the remaining islands are not listed and
+        keep their positions.
     """
 
     mesh: SeamedMesh
@@ -80,21 +81,21 @@ class MappedAtlas:
 
     @property
     def status(self) -> Status:
-        """That of the island which went least far."""
+        """The status of the island that made the least progress."""
         found = [island.result.status for island in self.islands]
         return next((status for status in _FURTHEST_LAST if status in found), found[0])
 
     def places(self) -> list[FloatArray]:
-        """For each island, where its vertices are, in the order in which its result has them."""
+        """Return the vertex positions of every island, in the order of its result."""
         done = [one.result.uv * MIRROR if one.mirrored else one.result.uv for one in self.islands]
         return [*done, *(island.uv for island in self.mesh.islands[len(done) :])]
 
     def verdict(self) -> AtlasVerdict:
-        """The exact verdict on the places as they are stored."""
+        """Return the exact verdict on the stored positions."""
         return certify(self.mesh)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; of one island its result, of several their sums and the islands."""
+        """The results for JSON: with one island its result, otherwise totals and the list of islands."""
         results = [island.result for island in self.islands]
         if len(results) == 1:
             return results[0].to_dict()
@@ -110,29 +111,30 @@ class MappedAtlas:
 
 
 def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, reflect: bool = True) -> MappedAtlas:
-    """Do something to each island of a mesh.
+    """Apply an operation to each island of a mesh.
 
     Parameters
     ----------
     mesh : SeamedMesh
-        A surface, if it has no seams; those in it may be anything else's edges.
+        A mesh; without seams it must be a manifold surface.
     lower : callable
-        Called with each island; its result has a place for every vertex of it, and may have further ones at the end.
+        Called with each island. Its result has a position for every vertex of the island, and may have further
+        vertices at the end.
     reflect : bool
-        Of several islands, hand those that are mirrored over as their reflection, and reflect what comes out: they stay
-        mirrored. A single one that is mirrored is inverted, and nobody's purpose.
+        If there are several islands, pass mirrored ones as their reflection, and reflect the result, so that they stay
+        mirrored. A single mirrored island is treated as inverted.
 
     Returns
     -------
     MappedAtlas
-        Ctrl-C ends it, and what is not yet done stays where it was.
+        After Ctrl-C the remaining islands keep their positions.
 
     Raises
     ------
     ValueError
-        When the mesh is none, or ``lower`` refuses an island; the message says which.
+        If the mesh is not a surface or has no island, or ``lower`` rejects an island; the message names it.
     KeyboardInterrupt
-        When Ctrl-C comes before an island has a place.
+        If Ctrl-C comes before every island has a position.
     """
     islands = faced(mesh, reflect=reflect)
     done: list[MappedIsland] = []
@@ -144,22 +146,22 @@ def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, refle
             continue
         with naming(island, len(islands)):
             result = lower(island)
-        # A refinement of the island has further vertices, at the end.
+        # A refined island has further vertices at the end.
         places[k] = (result.uv * MIRROR if mirrored else result.uv)[: len(island.vertices)]
         done.append(MappedIsland(island.triangles, mirrored, result))
     return MappedAtlas(mesh.with_places(places), tuple(done))
 
 
 def faced(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]]:
-    """The islands of a mesh as `each_island` hands them over, and whether each is the reflection of a mirrored one.
+    """Return the islands of a mesh, mirrored ones as their reflection, and whether each was reflected.
 
     Raises
     ------
     ValueError
-        As `each_island` for a mesh that is none.
+        As `each_island`, if the mesh is not a surface or has no island.
     """
     if mesh.seamless:
-        # What is no surface comes apart where it is none, which nobody has asked for.
+        # A mesh without seams must be a surface: without this check it would silently split at non-manifold edges.
         manifold_edges(mesh.F, len(mesh.V))
     islands = mesh.islands
     if not islands:
@@ -173,7 +175,7 @@ def faced(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]
 
 @contextmanager
 def naming(island: Island, count: int) -> Iterator[None]:
-    """Say of which island a ValueError speaks, where there are several."""
+    """Name the island in a ValueError if there are several islands."""
     try:
         yield
     except ValueError as error:
@@ -183,9 +185,9 @@ def naming(island: Island, count: int) -> Iterator[None]:
 
 
 def in_place_of(island: Island, uv: FloatArray) -> FloatArray:
-    """A map (m, 2) of an island, turned, scaled to its area and shifted to where the island was.
+    """Rotate, scale and shift an island's map (m, 2) to the island's old direction, area and position.
 
-    Where rounding would invert a triangle it is left as it is.
+    If rounding would invert a triangle, the map is returned unchanged.
     """
     before, after = (np.ascontiguousarray(w).view(np.complex128).ravel() for w in (island.uv, uv))
     centre, middle = before.mean(), after.mean()

@@ -1,8 +1,7 @@
-"""Islands packed into the unit square: turned to their least boxes, scaled alike, apart by a margin.
+"""Pack islands into the unit square, rotated to their minimum boxes, with a common scale and a margin between them.
 
-Islands are packed as the boxes around them, by `quasiharmonic.apps.atlas.skyline`, in several orders; a bisection finds
-the largest scale at which one of them has room for all. Nothing is mirrored, and no triangle is inverted by rounding:
-that is decided exactly on what is handed back.
+`quasiharmonic.apps.atlas.skyline` packs the islands' bounding boxes in several orders. A bisection finds the largest
+scale at which one order fits. Islands are never mirrored. An exact check ensures that rounding inverts no triangle.
 """
 
 from __future__ import annotations
@@ -26,48 +25,48 @@ from quasiharmonic.util.arrays import (
     triangle_array,
 )
 
-# How far below the largest scale that is known not to fit a scale may stay.
+# Relative gap between the scale found and the smallest scale that does not fit.
 _PRECISION = 0.002
-# Room around each box that rounding may take, in addition to the margin.
+# Space around each box for rounding, in addition to the margin.
 _SLACK = 1e-12
-# Boxes whose areas differ by no more than this share are equally small: the one least turned is taken.
+# Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
 _AS_SMALL = 1e-9
-# Of the square's side, what islands must be left.
+# Minimum share of the square's side that the largest island must keep.
 _LEAST = 1e-6
-# Places of hull points that are computed at a time.
+# Positions of hull points computed per block.
 _BLOCK = 1 << 20
 
 
 def packed(
     uv: Sequence[ArrayLike], F: Sequence[ArrayLike], areas: ArrayLike, *, margin: float = 1 / 256
 ) -> list[FloatArray]:
-    """Lay the islands of a map into the unit square without overlap, as large as fits, all at one texel density.
+    """Pack the islands of a map into the unit square without overlap, as large as possible and at one texel density.
 
     Parameters
     ----------
     uv : sequence of (m, 2) array
-        Places of each island's vertices.
+        Positions of each island's vertices.
     F : sequence of (k, 3) array of int
-        Its triangles, by its own vertices.
+        Triangles of each island, in the island's numbering.
     areas : (i,) array
-        Areas of the islands on the surface, in any unit. In the square they are in proportion to these. An island
-        without area on the surface or in the plane is scaled as the others are on average.
+        Areas of the islands on the surface, in any unit. Packed areas are proportional to these. Islands without area
+        on the surface or in the plane get the average scale.
     margin : float
-        Least room between two islands' boxes, as a share of the square's side: 4/1024 are four texels of 1,024. To
-        the square's sides there is half of it, so that copies of the square side by side keep it too.
+        Minimum space between two islands' boxes, as a fraction of the square's side: 4/1024 is four texels of 1,024.
+        The space to the square's sides is half of it, so that adjacent copies of the square keep the margin too.
 
     Returns
     -------
     list of (m, 2) float64
-        New places. Boxes around islands are disjoint, by the margin or more along an axis, and within the square.
-        An island is turned such that its box is least, by 45° at most, and by a quarter more where that fits better;
-        never mirrored. The same input gives the same places.
+        New positions. The boxes around islands are within the square, and the margin separates them along an axis.
+        Islands are rotated to their minimum box by at most 45°, and by another 90° if this fits better, and never
+        mirrored. The result is deterministic.
 
     Raises
     ------
     ValueError
-        When arrays are malformed, or the sequences differ in length; when so many islands have no room with such a
-        margin; when an island has triangles so thin that rounding to places in the square would invert them.
+        If arrays are malformed or the sequences differ in length; if the islands do not fit with this margin; if
+        an island has triangles so thin that rounding to positions in the square would invert them.
     """
     islands, triangles, surface = _checked(uv, F, areas, margin)
     if not islands:
@@ -75,7 +74,7 @@ def packed(
     start = np.cumsum([0, *map(len, islands)])
     every = np.concatenate([rows + first for rows, first in zip(triangles, start, strict=False)])
     owner = np.repeat(np.arange(len(islands)), [len(rows) for rows in triangles])
-    # In units of about the map's size, a power of two, so that no square overflows.
+    # Scale by a power of two to about unit size, so that squares do not overflow.
     largest = np.abs(np.concatenate(islands)).max()
     islands = [np.ldexp(points, -int(np.frexp(largest)[1])) for points in islands]
     before = inverted_triangles(every, np.concatenate(islands))
@@ -102,7 +101,7 @@ def packed(
 def _checked(
     uv: Sequence[ArrayLike], F: Sequence[ArrayLike], areas: ArrayLike, margin: float
 ) -> tuple[list[FloatArray], list[IntArray], FloatArray]:
-    """Arrays of the right types and shapes, or a ValueError that says which are not."""
+    """Check the arguments and convert them to arrays; the ValueError names the wrong ones."""
     surface = real_array("areas", areas)
     for name, arrays in (("uv", uv), ("F", F)):
         if not isinstance(arrays, Sized) or isinstance(arrays, str | bytes):
@@ -124,16 +123,16 @@ def _checked(
 
 
 def _least_box(points: FloatArray) -> complex:
-    """Direction of the least box around points, as a complex number of length 1, at most 45° off the x-axis.
+    """The direction of the minimum box around points, as a complex number of length 1, at most 45° off the x-axis.
 
-    One of its sides lies along a side of the convex hull (Freeman and Shapira 1975).
+    One side of this box lies along a side of the convex hull (Freeman and Shapira 1975).
     """
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         hull = points[ConvexHull(points).vertices]
     except (QhullError, ValueError):
-        # Too few points, or all on a line.
+        # There are too few points, or all are collinear.
         return 1.0 + 0.0j
     corners = np.ascontiguousarray(hull).view(np.complex128).ravel()
     side = np.roll(corners, -1) - corners
@@ -145,19 +144,19 @@ def _least_box(points: FloatArray) -> complex:
 
 
 def _box_areas(corners: ComplexArray, along: ComplexArray) -> FloatArray:
-    """Areas of the boxes around points whose sides run in some directions."""
+    """Areas of the bounding boxes of points with sides along given directions."""
     seen = corners[None, :] * along.conj()[:, None]
     return np.asarray(np.ptp(seen.real, axis=1) * np.ptp(seen.imag, axis=1))
 
 
 def _turned(points: FloatArray, along: complex) -> FloatArray:
-    """Points turned such that a direction becomes that of the x-axis; themselves where it is."""
+    """Rotate points so that a direction becomes the x-axis; the same array if it already is."""
     c, s = along.real, along.imag
     return points if s == 0 else points @ np.array([[c, -s], [s, c]])
 
 
 def _densities(islands: list[FloatArray], F: list[IntArray], surface: FloatArray) -> FloatArray:
-    """What each island is to be scaled by so that areas are in proportion to those on the surface."""
+    """The scale of each island that makes packed areas proportional to areas on the surface."""
     plane = np.array([_area(points, rows) for points, rows in zip(islands, F, strict=True)])
     surface = surface / (surface.max() or 1.0)
     known = (plane > 0) & (surface > 0)
@@ -171,9 +170,9 @@ def _area(uv: FloatArray, F: IntArray) -> float:
 
 
 def _largest_scale(sizes: FloatArray, margin: float) -> tuple[float, list[Laid]]:
-    """The largest scale at which boxes (k, 2) have room, all but, and where they lie then."""
+    """The largest scale, within the precision, at which boxes (k, 2) fit, and their positions."""
     room = margin + 2 * _SLACK
-    # Which of them is best depends on the boxes.
+    # The best order depends on the boxes.
     longest, shortest = sizes.max(axis=1), sizes.min(axis=1)
     orders = [np.argsort(-by, kind="stable") for by in (longest, longest * shortest, longest + shortest, shortest)]
 
@@ -188,7 +187,7 @@ def _largest_scale(sizes: FloatArray, margin: float) -> tuple[float, list[Laid]]
     large = longest.max() or 1.0
     low, high, best = 0.0, 1 / large, at(0.0)
     scale = min((1 - room) / large, 1 / sqrt(max((longest * shortest).sum(), _LEAST * large**2)))
-    # Where margins leave next to nothing, that is nothing.
+    # If margins leave almost no space, the search stops and reports that the islands do not fit.
     while best is not None and high - low > _PRECISION * high and high * large > _LEAST:
         found = at(scale)
         if found is None:
@@ -205,7 +204,7 @@ def _largest_scale(sizes: FloatArray, margin: float) -> tuple[float, list[Laid]]
 
 
 def _placed(points: FloatArray, scale: float, place: Laid, inset: float) -> FloatArray:
-    """An island, its box's corner at the origin, in its place: turned by a quarter, scaled, shifted."""
+    """Place an island whose box has its corner at the origin: rotate by 90° if needed, scale and shift it."""
     if place.turned:
         points = np.stack([points[:, 1].max() - points[:, 1], points[:, 0]], axis=1)
     return np.asarray(scale * points + (place.x + inset, place.y + inset))

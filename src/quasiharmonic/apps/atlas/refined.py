@@ -1,4 +1,4 @@
-"""A file whose islands were refined, each on its own: one mesh again."""
+"""Combine islands that were refined separately into one mesh."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from quasiharmonic.util.arrays import FloatArray
 def written_over(
     mesh: MeshData, islands: Sequence[Island], refined: Sequence[Refined | None], places: Sequence[FloatArray]
 ) -> MeshData:
-    """Carry refinements of islands and their places over to the file that they are of.
+    """Transfer refinements of islands and their positions to the mesh data that contains them.
 
     Parameters
     ----------
     mesh : MeshData
     islands : sequence of Island
-        All islands of the mesh, by its numbers.
+        All islands of the mesh.
     refined : sequence of (Refined or None)
-        What became of each; only inner edges were split. None where nothing was.
+        The refinement of each island, which splits only interior edges; None for unchanged islands.
     places : sequence of (m_i, 2) float64
-        For each island, where its vertices are, the new ones included.
+        Vertex positions of each island, including new vertices.
 
     Returns
     -------
     MeshData
-        Vertices keep their numbers, new ones follow; the parts of a triangle stand where it stood.
+        Old vertices keep their indices, and new ones follow. The parts of a triangle take its place in the order.
     """
     n, dimension = mesh.V.shape
     V, F, FT, parent = [mesh.V], [], [], []
@@ -43,7 +43,7 @@ def written_over(
             origin = np.concatenate([origin, n + np.arange(added)])
             own, of = fine.F, of[fine.parent]
             V.append(fine.V[len(island.vertices) :, :dimension])
-            # Two parents or three; what is repeated has no share.
+            # Vertices have two or three parents; padded parents have weight zero.
             pad = (0, 0), (0, 3 - k)
             parents.append(np.pad(island.vertices[fine.parents], pad, mode="edge"))
             weights.append(np.pad(fine.weights, pad))
@@ -55,7 +55,7 @@ def written_over(
     together = Refined(
         np.concatenate(V), np.concatenate(F), np.concatenate(parent), np.concatenate(parents), np.concatenate(weights)
     )
-    # The places take the place of these zeros.
+    # The zeros are placeholders for positions, replaced below.
     new, _ = refined_mesh(mesh, together, np.zeros((len(mesh.V), 2)))
     order = np.argsort(together.parent, kind="stable")
     return new.with_places(SeamedMesh(new.V, new.F, np.concatenate(FT)[order], np.concatenate(places)))

@@ -1,4 +1,4 @@
-"""Where the seams of a surface are: where its map has them, along edges that somebody names, or where they do good."""
+"""Choose the seams of a surface: cuts into disks, or given edges."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from quasiharmonic.util.arrays import IntArray, named_edges
 def cut_apart(
     mesh: SeamedMesh, *, polygons: Polygons | None = None, disks_too: bool = True, reach: bool = True
 ) -> SeamedMesh:
-    """Cut every island of a surface into a disk that lies flat well; see `quasiharmonic.find_cuts`.
+    """Cut every island of a surface into disks that flatten with low distortion; see `quasiharmonic.find_cuts`.
 
     Parameters
     ----------
     mesh : SeamedMesh
-        Its seams stay.
+        The mesh. Its seams are kept.
     polygons : Polygons, optional
-        The faces that its triangles are parts of, inside which nothing is cut.
+        The polygonal faces that the triangles belong to. Edges inside a face are not cut.
     disks_too : bool
-        Whether islands that are disks already are cut where that is worth it. Otherwise they are left.
+        Also cut islands that already are disks, if it is worth it. If false and all islands are disks, the mesh is
+        returned unchanged.
     reach : bool
-        Whether cuts go on to what sticks out. A cut that only makes a disk is shorter, and seldom leaves an outline no
-        room beside it.
+        Extend the cuts to protruding parts. Cuts that only make a disk are shorter, and rarely leave too little space
+        for an outline.
 
     Returns
     -------
     SeamedMesh
-        Without places; or ``mesh`` itself, if nothing was to be cut.
+        Without positions; ``mesh`` itself if nothing was cut.
 
     Raises
     ------
@@ -48,7 +49,7 @@ def cut_apart(
 
 
 def cut_along(mesh: SeamedMesh, pairs: ArrayLike, *, polygons: Polygons | None = None) -> SeamedMesh:
-    """Cut a surface along edges, whatever seams its map has.
+    """Cut a surface along edges, ignoring the seams of its map.
 
     Parameters
     ----------
@@ -56,17 +57,17 @@ def cut_along(mesh: SeamedMesh, pairs: ArrayLike, *, polygons: Polygons | None =
     pairs : (k, 2) array of int
         Vertices at both ends of each edge.
     polygons : Polygons, optional
-        The faces that its triangles are parts of.
+        The polygonal faces that the triangles belong to.
 
     Returns
     -------
     SeamedMesh
-        Without places.
+        Without positions.
 
     Raises
     ------
     ValueError
-        When one is no edge, or inside a face; names the first ones.
+        If a pair is not an edge, or is inside a face; the message names the first ones.
     """
     cut = SeamedMesh(mesh.V, mesh.F).cut(pairs)
     if polygons is not None:

@@ -1,7 +1,8 @@
-"""Boxes laid into the unit square one after another, each where its upper side comes lowest.
+"""Pack boxes into the unit square one after another, each at the position with the lowest top side.
 
-What is filled is told by its upper rim alone, the skyline: steps from left to right. A box lies on the highest of the
-steps under it; what is lower remains empty (the bottom-left skyline of Jylänki 2010, A thousand ways to pack the bin).
+The filled region is represented by its upper boundary only, the skyline: steps from left to right. A box lies on the
+highest of the steps below it, and the space under it stays empty. This is the bottom-left skyline algorithm (Jylänki
+2010, A thousand ways to pack the bin).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 
 class Laid(NamedTuple):
-    """Where a box lies.
+    """The position of a box.
 
     Attributes
     ----------
@@ -27,17 +28,17 @@ class Laid(NamedTuple):
 
 
 def laid(boxes: Sequence[tuple[float, float]]) -> list[Laid] | None:
-    """Lay boxes into the unit square in the order they are given in, turned by a quarter where that is lower.
+    """Pack boxes into the unit square in the given order, rotated by 90° if this is lower.
 
     Parameters
     ----------
     boxes : sequence of (width, height)
-        Large ones had better come first.
+        Box sizes; large boxes should come first.
 
     Returns
     -------
     list of Laid or None
-        None if one of them has no room left.
+        None if a box does not fit.
     """
     left, top = [0.0], [0.0]
     places = []

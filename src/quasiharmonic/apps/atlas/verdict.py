@@ -1,4 +1,4 @@
-"""The exact verdict on a map with seams: on each of its islands, and on how they lie to each other."""
+"""The exact verdict on a map with seams: on each island, and on overlaps between islands."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from quasiharmonic.geometry.mesh.seams import Island, SeamedMesh, which_island
 from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray, counted, named
 
-#: What a map is multiplied by to be reflected at the v axis.
+#: Factor that reflects a map about the v axis.
 MIRROR = np.array([-1.0, 1.0])
 
-# Pairs of islands that are named at most; an atlas of stacked ones has as many as pairs there are.
+# Maximum number of pairs listed; stacked islands can overlap in all pairs.
 _MOST_PAIRS = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class IslandVerdict:
-    """The verdict on one island; elements by the mesh's numbers.
+    """The verdict on one island, in the mesh's numbering.
 
     Attributes
     ----------
     triangles : (k,) int64
-        Its triangles, ascending.
+        Triangles of the island, ascending.
     mirrored : bool
-        Whether every triangle is strictly negative, as in an island that was turned over on purpose. It then is judged
-        as the other side shows it. A single island is never held for mirrored, but for inverted.
+        Whether every triangle is strictly negative, as in an island that was mirrored on purpose. The reflection is
+        then certified. A single island is never called mirrored, but inverted.
     certificate : Certificate
-        By the island's own numbers.
+        The certificate, in the island's own numbering.
     inverted : (a,) int64
-        Its triangles that are not strictly positive (mirrored: not strictly negative).
+        Triangles that are not strictly positive (mirrored islands: not strictly negative).
     """
 
     triangles: IntArray
@@ -46,16 +46,16 @@ class IslandVerdict:
 
     @property
     def injective(self) -> bool:
-        """Whether its triangles are all strictly positive, or all strictly negative."""
+        """Whether all triangles are strictly positive, or all strictly negative."""
         return self.certificate.injective
 
     @property
     def bijective(self) -> bool:
-        """Whether it moreover covers no point twice."""
+        """Whether the island is injective and does not overlap itself."""
         return bool(self.certificate.bijective)
 
     def summary(self) -> str:
-        """Say in a sentence what is certified or wrong."""
+        """Describe the verdict in one line."""
         where = which_island(self.triangles)
         turned = ", mirrored" if self.mirrored else ""
         if not self.injective:
@@ -63,7 +63,7 @@ class IslandVerdict:
         return f"{where}{turned}: injective, {'bijective' if self.bijective else 'but it overlaps itself'}"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; of the triangles, the first and how many there are."""
+        """The verdict for JSON, with the first triangle and the number of triangles."""
         return {
             "first_triangle": int(self.triangles[0]),
             "triangles": len(self.triangles),
@@ -77,14 +77,14 @@ class IslandVerdict:
 
 @dataclass(frozen=True, eq=False)
 class AtlasVerdict:
-    """The verdict on a map with seams; made by `certify`.
+    """The verdict on a map with seams, made by `certify`.
 
     Attributes
     ----------
     islands : tuple of IslandVerdict
-        By their first triangle.
+        Verdicts, in the order of each island's first triangle.
     overlapping : (p, 2) int64
-        Pairs of bijective islands that share points of the plane, by their places in ``islands``; 1000 at most.
+        Pairs of bijective islands that share points of the plane, as indices of ``islands``; at most 1000.
     """
 
     islands: tuple[IslandVerdict, ...]
@@ -92,26 +92,26 @@ class AtlasVerdict:
 
     @property
     def injective(self) -> bool:
-        """Whether there are islands, and each is injective."""
+        """Whether there are islands and all are injective."""
         return bool(self.islands) and all(island.injective for island in self.islands)
 
     @property
     def bijective(self) -> bool:
-        """Whether each island is bijective. Whether they overlap each other is another question."""
+        """Whether there are islands and each one is bijective; overlaps between islands are not included."""
         return bool(self.islands) and all(island.bijective for island in self.islands)
 
     @property
     def inverted(self) -> IntArray:
-        """Triangles that are not as their island is wound, ascending."""
+        """Triangles with a sign other than their island's, ascending."""
         return np.sort(np.concatenate([np.empty(0, dtype=np.int64), *(island.inverted for island in self.islands)]))
 
     @property
     def mirrored(self) -> IntArray:
-        """Islands all of whose triangles are negative."""
+        """Indices of islands whose triangles are all negative."""
         return np.flatnonzero([island.mirrored for island in self.islands])
 
     def summary(self) -> str:
-        """Say what is certified; and of which islands it is not, or what is unusual about them."""
+        """Describe the verdict, with mirrored, overlapping and not bijective islands."""
         count = len(self.islands)
         injective = sum(island.injective for island in self.islands)
         bijective = sum(island.bijective for island in self.islands)
@@ -126,7 +126,7 @@ class AtlasVerdict:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The verdict for JSON."""
         return {
             "injective": self.injective,
             "bijective": self.bijective,
@@ -136,12 +136,12 @@ class AtlasVerdict:
 
 
 def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
-    """Judge a map with seams exactly, island by island.
+    """Certify a map with seams exactly, island by island.
 
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
-        Triangles without a place are in no island, and not judged.
+        Triangles without a position belong to no island and are not certified.
 
     Returns
     -------
@@ -164,12 +164,12 @@ def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
 
 
 def mirrored_islands(mesh: SeamedMesh) -> list[bool]:
-    """Which islands are mirrored; of a single one it is never said, as it is nobody's purpose."""
+    """Which islands are mirrored; a single island is never called mirrored."""
     return [len(mesh.islands) > 1 and is_mirrored(island.F, island.uv) for island in mesh.islands]
 
 
 def unmirrored(mesh: SeamedMesh) -> SeamedMesh:
-    """The map with its mirrored islands reflected, to be measured; where they lie does not matter then."""
+    """Reflect the mirrored islands of a map, for measurements that do not depend on positions."""
     turned = zip(mesh.islands, mirrored_islands(mesh), strict=True)
     return mesh.with_places([island.uv * MIRROR if mirrored else island.uv for island, mirrored in turned])
 
@@ -198,6 +198,6 @@ def _overlapping(islands: Sequence[Island], judged: Sequence[IslandVerdict]) -> 
 
 
 def _apart(one: Island, other: Island, mirrored: bool, also: bool) -> bool:
-    """Whether two bijective islands have no point of the plane in common."""
+    """Whether two bijective islands share no point of the plane."""
     F = np.concatenate([one.F[:, ::-1] if mirrored else one.F, (other.F[:, ::-1] if also else other.F) + len(one.uv)])
     return bool(certificate.certify(F, np.concatenate([one.uv, other.uv])).bijective)

@@ -1,4 +1,4 @@
-"""Maps with seams found, flattened and improved, island by island; each as the function of its name does a surface."""
+"""Map, flatten, improve and pack the islands of a map with seams, like the functions of the same names."""
 
 from __future__ import annotations
 
@@ -40,17 +40,16 @@ def polish(
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
-        A map whose islands are injective, mirrored ones included.
+        A map whose islands are injective; mirrored islands are allowed.
     free : bool
-        Let their borders go where distortion is least, rather than keep them. Islands then stay where they are as far
-        as their middle, their direction and their area go, and may come to overlap.
+        Let the boundaries move. The centre, direction and area of each island are kept. Islands may then overlap.
     fixed : (k,) array of int, optional
-        Vertices of the mesh that stay, with all of their places; the borders by default. Not with ``free``.
+        Fixed vertices of the mesh, on all islands that contain them; the boundaries by default. Not with ``free``.
     weights : (f,) array, optional
-        How much each triangle's distortion counts.
+        Weight of each triangle's distortion.
     **rest
-        As `quasiharmonic.polish`, or with ``free`` `quasiharmonic.flatten`, has it: ``energy``, ``max_iterations``,
-        ``tolerance``, ``linear_solver``, ``callback``; ``slide`` of the first.
+        Options of `quasiharmonic.polish`, or with ``free`` of `quasiharmonic.flatten`: ``energy``,
+        ``max_iterations``, ``tolerance``, ``linear_solver``, ``callback``; without ``free`` also ``slide``.
 
     Returns
     -------
@@ -59,7 +58,7 @@ def polish(
     Raises
     ------
     ValueError
-        When an island is not injective or no surface, named by its first triangle.
+        If an island is not injective or not a surface; the message names its first triangle.
     """
     mesh = seamed_mesh(mesh)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
@@ -79,15 +78,15 @@ def polish(
 
 
 def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **rest: Any) -> MappedAtlas:
-    """Lower an energy of every island within the injective maps, its border kept; see `quasiharmonic.harmonise`.
+    """Lower an energy of every island within the injective maps, with a fixed boundary; see `quasiharmonic.harmonise`.
 
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
     fixed : (k,) array of int, optional
-        As `polish` has it.
+        As for `polish`.
     **rest
-        As `quasiharmonic.harmonise` has it.
+        Options of `quasiharmonic.harmonise`.
 
     Returns
     -------
@@ -101,20 +100,20 @@ def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **
 def injective_map(
     mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, reference: Any = None, **rest: Any
 ) -> MappedAtlas:
-    """Map every island anew, its border kept; see `quasiharmonic.injective_map`.
+    """Map every island again with a fixed boundary; see `quasiharmonic.injective_map`.
 
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
     fixed : (k,) array of int, optional
-        As `polish` has it.
+        As for `polish`.
     reference, **rest
-        As `quasiharmonic.injective_map` has it.
+        Options of `quasiharmonic.injective_map`.
 
     Returns
     -------
     MappedAtlas
-        Where an island has no injective map, its result says so.
+        If an island has no injective map, its result reports it.
     """
     mesh = seamed_mesh(mesh)
     held = _fixed(mesh, fixed)
@@ -136,26 +135,26 @@ def flatten(
     gap: float = 0.0,
     **rest: Any,
 ) -> MappedAtlas:
-    """Lay every island flat, its border free; several stand side by side, and none of them is mirrored.
+    """Flatten every island with a free boundary. Islands stand side by side and are not mirrored.
 
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
-        Its islands need have no places.
+        Its islands may be without positions.
     start : bool
-        Begin with the places that the islands have.
+        Start from the islands' current positions.
     fixed : (k,) array of int, optional
-        Vertices of the mesh that are held at their places. An island with such a vertex stays where these put it, the
-        others are laid beside, and none over another.
+        Fixed vertices of the mesh, at their current positions. Islands with fixed vertices are mapped there, and the
+        others are placed beside them without overlap.
     weights : (f,) array, optional
-        How much each triangle's distortion counts.
+        Weight of each triangle's distortion.
     unit_square, gap, **rest
-        As `quasiharmonic.flatten` has it.
+        Options of `quasiharmonic.flatten`.
 
     Returns
     -------
     MappedAtlas
-        In the surface's own unit of length, or in the unit square.
+        In the surface's unit of length, or in the unit square.
     """
     mesh = seamed_mesh(mesh)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
@@ -190,12 +189,12 @@ def flatten(
 def _held_together(
     mesh: SeamedMesh, fixed: IntArray, weights: FloatArray | None, start: bool, rest: dict[str, Any]
 ) -> MappedAtlas:
-    """Several islands of which some have vertices held, as surfaces of one mesh: they mind each other."""
+    """Flatten several islands of which some have fixed vertices as one mesh, so that they do not overlap."""
     islands = mesh.islands
     for island in islands:
         with naming(island, len(islands)):
             flattened.flattenable(island.V, island.F)
-    # Numbered as the mesh is, where it has no seams, so that messages say what its owner reads.
+    # Without seams, use the mesh's numbering, so that messages name the mesh's elements.
     order, by_mesh = (np.argsort(_joined(islands, name), kind="stable") for name in ("vertices", "triangles"))
     number = np.argsort(order)
     ends = np.cumsum([len(island.V) for island in islands])
@@ -212,7 +211,7 @@ def _held_together(
         **own,
         **rest,
     )
-    # What was done was done to all of them, and is told once.
+    # There is one result for all islands, so its stages, history and time are reported once.
     told = [result, *[replace(result, stages=[], history=[], diagnosis=None, seconds=0.0) for _ in islands[1:]]]
     places = [result.uv[of] for of in numbers]
     done = [
@@ -223,19 +222,19 @@ def _held_together(
 
 
 def _joined(islands: Sequence[Island], name: str) -> Any:
-    """What islands have, one after the other."""
+    """Concatenate an attribute of all islands."""
     return np.concatenate([getattr(island, name) for island in islands])
 
 
 def pack(mesh: SeamedMesh | MeshLike, *, margin: float = 1 / 256) -> SeamedMesh:
-    """Lay islands into the unit square, all at one texel density; see `quasiharmonic.apps.atlas.packing.packed`.
+    """Pack islands into the unit square at one texel density; see `quasiharmonic.apps.atlas.packing.packed`.
 
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
-        Its islands injective, or mirrored; these stay mirrored.
+        Its islands are injective or mirrored. Mirrored islands stay mirrored.
     margin : float
-        Least room between two islands, as a share of the square's side.
+        Minimum space between two islands, as a fraction of the square's side.
 
     Returns
     -------
@@ -244,7 +243,7 @@ def pack(mesh: SeamedMesh | MeshLike, *, margin: float = 1 / 256) -> SeamedMesh:
     Raises
     ------
     ValueError
-        When an island has no places, or so many have no room with such a margin.
+        If an island has no positions, or the islands do not fit with this margin.
     """
     mesh = seamed_mesh(mesh)
     islands = mesh.islands
@@ -253,7 +252,7 @@ def pack(mesh: SeamedMesh | MeshLike, *, margin: float = 1 / 256) -> SeamedMesh:
 
 
 def _surface_areas(mesh: SeamedMesh) -> FloatArray:
-    """The islands' areas, in a unit near the surface's size."""
+    """Areas of the islands on the surface, in a unit near the surface's size."""
     V = np.ldexp(mesh.V, -int(np.frexp(np.abs(mesh.V).max(initial=0.0))[1]))
     a, b, c = V[mesh.F].swapaxes(0, 1)
     along, across = b - a, c - a
@@ -273,7 +272,7 @@ def _fixed(mesh: SeamedMesh, fixed: ArrayLike | None) -> IntArray | None:
 
 
 def _held(island: Island, fixed: IntArray | None) -> IntArray:
-    """Which of an island's vertices stay."""
+    """Fixed vertices of an island; its boundary by default."""
     if fixed is None:
         return np.unique(boundary_edges(island.F, len(island.vertices)))
     return np.flatnonzero(np.isin(island.vertices, fixed))

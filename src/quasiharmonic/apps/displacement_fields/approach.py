@@ -1,16 +1,15 @@
-"""From a field without folds down to the nearest one, patch by patch, each with a step length of its own.
+"""Descend from a field without folds to the nearest one, patch by patch, with a step length for each patch.
 
-Free are the pixels of some patches, between which no cell has free pixels of two. With ``w`` where pixels go and ``a``
-where the given field takes them, both in the grid's unit, a patch descends::
+The free pixels form patches. No cell has free pixels of two patches. Let ``w`` be the positions of the mapped pixels
+and ``a`` those under the given field, both in the grid's unit. Each patch minimises::
 
     ½ Σ |w − a|²  +  κ Σ B((det − δ) / d)        B(s) = −(s − 1)² log s   for s < 1,   0 for s ≥ 1
 
-over its pixels and its cells' corner triangles. The barrier [1]_ is infinite at determinants of δ and vanishes, with
-two derivatives, from δ + d on: pixels whose cells are not nearly folded are pulled by the first term alone, to exactly
-where the field takes them. κ is lowered in steps, and what is left of the barrier is then a layer too thin to matter.
+over its pixels and its cells' corner triangles. The barrier [1]_ is infinite at determinants of δ. From δ + d on, it
+and its first two derivatives vanish. So only the first term acts on pixels whose cells are not nearly folded, and moves
+them exactly to their positions under the given field. κ decreases in steps, until the barrier's effect is negligible.
 
-All patches at hand share one matrix, which falls apart into a block each, and Newton's direction; how far they go
-along it, whether they are at rest, is each one's own concern.
+Patches share one block-diagonal matrix and Newton's direction. Step length and convergence are determined per patch.
 
 References
 ----------
@@ -31,24 +30,25 @@ from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# The barrier's width d, and its weights κ, one after the other.
+# The barrier's width d, and its weights κ in turn.
 _WIDTH, _WEIGHTS = 0.05, (1e-3, 1e-5)
-# A patch is at rest when Newton's model promises less than this part of its value, or than this, in squared pixels.
+# A patch has converged if Newton's model predicts a decrease below this fraction of its value, or below this number of
+# squared pixels,
 _TOLERANCE, _NOTHING = 1e-6, 1e-14
-# Or when a step lowers it by less than this part.
+# or if a step lowers its value by less than this fraction.
 _IDLE = 1e-9
 _STEPS, _HALVINGS = 100, 30
-# As of Newton's other descents: part of the way to the first collapse, and of the decrease that the slope promises.
+# As in the other Newton descents: fraction of the step to the first collapse, and of the predicted decrease.
 _FRACTION, _SUFFICIENT = 0.9, 1e-4
-# What the matrix's diagonal is raised by if need be.
+# Values added to the matrix's diagonal in turn until it is positive definite.
 _SHIFTS = 0.0, 1e-12, 1e-8, 1e-4
-# Free pixels of which one matrix is made, about.
+# Approximate number of free pixels in one matrix.
 _AT_ONCE = 20_000
 
 
 @dataclass(frozen=True)
 class ThinBarrier(Isotropic):
-    """A barrier at determinants of ``min_jacobian`` that is 0 from ``min_jacobian + width`` on."""
+    """A barrier at determinants of ``min_jacobian`` that vanishes from ``min_jacobian + width`` on."""
 
     min_jacobian: float
     width: float
@@ -56,18 +56,18 @@ class ThinBarrier(Isotropic):
     barrier = True
 
     def density(self, d: Deformation) -> FloatArray:
-        """``B(s)``."""
+        """Return ``B(s)``."""
         s = self._place(d)
         return np.where(s > 0, -((s - 1) ** 2) * np.log(np.where(s > 0, s, 1)), np.inf)
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """By a, and by b the negative: φ is a function of det = a − b."""
+        """Derivatives by a and by b; they are opposite, as φ is a function of det = a − b."""
         s = self._inside(d)
         slope = -(2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) / self.width
         return slope, -slope
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """By a twice, by both, by b twice."""
+        """Second derivatives by a and a, a and b, b and b."""
         s = self._inside(d)
         bend = -(2 * np.log(s) + 4 * (s - 1) / s - ((s - 1) / s) ** 2) / self.width**2
         return bend, -bend, bend
@@ -81,7 +81,7 @@ class ThinBarrier(Isotropic):
 
 
 def approach(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float) -> None:
-    """Bring the free pixels as near to a given field as they get.
+    """Move the free pixels as near to their positions under a given field as possible.
 
     Parameters
     ----------
@@ -90,16 +90,16 @@ def approach(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, 
         A map in the grid's unit whose determinants are above ``min_jacobian`` at all corners of cells with free pixels.
         Changed in place.
     given : (h, w) complex128
-        The map to be near to.
+        The given map.
     patch : (h, w) int64
-        Each free pixel's patch, from 1 on; 0 where pixels stay.
+        Patch of each free pixel, from 1 on; 0 for fixed pixels.
     min_jacobian : float
-        δ, what determinants stay above.
+        δ, the lower bound of the determinants.
     """
     size = np.bincount(patch.ravel())
     size[0] = 0
     batch = (np.cumsum(size) - size) // _AT_ONCE
-    # Overflow gives inf or NaN; every comparison with NaN is false, so such a step is never taken.
+    # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never taken.
     with np.errstate(all="ignore"):
         for number in range(int(batch[-1]) + 1):
             todo = np.flatnonzero((batch == number) & (size > 0))
@@ -116,7 +116,7 @@ def _descend(
     min_jacobian: float,
     weight: float,
 ) -> None:
-    """Bring the patches ``todo`` to rest under one weight of the barrier; a matrix of those alone that still move."""
+    """Converge the patches ``todo`` for one weight of the barrier; the matrix only has patches that still move."""
     steps = _STEPS
     while todo.size and steps:
         batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), min_jacobian, weight)
@@ -130,7 +130,7 @@ def _descend(
 
 
 class _Batch:
-    """Some patches, with one matrix."""
+    """Patches that share one matrix."""
 
     def __init__(
         self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
@@ -156,11 +156,11 @@ class _Batch:
         self._count = len(F)
 
     def enter(self, w: ComplexArray) -> None:
-        """Put the free pixels' places into a map (h, w)."""
+        """Write the free pixels' positions into a map (h, w)."""
         w.ravel()[self._pixels[self.free]] = self.here[self.free]
 
     def _values(self, w: ComplexArray) -> tuple[FloatArray, Deformation]:
-        """Of each patch, what is descended; and the deformation."""
+        """Return the objective of each patch, and the deformation."""
         deformation = self.energy.deform(w)
         density = self.energy.energy.density(deformation)
         apart = np.abs((w - self.given)[self.free]) ** 2
@@ -168,9 +168,9 @@ class _Batch:
         return 0.5 * near + self.weight * np.bincount(self.of_triangle, density, minlength=self.patches), deformation
 
     def step(self, moving: BoolArray) -> BoolArray:
-        """One step of each patch that moves; whether there may be another."""
+        """Take one step of each moving patch; return which patches have not converged."""
         value, deformation = self._values(self.here)
-        # The energy is a mean, the patches' a sum.
+        # The energy is a mean, but the patches' objective is a sum.
         share = self.weight * self._count
         pull = share * self.energy.gradient_of(deformation, len(self.here))[self.free]
         gradient = pull + (self.here - self.given)[self.free]
@@ -187,7 +187,7 @@ class _Batch:
     def _search(
         self, direction: ComplexArray, expected_decrease: FloatArray, before: FloatArray, moving: BoolArray
     ) -> FloatArray:
-        """Go along a direction, each patch as far as is good; by how much each has fallen."""
+        """Search along a direction with a step length for each patch; return each patch's decrease."""
         full = np.zeros_like(self.here)
         full[self.free] = direction
         reach = np.full(self.patches, np.inf)
@@ -209,7 +209,7 @@ class _Batch:
 
 
 def touched_cells(pixels: BoolArray) -> BoolArray:
-    """The cells (h − 1, w − 1) that have one of the pixels (h, w)."""
+    """The cells (h − 1, w − 1) that have at least one of the pixels (h, w)."""
     rows = pixels[:-1] | pixels[1:]
     touched: BoolArray = rows[:, :-1] | rows[:, 1:]
     return touched

@@ -1,18 +1,17 @@
-"""A displacement field on a grid of pixels: what it is, and when it folds.
+"""Displacement fields on a grid of pixels, and the condition under which a field folds.
 
-A field says of the pixel in row y and column x, at the place ``p = (x · spacing_x, y · spacing_y)``, that it goes to
-``p + field[y, x]``. Between pixels displacements are interpolated bilinearly, as registration software does it. On a
-cell, the square between four pixels, the determinant of such a map's derivative is an affine function of the two
-coordinates, and at each corner it is the area of the triangle that the corner makes with its two neighbours over that
-of the triangle at rest. So it is positive on the whole cell if and only if all four *corner triangles* are, which is
-if and only if the cell's image is strictly convex and not turned over: both ways of cutting each cell along a diagonal
-give positive triangles [1]_. Central differences, which are often looked at instead, can be positive everywhere in a
-field that folds.
+A field maps the pixel in row y and column x, at the position ``p = (x · spacing_x, y · spacing_y)``, to
+``p + field[y, x]``. Between pixels, displacements are interpolated bilinearly, as in registration software. A cell is
+the square between four pixels. On it the Jacobian determinant of the map is an affine function of the coordinates. At
+each corner the determinant is the area ratio of the triangle of the corner and its two neighbours. So the determinant
+is positive on the whole cell if and only if all four *corner triangles* are positive. This holds if and only if the
+cell's image is strictly convex and not mirrored; both diagonals then cut it into positive triangles [1]_. Central
+differences can be positive everywhere in a field that folds.
 
 ::
 
-    0 ── 1      corner triangles 0 1 2, 1 3 0, 2 0 3, 3 2 1: each begins with its corner and runs
-    │    │      the way from the axis x to the axis y
+    0 ── 1      corner triangles 0 1 2, 1 3 0, 2 0 3, 3 2 1: each starts at its corner and turns
+    │    │      from the x axis to the y axis
     2 ── 3
 
 References
@@ -31,7 +30,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
 
-# Of a cell's vertices, numbered along x and then along y.
+# Corner triangles of a cell whose vertices are numbered along x and then along y.
 _TRIANGLES = np.array([[0, 1, 2], [1, 3, 0], [2, 0, 3], [3, 2, 1]])
 
 
@@ -42,9 +41,9 @@ class Grid:
     Attributes
     ----------
     shape : (int, int)
-        Rows and columns, at least two of each.
+        Numbers of rows and columns, at least two each.
     spacing : (float, float)
-        Between columns, along x, and between rows, along y.
+        Distances between columns, along x, and between rows, along y.
     """
 
     shape: tuple[int, int]
@@ -52,52 +51,52 @@ class Grid:
 
     @property
     def unit(self) -> float:
-        """The side of a square as large as a cell."""
+        """The side of a square with the area of a cell."""
         return float(np.sqrt(self.spacing[0]) * np.sqrt(self.spacing[1]))
 
     @cached_property
     def points(self) -> FloatArray:
-        """Where the pixels are; (h, w, 2)."""
+        """Positions of the pixels; (h, w, 2)."""
         rows, columns = self.shape
         x, y = np.arange(columns) * self.spacing[0], np.arange(rows) * self.spacing[1]
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     @cached_property
     def rest(self) -> ComplexArray:
-        """The same in the grid's unit, as complex numbers; (h, w)."""
+        """Positions of the pixels in the grid's unit, as complex numbers; (h, w)."""
         return np.ascontiguousarray(self.points / self.unit).view(np.complex128)[..., 0]
 
     def cells(self, rows: IntArray, columns: IntArray) -> IntArray:
-        """The four vertices of some cells, pixels counted row by row; (k, 4) int64."""
+        """Return the four vertices of cells, pixels counted row by row; (k, 4) int64."""
         first = rows * self.shape[1] + columns
         return np.stack([first, first + 1, first + self.shape[1], first + self.shape[1] + 1], axis=1)
 
     def corner_triangles(self, cells: IntArray) -> IntArray:
-        """All corner triangles of cells (k, 4); (4 k, 3) int64."""
+        """Return all corner triangles of cells (k, 4); (4 k, 3) int64."""
         return cells[:, _TRIANGLES].reshape(-1, 3)
 
     def triangles(self) -> IntArray:
-        """The grid as a mesh: each cell cut from its first row's second pixel to its second row's first; (f, 3)."""
+        """Return the grid as a mesh; each cell's diagonal joins its second and third vertex; (f, 3)."""
         rows, columns = np.indices((self.shape[0] - 1, self.shape[1] - 1)).reshape(2, -1)
         return self.cells(rows, columns)[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
 
     def jacobians(self, w: ComplexArray) -> FloatArray:
-        """Determinants at the corners of all cells of a map (h, w) in the grid's unit; (h − 1, w − 1, 4)."""
+        """Return the determinants at all cell corners of a map (h, w) in the grid's unit; (h − 1, w − 1, 4)."""
         along, down = np.diff(w, axis=1), np.diff(w, axis=0)
         upper, lower, left, right = along[:-1], along[1:], down[:, :-1], down[:, 1:]
         sides = ((upper, left), (upper, right), (lower, left), (lower, right))
-        # What overflows is infinite or NaN.
+        # Overflow gives inf or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
 
 
 def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
-    """The grid of a field of some shape.
+    """Return the grid of a field with a given shape.
 
     Raises
     ------
     ValueError
-        When the spacing is not one or two positive numbers.
+        If the spacing is not one or two positive numbers.
     """
     sides = real_array("spacing", spacing)
     if sides.shape not in ((), (2,)) or not (np.isfinite(sides) & (sides > 0)).all():
@@ -107,12 +106,12 @@ def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
 
 
 def checked_field(field: ArrayLike) -> FloatArray:
-    """A displacement field as (h, w, 2) float64; a copy.
+    """Check a displacement field, and return a copy as (h, w, 2) float64.
 
     Raises
     ------
     ValueError
-        When it has another shape, or is not finite; names the first pixels, row and column.
+        If the shape is wrong or the field is not finite; the message names the first pixels by row and column.
     """
     array = real_array("field", field)
     if array.ndim != 3 or array.shape[2] != 2 or min(array.shape[:2]) < 2:

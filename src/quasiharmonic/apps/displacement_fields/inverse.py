@@ -1,8 +1,8 @@
 """The inverse of a displacement field, on the same grid.
 
-A field without folds maps each cell, bilinearly, onto a convex quadrilateral, and these lie side by side. Which one a
-pixel lies in is decided exactly, and where in it is a quadratic equation. So the inverse is no iteration's limit: at
-the pixels it is right to rounding, as far as the field reaches.
+A field without folds maps each cell bilinearly to a convex quadrilateral, and the quadrilaterals do not overlap. The
+cell that contains a pixel is found exactly, and the position in it solves a quadratic equation. So the inverse is not
+iterative: at pixels in the image of the field it is exact to rounding.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class InverseField:
     Attributes
     ----------
     field : (h, w, 2) float64
-        From the pixel at the place q to where it comes from, ``q + field``; NaN where it comes from nowhere.
+        Displacement from the pixel at position q to its source ``q + field``; NaN for pixels without a source.
     outside : (h, w) bool
-        The pixels that come from nowhere: what the given field makes of the grid does not reach them.
+        Pixels outside the image of the given field, which have no source.
     error : float
-        The farthest that a pixel is off after the way there and back, through the given field between its pixels, in
-        the unit of the field: rounding.
+        Maximum distance of a pixel from itself after the inverse and the given field, in the field's unit; caused by
+        rounding only.
     """
 
     field: FloatArray
@@ -39,7 +39,7 @@ class InverseField:
     error: float
 
     def summary(self) -> str:
-        """In a sentence."""
+        """Describe the inverse in one sentence."""
         share = 100 * float(self.outside.mean())
         return f"{share:.3g} % of the pixels lie outside; there and back the others are off by {self.error:.2g} at most"
 
@@ -52,23 +52,23 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     field : (h, w, 2) array
         Displacements along x and y; see `nearest_invertible`.
     spacing : float or (float, float)
-        From a pixel to the next, along x and along y.
+        Distance between neighbouring pixels, along x and along y.
 
     Returns
     -------
     InverseField
-        On the same grid.
+        The inverse on the same grid.
 
     Raises
     ------
     ValueError
-        When the field folds or its border overlaps itself, is not finite, or an argument has the wrong shape. The
+        If the field folds, its border overlaps itself, it is not finite, or an argument has the wrong shape. The
         message names the pixels.
 
     Notes
     -----
-    At its own pixels the inverse is exact; between them, where software interpolates it, it differs from that of the
-    given field, which is not bilinear there, by the square of the spacing.
+    At its pixels the inverse is exact to rounding. Between them it is interpolated, although the true inverse is not
+    bilinear there; this error is proportional to the square of the spacing.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
 
 
 class _Images:
-    """The images of some cells (m,), ``first + s along + t down + s t twist`` for s and t from 0 to 1."""
+    """The images of cells (m,), ``first + s along + t down + s t twist`` for s and t from 0 to 1."""
 
     def __init__(self, grid: Grid, places: FloatArray, cell: IntArray) -> None:
         row, column = np.divmod(cell, grid.shape[1] - 1)
@@ -113,7 +113,7 @@ class _Images:
         self.twist = last - right - below + self.first
 
     def source(self, points: FloatArray) -> FloatArray:
-        """Where points (m, 2) come from, one in each cell's image."""
+        """Return the source positions of points (m, 2), one point in each cell's image."""
         away, twist = self.first - points, self.twist
         t = _rising_root(
             _cross(twist, self.down), _cross(self.along, self.down) + _cross(twist, away), _cross(self.along, away)
@@ -123,13 +123,13 @@ class _Images:
         return (self.corner + np.stack([np.clip(s, 0, 1), t], axis=1)) * self.spacing
 
     def forward(self, points: FloatArray) -> FloatArray:
-        """Where points (m, 2) of the cells go."""
+        """Return the images of points (m, 2) of the cells."""
         s, t = (points / self.spacing - self.corner).T[..., None]
         return self.first + s * self.along + t * self.down + s * t * self.twist
 
 
 def _rising_root(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """The root in [0, 1] at which ``a t² + b t + c`` rises through 0, there being one."""
+    """The root in [0, 1] at which ``a t² + b t + c`` changes from negative to positive; it must exist."""
     root = np.sqrt(np.maximum(b**2 - 4 * a * c, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(b >= 0, -2 * c / (b + root), (root - b) / (2 * a))

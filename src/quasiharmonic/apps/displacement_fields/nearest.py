@@ -1,4 +1,4 @@
-"""The nearest field without folds."""
+"""Find the nearest displacement field without folds."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, counted
 
-# Pixels that are this near to where they were, in pixels, are put there.
+# Pixels closer than this to their original position, in pixels, return to it.
 _THERE = 1e-6
-# Patches whose rim has moved grow by so many pixels, so many times at most.
+# Patches whose border moved grow by this number of pixels, at most this number of times.
 _WIDER, _ROUNDS = 4, 12
 
 
 @dataclass(frozen=True, eq=False)
 class InvertibleField:
-    """A displacement field without folds, and what it has cost.
+    """A displacement field without folds, and its distance from the given one.
 
     Attributes
     ----------
     field : (h, w, 2) float64
-        Without folds.
+        The field without folds.
     moved_mask : (h, w) bool
-        Where it is another than the given one; elsewhere it is that to the last bit.
+        Pixels whose displacement changed; the others are bitwise unchanged.
     certificate : Certificate
-        Of the pixels' places as a mesh, each cell cut along one diagonal: whether the field is injective, and, looking
-        at the border too, whether no place is covered twice.
+        The certificate of the mapped pixels as a mesh, with each cell cut along one diagonal. It reports whether the
+        field is injective and, including its border, bijective.
     folds : int
-        Cells that the given field folds: with a corner whose determinant is not above ``min_jacobian``.
+        Number of cells that the given field folds: a corner's determinant is not above ``min_jacobian``.
     patches : int
-        Parts of the grid, apart from each other, in which it was changed.
+        Number of separate regions of the grid in which the field changed.
     distance : float
-        Root of the mean square, over all pixels, of how far the field is from the given one, in the unit of the field.
+        Root mean square distance from the given field, over all pixels, in the field's unit.
     seconds : float
     """
 
@@ -53,7 +53,7 @@ class InvertibleField:
     seconds: float
 
     def summary(self) -> str:
-        """In a sentence or two."""
+        """Describe the field in one or two sentences."""
         if not self.folds:
             return f"The field does not fold, and is as it was. {self.certificate.summary()}"
         moved = int(np.count_nonzero(self.moved_mask))
@@ -70,46 +70,45 @@ def nearest_invertible(
     min_jacobian: float = 0.01,
     fixed: ArrayLike | None = None,
 ) -> InvertibleField:
-    """Make a displacement field invertible, and change it as little as that takes.
+    """Make a displacement field invertible with a minimum change.
 
-    A field folds at a cell, the square between four pixels, where the derivative of the map that it stands for, between
-    pixels bilinear, has a determinant that is not positive; that is, where one of the four triangles that each corner
-    makes with its two neighbours is inverted. This finds a field without folds that is as near to the given one as
-    it gets by going downhill: the sum of the squared distances over all pixels has a local minimum there.
+    Between pixels the field is interpolated bilinearly. It folds at a cell, the square between four pixels, if the
+    Jacobian determinant is not positive there. This holds if the triangle of one of the cell's corners and its two
+    neighbours is inverted. The result is a local minimum of the sum of the squared distances over all pixels.
 
     Parameters
     ----------
     field : (h, w, 2) array
-        Displacements along x, to the right, and y, down, of the pixel in row y and column x; in the unit of the
-        spacing. The pixel at the place p goes to ``p + field``.
+        Displacements along x, to the right, and y, down, of the pixel in row y and column x, in the unit of
+        ``spacing``. The pixel at position p is mapped to ``p + field``.
     spacing : float or (float, float)
-        From a pixel to the next, along x and along y.
+        Distance between neighbouring pixels, along x and along y.
     min_jacobian : float
-        What the determinants of the derivative are above, all four of each cell; at least 0 and less than 1, and
-        taken to be what rounding does to a determinant where it is less. Cells that have less are folds. What is above
-        by a little survives being stored in single precision.
+        Lower bound of the determinants at the four corners of each cell; at least 0 and less than 1. Cells below it
+        count as folds. Smaller values than the rounding error of a determinant are raised to it. A field with
+        determinants slightly above the bound stays without folds in single precision.
     fixed : (h, w) array of bool, optional
-        Pixels that keep their displacements; none by default, those of the border neither.
+        Pixels that keep their displacements; none by default, so border pixels may also move.
 
     Returns
     -------
     InvertibleField
-        Away from the folds it is the given field to the last bit; where nothing folds, everywhere.
+        The result. Away from folds the field is bitwise unchanged.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape, the field is not finite, or another option has no such value. The message
-        names the pixels.
+        If an array has the wrong shape, the field is not finite, or an option is out of range. The message names the
+        pixels.
     RuntimeError
-        When no field was found, because of pixels that are fixed, or of displacements so large that nothing is left of
-        a pixel when they are rounded.
+        If no field was found, because of fixed pixels or because displacements are too large for the precision of
+        doubles.
 
     Notes
     -----
-    The distance has many local minima where folds are deep; which one is found follows from the start, a harmonic fill
-    of patches around the folds (`quasiharmonic.apps.displacement_fields.patches`). Where the field's border overlaps
-    itself, which is no fold, `Certificate.bijective` is False and says where.
+    With deep folds the distance has many local minima. The result depends on the start, a harmonic fill of patches
+    around the folds (`quasiharmonic.apps.displacement_fields.patches`). If the field's border overlaps itself, which is
+    not a fold, `Certificate.bijective` is False and the certificate reports where.
 
     Examples
     --------
@@ -154,18 +153,18 @@ def nearest_invertible(
 
 
 def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
-    """Say of each cell of a displacement field whether it does not fold, exactly.
+    """Decide exactly for each cell of a displacement field whether it does not fold.
 
     Parameters
     ----------
     field : (h, w, 2) array
     spacing : float or (float, float)
-        Both as of `nearest_invertible`.
+        As for `nearest_invertible`.
 
     Returns
     -------
     (h − 1, w − 1) bool
-        Whether all four corner triangles of the pixels' places, as doubles have them, are positive.
+        Whether all four corner triangles of the mapped pixels, as stored in doubles, are positive.
 
     Raises
     ------
@@ -185,12 +184,12 @@ def _fold_free(grid: Grid, field: FloatArray) -> BoolArray:
 
 
 def _map(grid: Grid, field: FloatArray) -> ComplexArray:
-    """Where pixels go, in the grid's unit; (h, w)."""
+    """Positions of the mapped pixels, in the grid's unit; (h, w)."""
     return np.ascontiguousarray((grid.points + field) / grid.unit).view(np.complex128)[..., 0]
 
 
 def _rounding(w: ComplexArray) -> float:
-    """What rounding may do to a determinant of a map (h, w), generously: of most of it, whatever single pixels do."""
+    """A bound on the rounding error of a determinant of a map (h, w), from medians, so that outliers do not count."""
     side = max(float(np.median(np.abs(np.diff(w, axis=axis)))) for axis in (0, 1))
     return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
 
@@ -205,7 +204,7 @@ def _fixed_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
 
 
 def _check_fixed(wrong: BoolArray, fixed: BoolArray) -> None:
-    """Refuse folds that nobody may mend."""
+    """Raise ValueError for folds whose pixels are all fixed."""
     stuck = wrong & fixed[:-1, :-1] & fixed[1:, :-1] & fixed[:-1, 1:] & fixed[1:, 1:]
     if stuck.any():
         raise ValueError(
@@ -214,7 +213,7 @@ def _check_fixed(wrong: BoolArray, fixed: BoolArray) -> None:
 
 
 def _descended(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:
-    """The nearest map, from one without folds; patches grow until nothing moves at their rims."""
+    """Find the nearest map, starting from one without folds; patches grow until nothing moves at their borders."""
     try:
         w, patch = filled_in(grid, given, fixed, min_jacobian)
     except NoRoomError as none:
@@ -237,7 +236,7 @@ def _descended(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: 
 
 
 def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
-    """Put pixels to where they were that are all but there, if nothing folds with that."""
+    """Return pixels that are nearly at their original positions to them, unless this makes a fold."""
     there = (w != given) & (np.abs(w - given) < _THERE)
     before = w[there]
     w[there] = given[there]

@@ -1,9 +1,8 @@
-"""Patches around the folds of a field, and a map of each without folds that fits into the field around it.
+"""Patches around the folds of a field, and a map without folds that agrees with the field outside them.
 
-The pixels of cells that fold are freed, and those a little way around them. Inside each patch displacements become
-harmonic: as smooth as those around it let them be. Where that folds too, the patch grows, and what it meets it takes
-in; a patch that has become the whole grid takes the field smoothed until it does not fold, as every field does in
-the end: far enough smoothed it is a translation.
+The pixels of folded cells and some pixels around them become free. Inside each patch, displacements become harmonic. If
+the result still folds, the patch grows and merges with patches that it meets. If a patch becomes the whole grid, the
+field is smoothed until it does not fold. This always ends, as smoothing converges to a translation.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 if TYPE_CHECKING:
     from scipy.sparse import dia_array
 
-# How far around folded cells pixels are freed, and by what factor patches that fold still grow.
+# Distance in pixels around folded cells that becomes free, and growth factor of patches that still fold.
 _REACH, _GROWTH = 2, 2
-# Standard deviations of smoothing, in pixels, grow by this factor.
+# Growth factor of the smoothing's standard deviation in pixels.
 _SMOOTHER = 1.2
 _EIGHT = np.ones((3, 3), dtype=bool)
 
 
 class NoRoomError(Exception):
-    """Pixels that are fixed leave no map without folds that could be found; ``mask`` (h, w) says where."""
+    """Because of fixed pixels, no map without folds was found; ``mask`` (h, w) marks the pixels of the folds."""
 
     def __init__(self, mask: BoolArray) -> None:
         super().__init__("pixels that are fixed leave no room")
@@ -35,12 +34,12 @@ class NoRoomError(Exception):
 
 
 def folded(grid: Grid, w: ComplexArray, min_jacobian: float) -> BoolArray:
-    """The cells (h − 1, w − 1) of which a corner's determinant is not above ``min_jacobian``."""
+    """The cells (h − 1, w − 1) with a corner whose determinant is not above ``min_jacobian``."""
     return np.asarray(~(grid.jacobians(w) > min_jacobian).all(axis=2))
 
 
 def corners_of(cells: BoolArray) -> BoolArray:
-    """The pixels (h, w) of some cells (h − 1, w − 1)."""
+    """The pixels (h, w) of cells (h − 1, w − 1)."""
     pixels = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=bool)
     for y in (0, 1):
         for x in (0, 1):
@@ -49,14 +48,14 @@ def corners_of(cells: BoolArray) -> BoolArray:
 
 
 def labelled(free: BoolArray) -> IntArray:
-    """Number the patches that free pixels (h, w) make, from 1 on: no cell has pixels of two."""
+    """Number the patches of free pixels (h, w) from 1 on; no cell has pixels of two patches."""
     from scipy.ndimage import label
 
     return np.asarray(label(free, structure=_EIGHT)[0], dtype=np.int64)
 
 
 def grown(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
-    """Pixels and all that are at most some steps away, by rows, columns or both, but for those that are fixed."""
+    """Add all pixels within a number of steps, by rows, columns or both, except fixed ones."""
     from scipy.ndimage import maximum_filter
 
     around: BoolArray = maximum_filter(pixels, 2 * steps + 1, mode="constant") & ~fixed
@@ -64,7 +63,7 @@ def grown(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
 
 
 def filled_in(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> tuple[ComplexArray, IntArray]:
-    """A map without folds that is the given one but for some patches.
+    """Find a map without folds that agrees with the given one outside some patches.
 
     Parameters
     ----------
@@ -72,20 +71,20 @@ def filled_in(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: f
     given : (h, w) complex128
         A map in the grid's unit.
     fixed : (h, w) bool
-        Pixels that stay.
+        Fixed pixels.
     min_jacobian : float
-        What all determinants are to be above.
+        Lower bound of all determinants.
 
     Returns
     -------
     w : (h, w) complex128
     patch : (h, w) int64
-        The patch of each pixel that has been freed, from 1 on, and 0 of all others.
+        Patch of each free pixel, from 1 on; 0 for all others.
 
     Raises
     ------
     NoRoomError
-        When none was found, which only pixels that are fixed can do.
+        If no such map was found, which can only happen with fixed pixels.
     """
     w, steps = given.copy(), _REACH
     free = grown(corners_of(folded(grid, given, min_jacobian)), steps, fixed)
@@ -105,7 +104,7 @@ def filled_in(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: f
 
 
 def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
-    """Make the displacements of free pixels harmonic, those of the others given, the grid's border free."""
+    """Make the displacements of free pixels harmonic, given the others; natural conditions at the grid's border."""
     from scipy.sparse import csr_array, dia_array, kron, triu
 
     inside, moved = np.flatnonzero(free), (given - grid.rest).ravel()
@@ -124,7 +123,7 @@ def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> 
 
 
 def _path(count: int) -> dia_array:
-    """The Laplacian of so many points in a row."""
+    """The Laplacian of a path of points."""
     from scipy.sparse import dia_array
 
     bands = np.full((3, count), -1.0)
@@ -134,7 +133,7 @@ def _path(count: int) -> dia_array:
 
 
 def _smoothed(grid: Grid, given: ComplexArray, min_jacobian: float) -> ComplexArray:
-    """The map whose displacements are smoothed by a Gaussian, as little as leaves no fold."""
+    """Smooth the displacements by the smallest tried Gaussian that leaves no fold."""
     from scipy.ndimage import gaussian_filter
 
     moved, deviation = given - grid.rest, 1.0

@@ -1,16 +1,16 @@
-"""What keeps a free boundary from running into itself: a barrier between its vertices and the edges near them.
+"""A barrier between boundary vertices and near boundary edges, which keeps a free boundary from intersecting itself.
 
-A vertex ``v`` of the boundary and an edge ``a → b`` that faces it across what is outside the surface are in *contact*
-where their distance ``d`` is below a reach ``d̂``, and repel each other by ``(d̂/d − 1)²``, which begins smoothly and
-grows beyond all bounds [1]_. The reach is a share of the boundary's own edges there: a limb that the map has shrunk to
-a millionth keeps gaps of a millionth. Second derivatives leave out how the direction of contact turns (Gauss and
-Newton): with ``n`` the unit vector from the edge's nearest point ``(1 − s) a + s b`` to ``v``, the gap changes by
-``Re n̄ (dv − (1 − s) da − s db)``, and what is kept is a factor times the square of this.
+A boundary vertex ``v`` and a boundary edge ``a → b`` that face each other across the outside of the surface are in
+*contact* if their distance ``d`` is below a reach ``d̂``. They then repel each other by ``(d̂/d − 1)²``, which starts
+smoothly and is unbounded [1]_. The reach is proportional to the local edge length of the boundary, so parts that have
+shrunk to a millionth have gaps of a millionth. Second derivatives neglect rotation of the contact direction
+(Gauss–Newton): let ``n`` be the unit vector from the edge's nearest point ``(1 − s) a + s b`` to ``v``. The gap changes
+by ``Re n̄ (dv − (1 − s) da − s db)``, and the second derivative is a factor times the square of this.
 
-To Newton's system a contact is one more triangle ``v, a, b``: whatever its corners do is affine, so the gap's change
-is ``Re(α dp + β dq)`` in the derivatives of a fixed right triangle at rest, and its square a quadratic form in them.
+For Newton's system a contact is one more triangle ``v, a, b``. Any displacement of its corners is affine, so the gap
+changes by ``Re(α dp + β dq)`` in the derivatives on a fixed right triangle at rest. Its square is a quadratic form.
 
-The barrier only shows Newton's method the way. Whether the boundary is simple is decided exactly, on every map.
+The barrier only guides Newton's method. An exact test on every map decides whether the boundary is simple.
 
 References
 ----------
@@ -29,12 +29,12 @@ from quasiharmonic.geometry.exact.loops import contacts, judge_loops
 from quasiharmonic.geometry.exact.predicates import box_pairs_between
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-# A gap is kept open from this share of the boundary's edges there on, ...
+# Reach of the barrier, relative to the local edge length of the boundary.
 _REACH = 1.0
-# ... and pairs up to so many times as far apart are looked at during a step, which may bring them nearer.
+# Pairs up to this many times the reach are also tracked during a step, which may bring them closer.
 _LOOKOUT = 2.0
 _MOST_MEETINGS = 1000
-#: Half the gradients of the hat functions of a triangle v, a, b with its right angle at a and legs of 1.
+#: Half the gradients of the hat functions of a triangle v, a, b with a right angle at a and legs of length 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 
 
@@ -45,9 +45,9 @@ class Contacts:
     Attributes
     ----------
     corners : (3, c) int64
-        Vertex, and tail and head of the edge.
+        Vertex, and start and end of the edge.
     reach : (c,) float64
-        The distance at which they begin to repel each other, in the map's units; 0 for those that do not.
+        Distance below which they repel each other, in the map's units; 0 for pairs that do not.
     """
 
     corners: IntArray
@@ -55,21 +55,21 @@ class Contacts:
 
     @classmethod
     def none(cls) -> Contacts:
-        """No contacts."""
+        """Return an empty set of contacts."""
         return cls(np.zeros((3, 0), dtype=np.int64), np.zeros(0))
 
     def room(self, w: ComplexArray) -> float:
-        """The least distance over its reach; ``inf`` without contacts."""
+        """The smallest ratio of distance to reach; ``inf`` without contacts."""
         d, _, _ = _nearest(*w[self.corners])
         return float(np.min(d[self.reach > 0] / self.reach[self.reach > 0], initial=np.inf))
 
     def value(self, w: ComplexArray) -> float:
-        """The sum of the barriers of a map (n,) complex128."""
+        """The sum of the barriers for a map (n,) complex128."""
         d, _, _ = _nearest(*w[self.corners])
         return float(np.sum(self._excess(d) ** 2))
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
-        """Its derivative by the positions, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
+        """The derivative of `value` with respect to positions, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
         d, normal, s = _nearest(*w[self.corners])
         pull = -2 * self._excess(d) * self.reach / d**2 * normal
         parts = np.concatenate([pull, -(1 - s) * pull, -s * pull])
@@ -77,7 +77,7 @@ class Contacts:
         return np.bincount(at, parts.real, minlength=w.size) + 1j * np.bincount(at, parts.imag, minlength=w.size)
 
     def curvature(self, w: ComplexArray) -> QuadraticForm:
-        """Its second derivative along the present directions of contact, in the derivatives that `HATS` defines."""
+        """The second derivative along the current contact directions, in the derivatives that `HATS` defines."""
         d, normal, s = _nearest(*w[self.corners])
         half: FloatArray = 0.5 * self._stiffness(d)
         # dv − da = dp + dq and db − da = i (dp − dq).
@@ -93,22 +93,22 @@ class Contacts:
         )
 
     def blocks(self, w: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Bound its second derivative by one that does not couple vertices: blocks xx, xy, yy, (n,) float64 each.
+        """A bound of the second derivative that does not couple vertices: blocks xx, xy, yy, (n,) float64 each.
 
-        Of three terms the square of the sum is at most three times the sum of the squares.
+        The square of a sum of three terms is at most three times the sum of their squares.
         """
         d, normal, s = _nearest(*w[self.corners])
         bound = 3 * self._stiffness(d) * np.stack([np.ones(s.shape), (1 - s) ** 2, s**2])
         at = self.corners.ravel()
 
         def summed(part: FloatArray) -> FloatArray:
-            # Of nothing bincount makes integers.
+            # For empty input bincount returns integers.
             return np.bincount(at, (bound * part).ravel(), minlength=w.size).astype(np.float64, copy=False)
 
         return summed(normal.real**2), summed(normal.real * normal.imag), summed(normal.imag**2)
 
     def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
-        """Those of a known set (3, k) of pairs of ``n`` vertices, with reach 0 for the others in it, and the rest."""
+        """Split into contacts in a known set (3, k), with reach 0 for its other pairs, and the remaining contacts."""
         keys, own = (pairs[0] * n + pairs[1] for pairs in (known, self.corners))
         order = np.argsort(keys)
         keys = np.append(keys[order], np.iinfo(np.int64).max)
@@ -119,13 +119,13 @@ class Contacts:
         return Contacts(known, reach), Contacts(self.corners[:, ~found], self.reach[~found])
 
     def within(self, w: ComplexArray, most: float) -> Contacts:
-        """Those whose distance is below so many times their reach."""
+        """Return the contacts whose distance is below ``most`` times their reach."""
         d, _, _ = _nearest(*w[self.corners])
         near = d < most * self.reach
         return Contacts(self.corners[:, near], self.reach[near])
 
     def _stiffness(self, d: FloatArray) -> FloatArray:
-        """The barriers' second derivatives by the distances."""
+        """The barriers' second derivatives with respect to the distances."""
         ratio = self.reach / d
         return np.where(ratio > 1, 2 * ratio * (3 * ratio - 2) / d**2, 0.0)
 
@@ -139,7 +139,7 @@ class Rim:
     Parameters
     ----------
     loops : sequence of (l,) int64
-        Boundary loops, the surface to their left.
+        Boundary loops, with the surface on their left.
     """
 
     def __init__(self, loops: Sequence[IntArray]) -> None:
@@ -153,27 +153,28 @@ class Rim:
         self._edges = np.stack([self._vertex, self._vertex[self._next]], axis=1)
 
     def meets_itself(self, uv: FloatArray) -> bool:
-        """Whether the boundary touches or crosses itself under a map (n, 2), or lies on the surface, exactly.
+        """Whether the boundary touches or crosses itself under a map (n, 2), or is wound the wrong way; decided
+        exactly.
 
-        Where it does not, and all triangles are positive, the map is bijective (`exact.certificate`). That no two edges
-        meet is not enough: where the triangles at a boundary vertex wind around it by more than a full turn,
-        a loop can be simple and run the wrong way round.
+        If it does not and all triangles are positive, the map is bijective (`exact.certificate`). Testing edges for
+        intersections is not sufficient: if triangles wind around a boundary vertex by more than a full turn, a loop
+        can be simple but wound the wrong way.
         """
         return bool(judge_loops(self._loops, uv)[1])
 
     def meetings(self, uv: FloatArray) -> IntArray:
-        """List the vertices (k,) at the ends of the first thousand pairs of edges that meet, if any do."""
+        """Return the end vertices (k,) of the first 1,000 pairs of intersecting boundary edges."""
         tail, head = uv[self._edges[:, 0]], uv[self._edges[:, 1]]
         short = self._edges[(tail == head).all(axis=1)]
         pairs = contacts(uv, self._edges, _MOST_MEETINGS).pairs
         return np.unique(np.concatenate([short.ravel(), self._edges[pairs].ravel()]))
 
     def tangled(self, uv: FloatArray) -> float:
-        """The share of the boundary's vertices at the ends of edges that meet; of the first thousand pairs at least."""
+        """The fraction of the boundary's vertices at intersecting edges, from the first 1,000 pairs."""
         return self.meetings(uv).size / self._vertex.size
 
     def contacts(self, w: ComplexArray) -> Contacts:
-        """Pairs that are near each other across what is outside the surface.
+        """Return pairs that are close to each other across the outside of the surface.
 
         Parameters
         ----------
@@ -184,7 +185,7 @@ class Rim:
         q = p[self._next]
         length = np.abs(q - p)
         around = 0.5 * (length + length[self._previous])
-        # The vertex's own edges and those next to it come first into its box, and are many: sort them out early.
+        # Most candidates are the vertex's own and neighbouring edges, so they are removed first.
         radius = (_LOOKOUT * _REACH * around)[:, None]
         here, there = _planar(p), _planar(q)
         boxes = here - radius, here + radius, np.minimum(here, there), np.maximum(here, there)
@@ -194,13 +195,13 @@ class Rim:
         d, normal, s = _nearest(p[i], p[j], q[j])
         near = np.flatnonzero(d < _LOOKOUT * reach)
         i, j, reach, normal, s = i[near], j[near], reach[near], normal[near], s[near]
-        # The way from the vertex to the edge leads through the outside, at both of its ends ...
+        # The path from the vertex to the edge must lie outside the surface at both ends,
         head = self._next[j]
         faced = ((q - p)[j].conj() * normal).imag < 0
         for place, at in ((0, j), (1, head)):
             those = np.flatnonzero(s == place)
             faced[those] = ~self._within(p, at[those], normal[those])
-        # ... and is not an edge of the boundary.
+        # and must not be an edge of the boundary.
         end = np.where(s == 0, j, np.where(s == 1, head, -1))
         kept = np.flatnonzero(faced & (self._next[i] != end) & (self._previous[i] != end))
         kept = kept[~self._within(p, i[kept], -normal[kept])]
@@ -208,12 +209,12 @@ class Rim:
         return Contacts(corners, reach[kept])
 
     def _apart(self, i: IntArray, j: IntArray) -> IntArray:
-        """Pairs (2, k) without those of a vertex and an edge of its own."""
+        """Remove pairs of a vertex and one of its own edges; (2, k)."""
         apart = np.flatnonzero((i != j) & (i != self._next[j]))
         return np.stack([i[apart], j[apart]])
 
     def _within(self, p: ComplexArray, i: IntArray, direction: ComplexArray) -> BoolArray:
-        """Whether directions from vertices of the boundary lead into the surface."""
+        """Whether directions from boundary vertices point into the surface."""
         ahead, behind = p[self._next[i]] - p[i], p[self._previous[i]] - p[i]
         left, right = (ahead.conj() * direction).imag > 0, (direction.conj() * behind).imag > 0
         convex = (ahead.conj() * behind).imag > 0
@@ -226,7 +227,7 @@ def _planar(w: ComplexArray) -> FloatArray:
 
 
 def _nearest(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    """Distances of points from segments, unit vectors from the nearest points, and these points' places s."""
+    """Distances of points from segments, unit vectors from the nearest points, and these points' parameters s."""
     along = b - a
     square = along.real**2 + along.imag**2
     s = np.clip(((v - a) * along.conj()).real / np.where(square > 0, square, 1), 0, 1)

@@ -1,6 +1,6 @@
-"""Newton's steps down the energy of a map whose boundary is free; where asked, without overlap on the way.
+"""Newton steps for the energy of a map with a free boundary, optionally without overlaps on the way.
 
-One vertex is held, or the map could drift. It may turn: the raised diagonal of the Newton system takes care of that.
+One vertex is fixed to prevent drift. Rotation remains possible; a raised diagonal keeps the Newton system regular.
 """
 
 from __future__ import annotations
@@ -23,44 +23,44 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# Stages of a guarded descent. Each contact weighs so much of the surface's mean energy, against a triangle of mean
-# size; the first stages end sooner, at this multiple of the tolerance, for they are only on the way.
+# Stages of a guarded descent: the weight of each contact, relative to the surface's mean energy per triangle, and a
+# factor on the tolerance. Early stages stop sooner, as they only prepare the later ones.
 _STAGES = (1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0)
-# The pattern of the system is made anew when this share of the contacts that repel is not in it.
+# The system's sparsity pattern is rebuilt when this fraction of the repelling contacts is not in it.
 _STRANGE = 0.3
-# ... where the energy is next to nothing as if it were this.
+# Lower bound of the energy for the contacts' weight.
 _LEAST_ENERGY = 1e-4
-# A step may take the narrowest gap down to this share of what it was, or of its reach.
+# A step may reduce the smallest gap to this fraction of its old value, or of its reach.
 _NARROWER = 0.3
-# Newton's steps in full converge quadratically. Where so many of them in a row leave this share of the decrement, and
-# this of the energy, triangles turn, which a straight step allows by little.
+# Full Newton steps converge quadratically. After _SLOW_STEPS slow steps in a row, which leave this fraction of the
+# decrement and this fraction of the energy, triangles probably rotate, which limits straight steps,
 _SLOW, _LITTLE, _SLOW_STEPS = 0.3, 0.8, 4
-# ... if in the middle they turn by so many times what they grow: otherwise a line is as good, and costs no solve.
+# if the median rotation is this many times the median growth. Otherwise a straight step is as good, and needs no solve.
 _TURNED = 12.0
 
 
 class _Moment(NamedTuple):
-    """A map as a `GuardedEnergy` reads it."""
+    """The evaluation of a map by `GuardedEnergy`."""
 
     surface: Any
     w: ComplexArray
 
 
 class GuardedEnergy:
-    """The energy of a surface and of the contacts of its boundary with itself, as `NewtonDescent` asks for it.
+    """The energy of a surface and of the contacts of its boundary with itself, for `NewtonDescent`.
 
     Parameters
     ----------
-    surface : Lowered
+    surface : NewtonObjective
 
     Attributes
     ----------
     contacts : Contacts
-        Those that couple their vertices in the Newton system.
+        Contacts that couple their vertices in the Newton system.
     strangers : Contacts
-        Others, for which it has no place.
+        Contacts that are not in the system's sparsity pattern.
     stiffness : float
-        The factor on each contact's barrier.
+        Factor on each contact's barrier.
     """
 
     def __init__(self, surface: NewtonObjective) -> None:
@@ -69,44 +69,44 @@ class GuardedEnergy:
         self.contacts, self.strangers, self.stiffness = Contacts.none(), Contacts.none(), 0.0
 
     def deform(self, w: ComplexArray) -> _Moment:
-        """What the other methods read of a map."""
+        """Evaluate the quantities of a map that the other methods need."""
         return _Moment(self.surface.deform(w), w)
 
     def value_of(self, moment: _Moment) -> float:
-        """The mean energy of the surface, and the barriers."""
+        """The mean energy of the surface plus the barriers."""
         return self.surface.value_of(moment.surface) + self.stiffness * (
             self.contacts.value(moment.w) + self.strangers.value(moment.w)
         )
 
     def gradient_of(self, moment: _Moment, n: int) -> ComplexArray:
-        """The derivative by ``n`` positions; (n,) complex128."""
+        """The derivative with respect to ``n`` positions; (n,) complex128."""
         return self.surface.gradient_of(moment.surface, n) + self.stiffness * (
             self.contacts.gradient(moment.w) + self.strangers.gradient(moment.w)
         )
 
     def curvature_of(self, moment: _Moment, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivatives on the surface's triangles, and then on the contacts'."""
+        """Second derivatives on the surface's triangles, then on those of the contacts."""
         surface = self.surface.curvature_of(moment.surface, negative=negative)
         between = self.contacts.curvature(moment.w).scaled(np.full(self.contacts.reach.shape, self.stiffness))
         fields = zip(vars(surface).values(), vars(between).values(), strict=True)
         return QuadraticForm(*(np.concatenate(both) for both in fields))
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
-        """How far along a direction each of the surface's triangles first vanishes."""
+        """The step along a direction at which each of the surface's triangles first becomes degenerate."""
         return self.surface.steps_to_collapse(w, direction)
 
 
 class FreeDescent(NewtonDescent):
-    """Steps of a map with a free boundary, of which as a rule nothing but one vertex is held.
+    """Newton steps of a map with a free boundary; usually only one vertex is fixed.
 
     Parameters
     ----------
-    energy : Lowered
+    energy : NewtonObjective
     uv : (n, 2) float64
         An injective map, of about unit size.
     linear_solver : str
     fixed : sequence of int
-        Vertices that are held where they are; one at least, or the map could drift.
+        Vertices fixed at their positions; at least one, to prevent drift.
     """
 
     def __init__(
@@ -118,28 +118,28 @@ class FreeDescent(NewtonDescent):
 
     @property
     def uv(self) -> FloatArray:
-        """The map at hand; (n, 2) float64."""
+        """The current map; (n, 2) float64."""
         return self.positions(self.w)
 
     @property
     def surface(self) -> NewtonObjective:
-        """The energy of the surface alone."""
+        """The energy of the surface, without contacts."""
         return self.energy
 
     @property
     def distortion(self) -> float:
-        """The value of the surface's energy alone."""
+        """The value of the surface's energy, without contacts."""
         return self.value
 
     def turn_to(self, density: Energy) -> None:
-        """Go on with another density on the same triangles; only of a `DeformationEnergy`, which has one."""
+        """Continue with another density on the same triangles; the energy must be a `DeformationEnergy`."""
         assert isinstance(self.surface, DeformationEnergy)
         self.surface.energy = density
         self.value = self.energy.value_of(self._deformation)
         self._cut, self._idle = True, 0
 
     def relax_barrier(self) -> bool:
-        """Make what only guards the map count for less; False if it cannot."""
+        """Lower the weight of the barrier that guards the map; return False if this is not possible."""
         return False
 
     @cached_property
@@ -147,7 +147,7 @@ class FreeDescent(NewtonDescent):
         return Turning.of(self.energy.F, self.energy.g, self.w.size, self.fixed, self._linear_solver)
 
     def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
-        """As of `NewtonDescent`; where full steps are many and short, first along a path that turns."""
+        """As in `NewtonDescent`; after several slow full steps, first try a path along which triangles rotate."""
         last, higher = self._last
         slow = not self._cut and expected_decrease > _SLOW * last and self.value > _LITTLE * higher
         self._last, self._slow = (expected_decrease, self.value), self._slow + 1 if slow else 0
@@ -156,7 +156,7 @@ class FreeDescent(NewtonDescent):
         )
 
     def _turned(self, direction: ComplexArray, expected_decrease: float) -> bool:
-        """Take a step in full, or more, along a path that turns; False if the energy does not fall enough there."""
+        """Take a full or longer step along a rotating path; return False if the energy does not decrease enough."""
         full = np.zeros_like(self.w)
         full[self.system.free] = direction
         rate = rates(self.energy.F, self.energy.g, self.w, full)
@@ -169,7 +169,7 @@ class FreeDescent(NewtonDescent):
             try:
                 there = path(t)
             except NotPositiveDefinite:
-                # Rest triangles so thin that the path's own system has no solution to any digit.
+                # With very thin rest triangles, the path's own system can be numerically singular.
                 return np.inf, None
             return self.evaluate_trial(there, bound)
 
@@ -181,12 +181,12 @@ class FreeDescent(NewtonDescent):
 
 
 class GuardedDescent(FreeDescent):
-    """Steps of a map that stays bijective.
+    """Newton steps of a map that stays bijective.
 
     Parameters
     ----------
     energy, uv, linear_solver, fixed
-        As `FreeDescent` has them; the map is bijective.
+        As for `FreeDescent`; the map must be bijective.
     rim : Rim
         The surface's boundary.
     """
@@ -211,16 +211,16 @@ class GuardedDescent(FreeDescent):
 
     @property
     def surface(self) -> NewtonObjective:
-        """The energy of the surface alone."""
+        """The energy of the surface, without contacts."""
         return self.energy.surface
 
     @property
     def distortion(self) -> float:
-        """The value of the surface's energy alone."""
+        """The value of the surface's energy, without contacts."""
         return self.energy.surface.value_of(self._deformation.surface)
 
     def relax_barrier(self) -> bool:
-        """Lower the weight of the contacts; False at the last."""
+        """Lower the weight of the contacts; return False if it is the last one."""
         following = next(self._stages, None)
         if following is None:
             return False
@@ -228,11 +228,11 @@ class GuardedDescent(FreeDescent):
         return True
 
     def step(self, tolerance: float) -> Status | None:
-        """Take one step, with the contacts there are now."""
+        """Take one step with the current contacts."""
         known, strangers = self._near.split(self._known, self.w.size)
         repelling = self._near.within(self.w, 1.0).reach.size
         if strangers.within(self.w, 1.0).reach.size > _STRANGE * repelling:
-            # A new pattern gets those that may come as well, or come again, so that it lasts a while.
+            # The new pattern includes possible and earlier contacts, so that it lasts for several steps.
             self._known = _united(self._known, self._near.corners, self.w.size)
             F = np.concatenate([self.energy.F, self._known.T])
             g = np.concatenate([self.energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
@@ -244,18 +244,18 @@ class GuardedDescent(FreeDescent):
         return super().step(self._slack * tolerance)
 
     def assemble(self, negative: float) -> None:
-        """Fill in the system's matrix, with strangers on its diagonal alone."""
+        """Assemble the system's matrix; contacts outside its pattern only add to the diagonal."""
         super().assemble(negative)
         if self.energy.strangers.reach.size:
             stiffness, free = self.energy.stiffness, self.system.free
             self.system.add_blocks(*(stiffness * part[free] for part in self.energy.strangers.blocks(self.w)))
 
     def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """As of `NewtonDescent`; besides, the boundary does not meet itself, and no gap becomes much narrower."""
+        """As in `NewtonDescent`; also reject maps whose boundary meets itself or whose gaps shrink too much."""
         value, there = super().evaluate_trial(w, bound)
         if there is not None:
             near = self._rim.contacts(w)
-            # Pairs that only face each other since count by how near they were, or no step might be short enough.
+            # New pairs are compared with _NARROWER at most, as otherwise no step might be short enough.
             before = min(self._room, near.room(self.w), _NARROWER)
             if near.room(w) < _NARROWER * before or self._rim.meets_itself(self.positions(w)):
                 return value, None
@@ -265,36 +265,36 @@ class GuardedDescent(FreeDescent):
     def _search(self, direction: ComplexArray, expected_decrease: float) -> bool:
         moved = super()._search(direction, expected_decrease)
         if moved:
-            # The last map that was accepted is the one that was gone to.
+            # The last evaluated map is the accepted one.
             self._near = self._ahead
             self._room = self._near.room(self.w)
         return moved
 
 
 def _united(older: IntArray, newer: IntArray, n: int) -> IntArray:
-    """Pairs (3, c) of either set, without the older ones where these are the most; ``n`` is above all vertices."""
+    """Unite pairs (3, c), or return the newer ones if they are less than half; ``n`` exceeds all vertices."""
     both = np.concatenate([newer, older], axis=1)
     _, first = np.unique(both[0] * n + both[1], return_index=True)
     return newer if first.size > 2 * newer.shape[1] else both[:, first]
 
 
 def descend(descent: FreeDescent, density: Energy, tolerance: float) -> Iterator[Status | None]:
-    """Take steps until there is no other to take.
+    """Take steps until converged or stalled.
 
     Parameters
     ----------
     descent : FreeDescent
-        At its start. If its energy's density is `ReweightedDirichlet`, it is held to that as long as two steps
-        together at least halve it.
+        The descent at its start. If its density is `ReweightedDirichlet`, it is used as long as two steps together at
+        least halve the energy.
     density : Energy
-        What is lowered.
+        The energy density to minimise.
     tolerance : float
-        As `quasiharmonic.polish` has it.
+        As for `quasiharmonic.polish`.
 
     Yields
     ------
     Status or None
-        After every step; a status after the last.
+        After every step; None until the last step, which yields a status.
     """
     values = [np.inf, descent.distortion]
     surface = descent.surface

@@ -1,11 +1,11 @@
-"""A surface flattened with nothing given: a bijective map into the plane, of little distortion.
+"""Flatten a surface without a given boundary: a bijective map into the plane with low distortion.
 
-    V, F ─▶ connected pieces ─▶ start, a disk ─▶ free descent ─▶ does the boundary meet itself? ─ no ─▶ laid out,
+    V, F ─▶ connected pieces ─▶ start, a disk ─▶ free descent ─▶ does the boundary touch itself? ─ no ─▶ layout,
                                       │                                       │ yes                  ▲  certified
                                       └───────────────────────────────────────┴─▶ guarded descent ───┘
 
-Overlap is rare, and what guards against it takes longer than the descent itself. So the boundary is first let go where
-it likes, and only where it has come to rest on itself is it taken back to the start.
+Overlaps are rare, and the guarded descent takes longer than the free one. So the boundary first moves freely. If the
+converged map overlaps itself, the descent starts again with the guard.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import reports_progress
 
-# A descent of distances, which are but a sample, has converged at so many times the tolerance of others.
+# Distances are sampled, so their descent converges at a larger tolerance, by this factor.
 _SAMPLED = 10.0
-# How descents end that nobody has stopped.
+# Statuses of descents that were not interrupted.
 _DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
 
 
@@ -67,71 +67,77 @@ def flatten(
     callback: Callable[[Step], object] | None = None,
     record_every: int = 0,
 ) -> MapResult:
-    """Map a surface into the plane bijectively, its boundary going where distortion is least.
+    """Map a surface into the plane bijectively with a free boundary.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Rest positions.
     F : (f, 3) array of int
-        Triangles of one or several surfaces, each with at least one boundary loop, holes welcome, and no handles.
+        Triangles of one or several surfaces. Each surface needs at least one boundary loop and must not have handles.
+        Holes are allowed.
     fixed : (k,) array of int, optional
-        Vertices held at ``target``, to the last bit. Surfaces with one stay where theirs put them, those with none are
-        laid beside.
+        Fixed vertices. They get exactly the positions in ``target``. Surfaces without fixed vertices are placed beside
+        the surfaces that have some.
     target : (k, 2) array, optional
-        Their positions.
+        Target positions of the fixed vertices.
     energy : str or Energy
-        What is lowered, the mean over the surface's area: ``"symmetric-dirichlet"``, ``"mips"`` (angles alone),
-        ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`. Or ``"distances"``: the symmetric
-        Dirichlet energy first, and then how far distances between vertices some edges apart are off, as
-        `quasiharmonic.keep_distances` lowers it; without pins and weights. From 50,000 triangles on that is done on
-        a coarse mesh, if no ``start`` is given, and of its steps ``path`` has none but the map at the end.
+        The objective, a mean over the surface's area: ``"symmetric-dirichlet"``, ``"mips"`` (angles only),
+        ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`. With ``"distances"`` the symmetric
+        Dirichlet energy is minimised first, then the error of distances between vertices some edges apart; see
+        `quasiharmonic.keep_distances`. ``"distances"`` does not accept ``fixed`` or ``weights``. Without ``start``,
+        pieces of at least 50,000 triangles use a coarse mesh for it, and ``path`` has only their final map.
     weights : (f,) array, optional
-        How much each triangle's distortion counts; positive, 1 by default.
+        Positive weight of each triangle's distortion; 1 by default.
     start : (n, 2) array, optional
-        An injective map to begin with, of any size. Where it overlaps itself, and so does all that the descent makes
-        of it, or where that collapses, a start of the library's own is taken.
+        Initial injective map, at any scale. If the descent from it collapses or every map overlaps itself, the descent
+        starts again from the default initial map.
     unit_square : bool
-        Scale the map evenly into the unit square. By default it is in the surface's own unit of length.
+        Scale the map uniformly into the unit square. By default it is in the surface's unit of length.
     rings : int
-        For ``"distances"``: how many edges apart vertices are at most whose distance is to be kept.
+        For ``"distances"``: the largest number of edges between two vertices whose distance is kept.
     gap : float
-        The least space between the bounding boxes of several pieces, in the surface's unit; a twentieth of the longest
-        of their sides is always left. Not negative.
+        Minimum space between the bounding boxes of several pieces, in the surface's unit; not negative. The space is
+        always at least a twentieth of the longest box side.
     max_iterations : int
-        Newton steps at most on each connected piece, counted anew where an overlap makes the descent begin again, and
-        for distances; with 0 the map is the start. The search for pins takes as many, or 2,000 if that is more, in each
-        of two tries.
+        Maximum number of Newton steps on each connected piece. The count starts again when an overlap restarts the
+        descent, and for distances. With 0 the map is the initial map. With fixed vertices, each of the two attempts
+        of the search takes at most this number of steps, or 2,000 if that is more.
     tolerance : float
-        The descent has converged when Newton's model promises a further decrease below this fraction of the
-        energy; for distances, which are a sample, below ten times of it. Not negative.
+        The descent has converged when Newton's model predicts a decrease below this fraction of the energy. For
+        distances, which are sampled, the fraction is ten times larger. Not negative.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step, and with the last one again at least every half second
-        in between, but not within a single factorisation; its ``energy`` is the mean of what is being lowered. It may
-        raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
+        Called with a `Step` at the start and after every step. Between steps it is called again with the last `Step`
+        at least every half second, except during a factorisation. ``Step.energy`` is the current mean energy. The
+        callback may raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
     record_every : int
-        Keep the map of every ``record_every``-th step in the result's ``path``, before it is laid out; none of them by
-        default, and none of several pieces.
+        Keep the map of every ``record_every``-th step in the result's ``path``, before layout. With 0, the default,
+        or with several pieces, no maps are kept.
 
     Returns
     -------
     MapResult
-        Its ``uv`` is bijective, certified; the principal axis lies along x, the bounding box begins at the origin, and
-        several pieces stand side by side. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration,
-        ``EXHAUSTED`` when doubles cannot express a better map, ``COLLAPSED`` when the map is stretched far more than
-        the surface asks for, whatever it was started from, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
-        With pins it may also be ``IMPOSSIBLE``, the ``diagnosis`` naming why, or what the search has ended with; the
-        map then is the best found, and only the certificate says what it is, as after an interrupt of that search.
+        ``uv`` is certified as bijective. Without fixed vertices the principal axis lies along x, the bounding box
+        starts at the origin, and several pieces stand side by side. The status is one of:
+
+        - ``POLISHED``: converged.
+        - ``STILL_FALLING``: stopped after ``max_iterations``.
+        - ``EXHAUSTED``: doubles cannot represent a better map.
+        - ``COLLAPSED``: from every initial map, the result is stretched far more than the surface requires.
+        - ``INTERRUPTED``: stopped by Ctrl-C; the map is the best so far.
+        - With fixed vertices also ``IMPOSSIBLE``, with the cause in ``diagnosis``, or the status of the search. The
+          map is then the best found and may not be injective; see its certificate. The same holds after an interrupt
+          of that search.
 
     Raises
     ------
     ValueError
-        When the input is malformed (see `Problem`), a surface is closed or has handles, a rest triangle has no area, or
-        ``start`` is not injective; the message names the elements. When the map does not fit into the range of doubles.
+        If the input is malformed (see `Problem`), a surface is closed or has handles, a rest triangle has no area, or
+        ``start`` is not injective; the message names the elements. Also if the map exceeds the range of doubles.
     KeyboardInterrupt
-        When Ctrl-C comes before there is a bijective map.
+        If Ctrl-C comes before a bijective map exists.
 
     Examples
     --------
@@ -187,14 +193,14 @@ def flatten(
         results.append(pinned_parts(F, held, *pins, settings, weights, given))
     for piece, vertices, triangles in free:
         if results and results[-1].status is Status.INTERRUPTED:
-            # The others still need a place, if not their best one.
+            # The other pieces still need a position, so they get their initial maps.
             settings = replace(settings, max_iterations=0, callback=None)
         uv = None if given is None else np.ldexp(given[vertices], -piece.exponent)
         if of_distances:
             results.append(_with_distances(piece, uv, rings, settings))
         else:
             results.append(Flattening(piece, settings, None if weights is None else weights[triangles]).run(uv))
-    # Where pins have put something, that stays.
+    # Pieces with fixed vertices keep their positions.
     first = len(results) - len(free)
     placed = [result.uv for result in results[:first]]
     low = placed[0].min(axis=0) if placed else 0.0
@@ -210,7 +216,7 @@ def flatten(
         uv = in_unit_square(uv)
     status, certificate = furthest_last(result.status for result in results), certify(F, uv, loops=_loops(parts))
     if held and not certificate.bijective and status in _DESCENDED:
-        # Beside what is held so far away, or at such a size, doubles do not tell the triangles of the others.
+        # If fixed vertices are far away or at a very different scale, doubles cannot resolve the other pieces there.
         status = Status.ROUNDED
     return MapResult(
         uv=uv,
@@ -231,7 +237,7 @@ def _loops(parts: list[Part]) -> list[IntArray]:
 
 
 def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
-    """The connected pieces of a mesh, largest first, if it is one that `flatten` takes; raises what that would.
+    """Check that `flatten` accepts a mesh, and return its connected pieces, largest first.
 
     Parameters
     ----------
@@ -245,18 +251,18 @@ def flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
     Raises
     ------
     ValueError
-        As `flatten` says of surfaces.
+        If `flatten` rejects the surface.
     """
     V, F = vertex_array(V), triangle_rows(F)
     pieces = [part.piece for part in parts_of(V, F)]
     for piece in pieces:
-        # Says which rest triangles have no area.
+        # Raises ValueError and names rest triangles without area.
         piece.energy(SymmetricDirichlet(), None)
     return pieces
 
 
 def _with_distances(piece: Piece, start: FloatArray | None, rings: int, settings: Settings) -> MapResult:
-    """A piece's map with distances kept; the one without if Ctrl-C comes before there is another."""
+    """Map a piece with ``"distances"``; if interrupted before that map exists, return the map without distances."""
     sampled = replace(settings, tolerance=_SAMPLED * settings.tolerance)
     if start is None and settings.max_iterations and len(piece.F) >= COARSE_FROM:
         by_coarse = kept_by_coarse(piece, rings, sampled)
@@ -290,7 +296,7 @@ def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
 
 
 def _laid_out(piece: Piece, uv: FloatArray) -> FloatArray:
-    """A piece's map in the surface's unit, along its axis; unturned where that would cost an inverted triangle."""
+    """Align a piece's map with its axis in the surface's unit; without the rotation if that would invert a triangle."""
     laid = in_given_unit(laid_along_axis(piece.F, uv), piece.exponent)
     if certify(piece.F, laid, loops=piece.loops).bijective:
         return laid

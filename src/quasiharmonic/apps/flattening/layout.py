@@ -1,4 +1,4 @@
-"""Where a flat map lies on the sheet: turned to its principal axis, its corner at the origin, several side by side."""
+"""Place flat maps: along their principal axis, with the corner at the origin, and side by side."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# The space between two components, as a share of the largest side of all.
+# Space between two components, relative to the largest side of all.
 _GAP = 0.05
 
 
 def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
-    """A map turned such that its principal axis is the x axis, its bounding box at the origin.
+    """Rotate a map so that its principal axis is the x axis, with its bounding box at the origin.
 
-    The axis is that of the image's moments of inertia. Of its two senses the one is taken in which the image is
-    skewed to the left: of its area, the longer tail points to the right.
+    The axis is that of the image's moments of inertia. Its direction is chosen so that the longer tail of the image's
+    area points to the right.
 
     Parameters
     ----------
@@ -28,14 +28,14 @@ def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
     Returns
     -------
     (n, 2) float64
-        The same turned and shifted, and so rounded anew.
+        The rotated and shifted map, with new rounding errors.
     """
     w = np.ascontiguousarray(uv).view(np.complex128).ravel()
     area = signed_areas(F, w)
     corners = w[F]
     middle = corners.mean(axis=1)
     centre = (area * middle).sum() / area.sum()
-    # Second moments of a triangle about a point, by its corners c and its middle m: area/12 (Σ c² + 9 m²).
+    # Second moment of a triangle about a point, from its corners c and centroid m: area/12 (Σ c² + 9 m²).
     spread = (area * (((corners - centre) ** 2).sum(axis=1) + 9 * (middle - centre) ** 2)).sum()
     turned = (w - centre) * np.exp(-0.5j * np.angle(spread)) if abs(spread) > 0 else w - centre
     along = turned[F].mean(axis=1).real
@@ -46,14 +46,14 @@ def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
 
 
 def side_by_side(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArray]:
-    """Shift maps (n, 2) whose bounding boxes begin at the origin such that they stand in a row.
+    """Shift maps (n, 2) whose bounding boxes start at the origin so that they stand in a row.
 
-    Between them there is a share of the largest side of all, or ``gap`` if that is more.
+    The space between them is ``gap``, but at least a fixed fraction of the largest side of all.
 
     Raises
     ------
     ValueError
-        When they are so large that the row leaves the numbers' range.
+        If the row exceeds the range of doubles.
     """
     gap = max(gap, _GAP * max(float(part.max()) for part in parts))
     shifted, right = [], 0.0
@@ -65,12 +65,12 @@ def side_by_side(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArr
 
 
 def in_range(uv: FloatArray) -> FloatArray:
-    """A map as it is.
+    """Return a map unchanged if it is finite.
 
     Raises
     ------
     ValueError
-        When positions have left the numbers' range.
+        If positions exceed the range of doubles.
     """
     if not np.isfinite(uv).all():
         raise ValueError(
@@ -80,7 +80,7 @@ def in_range(uv: FloatArray) -> FloatArray:
 
 
 def in_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
-    """A map in units of ``2 ** exponent`` in the unit that all was given in.
+    """Convert a map from units of ``2 ** exponent`` to the original unit.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def in_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
 
 
 def in_unit_square(uv: FloatArray) -> FloatArray:
-    """A map scaled evenly, and shifted, into the middle of the unit square."""
+    """Scale a map uniformly, and centre it in the unit square."""
     low, high = uv.min(axis=0), uv.max(axis=0)
     size = float((high - low).max())
     return 0.5 + (uv - low - 0.5 * (high - low)) / size

@@ -1,4 +1,4 @@
-"""The connected surfaces that a mesh is made of, each a piece of its own."""
+"""Split a mesh into its connected surfaces."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from quasiharmonic.geometry.mesh.topology import components
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range
 
-# Several pieces together are as far as the one that comes first here; the status of those that have no bijective map is
-# told in another way.
+# The status of several pieces is the first of these that one of them has. Other statuses, of pieces without a bijective
+# map, come first of all.
 _FURTHEST_LAST = (
     Status.INTERRUPTED,
     Status.COLLAPSED,
@@ -24,16 +24,16 @@ _FURTHEST_LAST = (
 
 
 class Part(NamedTuple):
-    """One of them.
+    """A connected surface of a mesh.
 
     Attributes
     ----------
     piece : Piece
-        Its elements numbered anew.
+        The surface, with its own numbering.
     vertices : (n,) int64
-        The mesh's numbers of its vertices, ascending.
+        The mesh's indices of its vertices, ascending.
     triangles : (f,) int64
-        Of its triangles.
+        The mesh's indices of its triangles.
     """
 
     piece: Piece
@@ -42,17 +42,17 @@ class Part(NamedTuple):
 
     @property
     def loops(self) -> list[IntArray]:
-        """Its boundary loops, by the mesh's numbers."""
+        """Boundary loops, in the mesh's numbering."""
         return [self.vertices[loop] for loop in self.piece.loops]
 
 
 def parts_of(V: FloatArray, F: IntArray) -> list[Part]:
-    """The connected surfaces of a mesh, the one of most triangles first.
+    """Return the connected surfaces of a mesh, the one with most triangles first.
 
     Raises
     ------
     ValueError
-        As `Piece`; of malformed arrays, too.
+        As `Piece`, also for malformed arrays.
     """
     everything = np.arange(len(V)), np.arange(len(F))
     if V.ndim != 2 or F.ndim != 2 or F.shape[1] != 3 or not F.size:
@@ -60,7 +60,7 @@ def parts_of(V: FloatArray, F: IntArray) -> list[Part]:
     check_range("F", F, len(V))
     label = components(F, len(V))
     if not label.any() or np.bincount(F.ravel(), minlength=len(V)).min() == 0:
-        # What is wrong with vertices of no triangle is said with the rest.
+        # `Piece` reports vertices without triangles together with other errors.
         return [Part(Piece(V, F), *everything)]
     of_triangle = label[F[:, 0]]
     labels, count = np.unique(of_triangle, return_counts=True)
@@ -80,12 +80,12 @@ def _part(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -
 
 
 def anew(vertices: IntArray) -> str:
-    """Say which part it is that a message is of, where that has numbers of its own."""
+    """Name a part in messages that use the part's own numbering."""
     return f"the piece around vertex {vertices[0]}, its elements numbered anew"
 
 
 def united(parts: Sequence[Part]) -> Part:
-    """Several parts as one, its elements part after part."""
+    """Combine several parts into one, with their elements in order."""
     return Part(
         Piece.united([part.piece for part in parts]),
         np.concatenate([part.vertices for part in parts]),
@@ -94,5 +94,5 @@ def united(parts: Sequence[Part]) -> Part:
 
 
 def furthest_last(statuses: Iterable[Status]) -> Status:
-    """How far several parts have come together: as far as the one that has come least far."""
+    """The status of several parts: that of the part that made the least progress."""
     return min(statuses, key=lambda status: _FURTHEST_LAST.index(status) if status in _FURTHEST_LAST else -1)

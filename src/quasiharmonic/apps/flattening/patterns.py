@@ -1,9 +1,8 @@
-"""The outline of a flat map true to scale, for cutting and sewing, as SVG or DXF.
+"""Write the outline of a flat map to scale, for cutting and sewing, as SVG or DXF.
 
-Both formats are written in millimetres: an SVG drawing has its size on paper, a DXF drawing its unit. Two kinds of
-lines are told apart, in SVG by groups and in DXF by layers: the *seam*, which is the boundary of the map, holes
-included, and, where there is an allowance, the *cut*, so far outside of it. Around corners the cut is round: it is
-where the seam is just so far away.
+Both formats use millimetres: an SVG drawing has its size on paper, a DXF drawing its unit. There are two kinds of
+lines, which are groups in SVG and layers in DXF. The *seam* is the boundary of the map, holes included. With an
+allowance, the *cut* is the curve at this distance outside the seam, so it is round at corners.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ from quasiharmonic.io.adapters.objects import mesh_triangles
 from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.util.arrays import FloatArray, index_array, map_array, not_negative
 
-#: Millimetres in each unit that a map may be in.
+#: Millimetres per unit of the map.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
-# Sides of the polygon in place of a quarter of a circle: it lacks 0.03 % of the allowance.
+# Sides of the polygon that replaces a quarter circle; its error is 0.03 % of the allowance.
 _QUARTER = 32
-# Around the drawing, and the widths of its lines, in millimetres.
+# Margin around the drawing, and line width, in millimetres.
 _MARGIN, _WIDTH = 5.0, 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Closed lines in millimetres, first points not repeated.
+    """Closed lines in millimetres; first points are not repeated.
 
     Attributes
     ----------
     seam : list of (k, 2) float64
-        The boundary of the map, loop by loop, the material to the left.
+        Boundary loops of the map, with the material on the left.
     cut : list of (k, 2) float64
-        The seam with its allowance; the seam itself where there is none.
+        The seam with its allowance; the seam itself without allowance.
     """
 
     seam: list[FloatArray]
@@ -47,19 +46,19 @@ class Pattern:
 
 
 def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float = 0.0) -> Pattern:
-    """The lines along which a flat map is cut and sewn.
+    """Return the lines along which a flat map is cut and sewn.
 
     Parameters
     ----------
     F : (f, 3) array of int
-        Triangles; pieces that are not connected are pieces of the pattern.
+        Triangles; each connected component is a piece of the pattern.
     uv : (n, 2) array
-        A bijective map, true to scale.
+        A bijective map, to scale.
     unit : {"mm", "cm", "m", "in"}
-        Of ``uv`` and of the allowance.
+        Unit of ``uv`` and of the allowance.
     allowance : float
-        How far outside of the seam is cut. Holes become smaller by it, and those that are narrower than twice of it
-        vanish.
+        Distance of the cut outside the seam. It makes holes smaller, and removes holes narrower than twice the
+        allowance.
 
     Returns
     -------
@@ -68,10 +67,9 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     Raises
     ------
     ValueError
-        When the map is not bijective, the unit is not known, the allowance is negative, or pieces are so near that
-        their allowances would overlap.
+        If the map is not bijective, the unit is unknown, the allowance is negative, or allowances of pieces overlap.
     ImportError
-        When there is an allowance and Shapely is not installed.
+        If there is an allowance and Shapely is not installed.
 
     Examples
     --------
@@ -106,23 +104,23 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
 def write_pattern(
     path: str | os.PathLike[str], F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float = 0.0
 ) -> None:
-    """Write the outline of a flat map as a drawing true to scale, whole or not at all.
+    """Write the outline of a flat map as a drawing to scale, in one atomic operation.
 
     Parameters
     ----------
     path : str or path-like
-        Ends in ``.svg`` or ``.dxf``.
+        Path that ends in ``.svg`` or ``.dxf``.
     F, uv, unit, allowance
-        As `pattern` has them.
+        As for `pattern`.
 
     Raises
     ------
     ValueError
-        When the name has another ending, or as `pattern` does.
+        If the path has another ending, or as `pattern`.
     ImportError
-        When a package that is needed is not installed: ezdxf for DXF, Shapely for an allowance.
+        If a required package is not installed: ezdxf for DXF, Shapely for an allowance.
     quasiharmonic.io.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     check_pattern(path, unit=unit, allowance=allowance)
     lines = pattern(F, uv, unit=unit, allowance=allowance)
@@ -130,7 +128,7 @@ def write_pattern(
 
 
 def check_pattern(path: str | os.PathLike[str], *, unit: str = "mm", allowance: float = 0.0) -> None:
-    """Say before there is a map whether its pattern could be written; raises what `write_pattern` would."""
+    """Check before mapping whether a pattern can be written; raises the same errors as `write_pattern`."""
     ending = _ending(path)
     if ending not in (".svg", ".dxf"):
         raise ValueError(f"a pattern is written as .svg or .dxf, not {ending or 'without an ending'}: {path}")
@@ -149,7 +147,7 @@ def _ending(path: str | os.PathLike[str]) -> str:
 
 
 def _widened(pieces: list[list[FloatArray]], allowance: float) -> list[FloatArray]:
-    """The outlines of pieces, each of its loops, with so much around them."""
+    """The outlines of pieces, each given by its loops, with an allowance around them."""
     shapely = _shapely()
     wide = []
     for loops in pieces:
@@ -170,12 +168,12 @@ def _widened(pieces: list[list[FloatArray]], allowance: float) -> list[FloatArra
 
 
 def _groups(lines: Pattern) -> list[tuple[str, list[FloatArray]]]:
-    """Lines by the name of their kind; without an allowance seam and cut are one."""
+    """Group lines by kind; without an allowance, seam and cut are one group."""
     return [("cut", lines.cut)] if lines.cut is lines.seam else [("cut", lines.cut), ("seam", lines.seam)]
 
 
 def _svg(lines: Pattern) -> bytes:
-    """A drawing with the size on paper; y points down there."""
+    """Return an SVG drawing with its size on paper; its y axis points down."""
     everything = np.concatenate(lines.cut + lines.seam)
     low, high = everything.min(axis=0) - _MARGIN, everything.max(axis=0) + _MARGIN
     width, height = (high - low).tolist()
@@ -195,10 +193,10 @@ def _svg(lines: Pattern) -> bytes:
 
 
 def _dxf(lines: Pattern) -> bytes:
-    """A drawing in millimetres, closed polylines on layers CUT and SEAM."""
+    """Return a DXF drawing in millimetres, with closed polylines on layers CUT and SEAM."""
     ezdxf = _ezdxf()
     stream = io.StringIO()
-    # Neither the time nor a random number goes into the file: of the same pattern it is the same.
+    # Write neither the time nor random identifiers, so that the same pattern gives the same file.
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
     try:

@@ -1,4 +1,4 @@
-"""One connected surface on its way into the plane."""
+"""Flatten one connected surface."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.util.arrays import FloatArray, check_callback, counted
 
-#: From so many triangles on a surface is flattened by way of coarse meshes.
+#: Surfaces with at least this number of triangles are flattened with coarse meshes.
 COARSE_FROM = 50_000
-# A mean energy below this is near enough to the least for Newton's own steps.
+# Newton steps are used directly if the mean energy is below this,
 _NEAR = 1.0
-# ... and below this also where the boundary is guarded, which makes steps short whatever they aim at. From above, steps
-# of Newton's that halve it at best would be too many.
+# or with a guarded boundary, which makes all steps short, if it is below this. From higher energies, Newton steps that
+# at best halve the energy would be too many.
 _FAR = 1e4
-# Energies are equal if they differ by no more than this part of them.
+# Energies with a relative difference of at most this are equal.
 _SAME = 1e-6
-# Of so many last maps of a free descent the latest is looked for that is bijective, if its energy is at most so many
-# times the last one's: far from that the start is the better place to begin anew.
+# After an overlap, the latest bijective map among this number of last maps is used if its energy is at most this many
+# times the last one's. Otherwise the initial map is a better start.
 _RECENT, _NOT_FAR = 12, 10.0
-# Every so many steps of a free descent it is looked whether so much of the boundary has met itself that it will not
-# come apart again.
+# Every _LOOK_EVERY steps, a free descent stops if edges at this fraction of the boundary's vertices intersect, because
+# such boundaries do not separate again.
 _LOOK_EVERY, _TANGLED = 8, 0.1
-# Two descents from different starts have come to the same if their energies differ by no more than this part of them.
+# Descents from different initial maps agree if their energies differ by at most this fraction.
 _AGREE = 0.1
-# A descent that has not come to an end in so many steps is asked whether it will get anywhere.
+# A descent that has not converged after this number of steps is checked for collapse.
 _MANY = 100
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a caller of `flatten` has chosen, checked.
+    """The checked options of a call of `flatten`.
 
     Attributes
     ----------
     density : Energy
     name : str
-        Of the energy.
+        Name of the energy.
     tolerance : float
     max_iterations : int
     linear_solver : str
@@ -88,7 +88,7 @@ class Piece:
     Raises
     ------
     ValueError
-        As `Domain`; where the surface has handles, or a triangle no area.
+        As `Domain`. If the surface has handles, or a triangle has no area.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Piece:
         Boundary loops.
     exponent : int
     area : float
-        The surface's, in square units.
+        Area of the surface, in square units.
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
@@ -121,7 +121,7 @@ class Piece:
 
     @classmethod
     def united(cls, pieces: Sequence[Piece]) -> Piece:
-        """Several pieces as one that is not connected, their elements piece after piece, in the largest one's unit."""
+        """Combine several pieces into one that is not connected, with elements in order, in the largest one's unit."""
         made = object.__new__(cls)
         first = np.cumsum([0, *(len(piece.V) for piece in pieces)])[:-1].tolist()
         made.F = np.concatenate([piece.F + k for piece, k in zip(pieces, first, strict=True)])
@@ -134,19 +134,19 @@ class Piece:
 
     @staticmethod
     def _missing(domain: Domain) -> int:
-        """What the Euler characteristic is short of a disk's with as many holes: two for each handle."""
+        """How much the Euler characteristic is below that of a disk with as many loops: two for each handle."""
         found = domain.edges
         euler = domain.n - len(found.interior) - len(found.boundary) + len(domain.F)
         return 2 - len(domain.loops) - euler
 
     def energy(self, density: Energy, weights: FloatArray | None) -> DeformationEnergy:
-        """The energy of its maps."""
+        """Return the energy of the piece's maps."""
         return DeformationEnergy(self.V, self.F, density, weights=weights)
 
 
 @dataclass
 class _Attempt:
-    """Where descents from one start have ended."""
+    """The result of the descents from one initial map."""
 
     energy: float
     uv: FloatArray
@@ -156,7 +156,7 @@ class _Attempt:
 
 
 class Flattening:
-    """The descent of one surface's map, and what is to be told of it.
+    """The flattening of one surface, with its record for the result.
 
     Parameters
     ----------
@@ -170,13 +170,13 @@ class Flattening:
         self._rim = Rim(piece.loops)
         self._measure = piece.energy(settings.density, weights)
         self._bijective: FloatArray | None = None
-        # Whether a free descent has ended on itself, and the map, if that had come to rest.
+        # Whether a free descent ended with an overlap, and the map, if it had converged.
         self._overlaps = False
         self._overlapping: FloatArray | None = None
         self._starts = self._own_starts()
-        # The solver and the energy of those that there have been.
+        # Solver and initial energy of the initial maps already used.
         self._begun: set[tuple[str, float]] = set()
-        # Of the last descent.
+        # Number of steps of the last descent.
         self._steps = 0
         self._solver = ""
         self._stages: list[Stage] = []
@@ -184,12 +184,12 @@ class Flattening:
         self._path: list[Snapshot] = []
 
     def run(self, start: FloatArray | None) -> MapResult:
-        """Flatten, from an injective map (n, 2) in the piece's unit or from one of the library's own.
+        """Flatten the piece from an injective map (n, 2) in the piece's unit, or from a default initial map.
 
         Raises
         ------
         KeyboardInterrupt
-            Before there is a first bijective map.
+            If Ctrl-C comes before there is a bijective map.
         """
         began = time.perf_counter()
         try:
@@ -216,7 +216,7 @@ class Flattening:
         )
 
     def _descended(self, start: FloatArray | None) -> Status:
-        """Descend freely, and once more with the boundary guarded if it has ended on itself."""
+        """Descend with a free boundary; if the result overlaps itself, descend again with a guarded boundary."""
         if start is not None:
             start = self._in_scale(start)
             if not self._rim.meets_itself(start):
@@ -225,7 +225,7 @@ class Flattening:
             if status is not None:
                 return status
         if self._bijective is None:
-            # Nothing was given, or what was given overlaps itself and ended so.
+            # There was no start, or both the start and the map that it led to overlap themselves.
             own, near = self._own_start()
             status = self._descent(own, guarded=False, near=near)
             if status is not None:
@@ -233,7 +233,7 @@ class Flattening:
         return self._guarded()
 
     def _guarded(self) -> Status:
-        """Descend from the bijective map at hand to bijective ones."""
+        """Descend from the current bijective map with a guarded boundary."""
         assert self._bijective is not None
         near = self._measure.value(in_units(self._bijective, 0)) < _FAR
         status = self._descent(self._bijective, guarded=True, near=near)
@@ -241,9 +241,9 @@ class Flattening:
         return status
 
     def _collapsed(self, status: Status) -> bool:
-        """Whether the descent that has ended so has come to a stand at a map which is far from what there should be."""
-        # What has converged is at a minimum, whatever that is like; only barriers of a boundary without room may feign
-        # it, and then there is a map to compare with.
+        """Whether a descent that ended with this status stalled at a collapsed map."""
+        # A converged map is a minimum. Only the barriers of a cramped boundary can imitate convergence, and then there
+        # is an overlapping map to compare with.
         converged = status is Status.POLISHED and self._overlapping is None
         falling = status is Status.STILL_FALLING and self._steps < _MANY
         if converged or falling or status is Status.INTERRUPTED:
@@ -256,7 +256,7 @@ class Flattening:
         )
 
     def _begun_otherwise(self, status: Status) -> Status:
-        """Descend from other starts until there is a map that has not collapsed; else take the best of all."""
+        """Descend from other initial maps until one result has not collapsed; otherwise use the best result."""
         attempts, first = [self._attempt(status, 0)], len(self._stages)
         try:
             while (own := self._next_start()) is not None:
@@ -275,7 +275,7 @@ class Flattening:
         return Status.COLLAPSED
 
     def _agreed(self, attempts: Sequence[_Attempt]) -> bool:
-        """Whether different starts have led to the same as the last: then that is what the surface asks for."""
+        """Whether another initial map led to the same energy, so that the surface requires the stretch."""
         *others, last = attempts
         least = min(attempt.energy for attempt in attempts)
 
@@ -288,13 +288,13 @@ class Flattening:
         )
 
     def _attempt(self, status: Status, first: int) -> _Attempt:
-        """The map at hand, to which the stages from ``first`` on have led."""
+        """Record the current map, the result of the stages from ``first`` on."""
         assert self._bijective is not None
         energy = self._measure.value(in_units(self._bijective, 0))
         return _Attempt(energy, self._bijective, status, self._solver, range(first, len(self._stages)))
 
     def _chosen(self, attempts: Sequence[_Attempt], best: _Attempt | None = None) -> Status:
-        """Take on where one attempt has ended, by default the one of least energy; the others are discarded."""
+        """Use the result of one attempt, by default the one with the least energy, and mark the others as discarded."""
         best = best or min(attempts, key=lambda attempt: attempt.energy)
         for attempt in attempts:
             for k in attempt.stages if attempt is not best else ():
@@ -303,7 +303,7 @@ class Flattening:
         return best.status
 
     def _own_start(self) -> tuple[FloatArray, bool]:
-        """A bijective map, and whether it is near its best already."""
+        """Return the first default initial map that exists, and whether it is already near the minimum."""
         own = self._next_start()
         if own is None:
             raise ValueError(
@@ -313,7 +313,7 @@ class Flattening:
         return own
 
     def _next_start(self) -> tuple[FloatArray, bool] | None:
-        """The next of the library's own starts that there is, and whether it is near its best already."""
+        """The next default initial map that exists, and whether it is near the minimum already; None at the end."""
         began = time.perf_counter()
         for name, start in self._starts:
             uv = start()
@@ -322,7 +322,7 @@ class Flattening:
             uv = self._in_scale(uv)
             energy = self._measure.value(in_units(uv, 0))
             if (self._settings.linear_solver, energy) in self._begun:
-                # Of a small surface the coarse mesh is the surface itself.
+                # The coarse mesh of a small surface is the surface itself.
                 continue
             self._begun.add((self._settings.linear_solver, energy))
             self._bijective = uv
@@ -332,7 +332,7 @@ class Flattening:
         return None
 
     def _own_starts(self) -> Iterator[tuple[str, Callable[[], FloatArray | None]]]:
-        """Bijective maps to begin with, the best bet first; each is made when it is called for, and may not exist."""
+        """Initial bijective maps, the most promising first; each is computed on demand and may not exist."""
         piece, solver = self._piece, self._settings.linear_solver
         surface = piece.V, piece.F, piece.loops
         disk = "disk", partial(disk_start, *surface, solver)
@@ -349,22 +349,22 @@ class Flattening:
             yield f"coarse mesh, {other}", partial(coarse_start, *surface, other)
 
     def _as_it_lies(self) -> FloatArray | None:
-        """The surface itself, if it is plane and covers no point twice: there is no better map."""
+        """Return the surface itself if it is planar and does not overlap itself, as no map is better."""
         V, F, loops = self._piece.V, self._piece.F, self._piece.loops
         if np.ptp(V[:, 2]) > 0:
             return None
-        # Seen from the side on which its triangles are counterclockwise.
+        # Seen from the side on which the triangles are counterclockwise.
         uv = V[:, :2] * [np.sign(signed_areas(F, in_units(V[:, :2], 0)).sum()) or 1.0, 1.0]
         return uv if certify(F, uv, loops=loops).bijective else None
 
     def _blind_to_scale(self, uv: FloatArray) -> bool:
-        """Whether a map of twice the size would be as good."""
+        """Whether the energy does not depend on the map's scale."""
         w = in_units(uv, 0)
         here, doubled = self._measure.value(w), self._measure.value(2 * w)
         return abs(doubled - here) <= _SAME * here
 
     def _in_scale(self, uv: FloatArray) -> FloatArray:
-        """A map scaled to the surface's area; only by a power of two, exactly, where more would invert a triangle."""
+        """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
         unit = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
         centred = unit - unit.mean(axis=0)
         area = float(signed_areas(self._piece.F, in_units(centred, 0)).sum())
@@ -373,7 +373,7 @@ class Flattening:
         return scaled if is_injective(self._piece.F, scaled) else np.ldexp(unit, round(np.log2(factor)))
 
     def _descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
-        """Descend from a map, which is bijective if the descent is guarded; None where the end overlaps itself."""
+        """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
         began = time.perf_counter()
         settings, solver = self._settings, self._settings.linear_solver
         energy = self._piece.energy(settings.density if near else ReweightedDirichlet(), self._weights)
@@ -392,7 +392,7 @@ class Flattening:
                 if not guarded and steps % _LOOK_EVERY == 0 and self._rim.tangled(descent.uv) > _TANGLED:
                     break
         finally:
-            # Also what Ctrl-C has left half done may be a better map than there was.
+            # After Ctrl-C too, the current map may be better than the previous one.
             last = self._measure.value(descent.w)
             apart = guarded or not self._rim.meets_itself(descent.uv)
             if apart:
@@ -408,7 +408,7 @@ class Flattening:
         return status if apart else None
 
     def _latest_bijective(self, recent: Iterable[tuple[float, FloatArray]], most: float) -> FloatArray | None:
-        """The latest of some maps with their energies that is bijective and of no more energy; else what there was."""
+        """Return the latest of several maps that is bijective and has at most this energy, or else the stored map."""
         for energy, uv in reversed([*recent]):
             if energy <= most and not self._rim.meets_itself(uv):
                 return uv

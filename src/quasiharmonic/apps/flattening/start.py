@@ -1,7 +1,7 @@
-"""A bijective map to start from: the longest boundary loop on a circle, the others free.
+"""Initial bijective map: the longest boundary loop on a circle, the other loops free.
 
-Holes are filled by a fan around a vertex of their own. What is left is a disk, and its map onto a convex outline is
-found and certified by the library's own search, whose first try is Tutte's embedding.
+Each hole is filled by a fan around a new vertex, so the surface becomes a disk. The library's solver, which starts with
+Tutte's embedding, maps it onto the convex outline and certifies the map.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto") -> FloatArray | None:
-    """Map a surface into a disk of its own area, its longest loop onto the circle by length.
+    """Map a surface into a disk of the surface's area, with its longest loop on the circle by arc length.
 
     Parameters
     ----------
@@ -25,19 +25,19 @@ def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_sol
     F : (f, 3) int64
         Triangles of a connected surface without handles.
     loops : sequence of (l,) int64
-        Its boundary loops.
+        Boundary loops of the surface.
     linear_solver : str
 
     Returns
     -------
     (n, 2) float64 or None
-        Bijective; None where double precision does not hold such a map.
+        A bijective map; None if none was found in double precision.
     """
     lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
     longest = int(np.argmax([length.sum() for length in lengths]))
     outer = loops[longest]
     holes = [loop for k, loop in enumerate(loops) if k != longest]
-    # Edges without length get some, so that no two vertices share a place.
+    # Edges of length zero get a small length, so that no two vertices share a position.
     length = lengths[longest] + 1e-6 * lengths[longest].mean()
     angle = 2 * np.pi * np.cumsum(length) / length.sum()
     corners = V[F]
@@ -56,6 +56,6 @@ def disk_start(V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_sol
 
 
 def fans(loops: Sequence[IntArray], n: int) -> IntArray:
-    """Fill loops, the surface to their left, by triangles (k, 3) around new vertices from ``n`` on."""
+    """Fill loops, with the surface on their left, by triangles (k, 3) around new vertices numbered from ``n``."""
     triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
     return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])

@@ -1,4 +1,4 @@
-"""Derivatives of maps: how a map moves as its target, its tensors or its surface do, and the transpose of that.
+"""Derivatives of maps by their target positions, tensors and surface, in forward and reverse mode.
 
 The package builds on `energies` and `problem`. Start reading in `derivative`, then `polished`.
 """

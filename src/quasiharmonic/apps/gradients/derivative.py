@@ -1,12 +1,11 @@
-"""The derivative of a map: what its users hold in hands, whatever the map.
+"""The derivative of a map; the class that all kinds of maps share.
 
-A map w of a surface with rest positions z, tensors μ and held vertices at t solves equations ``R(w, t, z, μ) = 0`` at
-the vertices that may move: the forces there vanish. So with K the derivative of R by the unknowns
+A map w of a surface with rest positions z, tensors μ and fixed vertices at t solves ``R(w, t, z, μ) = 0``: the forces
+at the free vertices vanish. With K the derivative of R by the unknowns,
 
-    dw = −K⁻¹ (∂R/∂t dt + ∂R/∂z dz + ∂R/∂μ dμ),
+    dw = −K⁻¹ (∂R/∂t dt + ∂R/∂z dz + ∂R/∂μ dμ).
 
-and for a function of the map with gradient c one solve ``K ℓ = c`` gives all of its gradients,
-``−(∂R/∂t)ᵀ ℓ`` and so on.
+For a function of the map with gradient c, one solve ``K ℓ = c`` gives all its gradients, ``−(∂R/∂t)ᵀ ℓ`` and so on.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from quasiharmonic.util.arrays import (
 
 
 class Doubt(Enum):
-    """Why a derivative may not be what differences of the map would show; the value is a sentence for the user."""
+    """A reason why a derivative may differ from finite differences of the map; the value is a sentence for the user."""
 
     NEAR_SINGULAR = (
         "The second derivative is singular but for rounding: there are other maps next to this one that are as good, "
@@ -62,16 +61,16 @@ class Doubt(Enum):
 
 
 class Gradients:
-    """The gradients of one number that depends on a map, each computed when it is first asked for.
+    """The gradients of a scalar function of a map, each computed at first access.
 
     Attributes
     ----------
     target : (k, 2) float64
-        By the held vertices' places, in the order of ``fixed``.
+        With respect to the target positions of the fixed vertices, in the order of ``fixed``.
     rest : (n, d) float64
-        By the rest positions.
+        With respect to the rest positions.
     mu : (f,) complex128 or None
-        By the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``, of a map that has them.
+        With respect to the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``; None for maps without them.
     """
 
     def __init__(
@@ -84,60 +83,60 @@ class Gradients:
 
     @cached_property
     def target(self) -> FloatArray:
-        """By the held vertices' places."""
+        """The gradient with respect to the target positions of the fixed vertices."""
         return self._target()
 
     @cached_property
     def rest(self) -> FloatArray:
-        """By the rest positions."""
+        """The gradient with respect to the rest positions."""
         return self._rest()
 
     @cached_property
     def mu(self) -> ComplexArray | None:
-        """By the Beltrami coefficients."""
+        """The gradient with respect to the Beltrami coefficients."""
         return self._mu()
 
 
 class Inverse(Protocol):
-    """The inverse of the derivative of forces by what may move; symmetric."""
+    """The inverse of the derivative of the forces by the free positions; symmetric."""
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """The displacement (n,) of all vertices under a load (n,); zero where nothing may move."""
+        """Return the displacement (n,) of all vertices under a load (n,); zero at fixed vertices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """A factor s between the scale of a map and that of its surface, which both have a part in.
+    """A factor s between the scales of a map and its surface, which depends on both.
 
     Attributes
     ----------
     by_places : (n,) complex128
-        Derivative of log s by the map.
+        Derivative of log s with respect to the map.
     by_rest : (n, d) float64
-        By the rest positions.
+        Derivative of log s with respect to the rest positions.
     """
 
     by_places: ComplexArray
     by_rest: FloatArray
 
     def change(self, dw: ComplexArray, dV: FloatArray) -> float:
-        """The change of log s."""
+        """Return the change of log s."""
         return work(self.by_places, dw) + float(np.sum(self.by_rest * dV))
 
 
 class Derivative:
-    """How a map moves with what it depends on, to first order.
+    """The derivative of a map with respect to its inputs.
 
-    Made by `quasi_harmonic_derivative`, `polish_derivative` and `flatten_derivative`. What is expensive, a
-    factorisation, is done by then: `jvp` and `vjp` take one solve each. Threads may share a derivative.
+    Made by `quasi_harmonic_derivative`, `polish_derivative` and `flatten_derivative`, which factor the matrix. Each
+    call of `jvp` or `vjp` takes one solve. Threads may share a derivative.
 
     Attributes
     ----------
     uv : (n, 2) float64
-        The map: as it was given, but for what it lacked of being at rest to rounding. Polished and flattened maps are
-        injective, decided exactly.
+        The map, converged to rounding. It can differ slightly from the given map. Polished and flattened maps are
+        certified as injective.
     doubts : tuple of Doubt
-        Why not to rely on the derivative; empty as a rule.
+        Reasons not to rely on the derivative; usually empty.
     """
 
     def __init__(
@@ -176,17 +175,17 @@ class Derivative:
     def jvp(
         self, *, target: ArrayLike | None = None, rest: ArrayLike | None = None, mu: ArrayLike | None = None
     ) -> FloatArray:
-        """How the map moves as what it depends on does.
+        """Return the change of the map for changes of its inputs.
 
         Parameters
         ----------
         target : (k, 2) array, optional
-            Of the held vertices' places, in the order of ``fixed``. Boundary vertices that slide, or are at corners of
-            their curves, are where the curves say: theirs do not count.
+            Change of the target positions, in the order of ``fixed``. Boundary vertices that slide or are at corners of
+            their curves are determined by the curves, so their entries are ignored.
         rest : (n, 2) or (n, 3) array, optional
-            Of the rest positions.
+            Change of the rest positions.
         mu : (f,) array, optional
-            Of the Beltrami coefficients, of a map that has them.
+            Change of the Beltrami coefficients, for maps that have them.
 
         Returns
         -------
@@ -195,7 +194,7 @@ class Derivative:
         Raises
         ------
         ValueError
-            When one of them has another shape or is not finite, or ``mu`` is given for a map without tensors.
+            If an argument has the wrong shape or is not finite, or ``mu`` is given for a map without tensors.
         """
         n, forces = len(self.uv), self._forces
         held = np.zeros(n, dtype=np.complex128)
@@ -222,12 +221,12 @@ class Derivative:
         return as_rows(self._unit * dw)
 
     def vjp(self, cotangent: ArrayLike) -> Gradients:
-        """The gradients of a function of the map, by what the map depends on.
+        """Return the gradients of a function of the map with respect to the map's inputs.
 
         Parameters
         ----------
         cotangent : (n, 2) array
-            The function's gradient by the map's positions.
+            The function's gradient with respect to the map's positions.
 
         Returns
         -------
@@ -236,7 +235,7 @@ class Derivative:
         Raises
         ------
         ValueError
-            When the cotangent has another shape or is not finite.
+            If the cotangent has the wrong shape or is not finite.
         """
         pull = self._unit * as_complex(map_array("cotangent", cotangent, len(self.uv)))
         on_pin, on_scale = 0j, 0.0
@@ -297,10 +296,10 @@ class Derivative:
 
 
 def as_complex(rows: FloatArray) -> ComplexArray:
-    """Places (n, 2) as complex numbers (n,)."""
+    """Return positions (n, 2) as complex numbers (n,)."""
     return np.ascontiguousarray(rows).view(np.complex128).ravel()
 
 
 def as_rows(w: ComplexArray) -> FloatArray:
-    """Complex numbers (n,) as places (n, 2)."""
+    """Return complex numbers (n,) as positions (n, 2)."""
     return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)

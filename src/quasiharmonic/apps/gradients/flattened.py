@@ -1,4 +1,4 @@
-"""The derivative of maps that have been flattened: boundary free, some vertices held or none."""
+"""The derivative of flattened maps: the boundary is free, and there may be fixed vertices."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 
-# Energies are equal if they differ by no more than this part of them, as `flattening.piece` has it.
+# Energies with a relative difference of at most this are equal, as in `flattening.piece`.
 _SAME = 1e-6
 
 
@@ -37,27 +37,28 @@ def flatten_derivative(
     weights: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> Derivative:
-    """Bring a flattened map to rest to rounding, and differentiate it by held places and rest positions.
+    """Converge a flattened map to rounding, and differentiate it by target and rest positions.
 
     Parameters
     ----------
     V, F, fixed, energy, weights, linear_solver
-        As `quasiharmonic.flatten` had them, but for ``"distances"``; one connected surface.
+        As for the call of `quasiharmonic.flatten` that made the map; not ``"distances"``, and only one connected
+        surface.
     uv : (n, 2) array
-        The flattened map, ``fixed`` where they are held.
+        The flattened map, with the vertices ``fixed`` at their target positions.
 
     Returns
     -------
     Derivative
-        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``. With no vertex held it is that
-        which lies nearest to ``uv`` (`quasiharmonic.apps.gradients.gauge`), wherever `flatten` would lay it: use it for
-        what does not depend on where the map lies. With one held the map may turn about it, and the same is so.
+        The derivative of the energy's minimum near ``uv``; this map is ``Derivative.uv``. Without fixed vertices, the
+        derivative is that of the map nearest to ``uv`` (`quasiharmonic.apps.gradients.gauge`), although `flatten` would
+        lay it out differently. Use functions that do not depend on the map's position and rotation. With one fixed
+        vertex the map can rotate about it, so the same holds for its rotation.
 
     Raises
     ------
     ValueError
-        As `quasiharmonic.flatten`; when there are several surfaces; when ``uv`` is not injective: of a map that was not
-        found there is no derivative.
+        As `quasiharmonic.flatten`. If there are several surfaces, or ``uv`` is not injective.
 
     Examples
     --------
@@ -90,7 +91,7 @@ def flatten_derivative(
     )
     gauge = _gauge(measure, w, domain)
     if gauge is not None and gauge.keeps_area:
-        # At rest at some scale, and then at the surface's own.
+        # First converge at any scale, then scale to the surface's area.
         w = _minimum(measure, w, gauge, domain.fixed, linear_solver).w
         size = float(strain.m.sum()) * 4.0**-exponent
         w = (w - w.mean()) * np.sqrt(size / signed_areas(domain.F, w).sum()) + w.mean()
@@ -112,7 +113,7 @@ def flatten_derivative(
 
 
 def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:
-    """What the map may do at no cost."""
+    """The transformations that do not change the energy; None if there are at least two fixed vertices."""
     if domain.fixed.size > 1:
         return None
     here, doubled = measure.value(w), measure.value(2 * w)

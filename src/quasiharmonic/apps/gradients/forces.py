@@ -1,9 +1,9 @@
-"""What pulls at the vertices of a map, and how that changes with the map and with the triangles it is a map of.
+"""Forces at the vertices of a map, and their derivatives by the map and by its rest triangles.
 
 The forces are the derivative of ``E = Σⱼ sⱼ φ(pⱼ, qⱼ)`` by the positions w, with ``p = Σ conj(gᵢ) wᵢ`` and
-``q = Σ gᵢ wᵢ``. At the maps that are differentiated here they vanish wherever a vertex may go, and what is needed are
-their derivatives: by w, and by what the sⱼ and gⱼ depend on. A transpose takes a displacement ℓ of the vertices to the
-gradient of the work ``⟨ℓ, force⟩`` that the forces do along it.
+``q = Σ gᵢ wᵢ``. At the maps that are differentiated, the forces vanish at free vertices. This module computes their
+derivatives by w, sⱼ and gⱼ. A transpose takes a displacement ℓ of the vertices to the gradient of the work
+``⟨ℓ, force⟩``.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 
 class Felt(NamedTuple):
-    """What triangles feel of a displacement of the vertices.
+    """The response of triangles to a displacement of the vertices.
 
     Attributes
     ----------
     dp, dq : (f,) complex128
         The change of p and q.
     hp, hq : (f,) complex128
-        The change of φ's derivatives by them.
+        The change of φ's derivatives by p and q.
     """
 
     dp: ComplexArray
@@ -42,7 +42,7 @@ class Forces:
     Attributes
     ----------
     corners : (3, f) int64
-        Triangles, column by column.
+        Vertices of the triangles, one column per triangle.
     n : int
         Number of vertices.
     g : (3, f) complex128
@@ -52,9 +52,9 @@ class Forces:
     p, q : (f,) complex128
         Derivatives of the map.
     by_p, by_q : (f,) complex128
-        Of φ, ``∂/∂Re + i ∂/∂Im``.
+        Derivatives of φ, ``∂/∂Re + i ∂/∂Im``.
     form : QuadraticForm
-        Second derivatives of φ, as they are.
+        Exact second derivatives of φ.
     """
 
     corners: IntArray
@@ -68,16 +68,16 @@ class Forces:
     form: QuadraticForm
 
     def derivatives(self, dw: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """The change (f,) of p and of q as vertices (n,) move."""
+        """The change (f,) of p and of q for displacements (n,) of the vertices."""
         moved = dw[self.corners]
         return np.sum(self.g.conj() * moved, axis=0), np.sum(self.g * moved, axis=0)
 
     def by_places(self, dw: ComplexArray) -> ComplexArray:
-        """The change of the forces (n,) as vertices (n,) move. It is its own transpose."""
+        """The change of the forces (n,) for displacements (n,) of the vertices; a symmetric operator."""
         return self.gathered(*self.form.apply(*self.derivatives(dw)))
 
     def by_strain(self, a: ComplexArray, b: ComplexArray) -> ComplexArray:
-        """The change of the forces (n,) as rest triangles grow and are sheared (f,), the sⱼ with their areas."""
+        """The change of the forces (n,) for growth and shear (f,) of the rest triangles; sⱼ changes with the area."""
         more = 2 * a.real
         by_p, by_q = self.form.apply(-(self.p * a + self.q * b.conj()), -(self.p * b + self.q * a.conj()))
         by_p += more * self.by_p
@@ -88,7 +88,7 @@ class Forces:
         return self.gathered(by_p, by_q)
 
     def felt(self, dw: ComplexArray) -> Felt:
-        """What the triangles feel of a displacement (n,)."""
+        """The response of the triangles to a displacement (n,)."""
         changes = self.derivatives(dw)
         return Felt(*changes, *self.form.apply(*changes))
 
@@ -102,12 +102,12 @@ class Forces:
 
     @cached_property
     def by_scale(self) -> ComplexArray:
-        """The change of the forces (n,) with the logarithm of a factor that all g have in common."""
+        """The change of the forces (n,) with the logarithm of a common factor of all g."""
         hp, hq = self.form.apply(self.p, self.q)
         return self.gathered(hp + self.by_p, hq + self.by_q)
 
     def gathered(self, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
-        """Forces of triangles (f,) on p and q, summed up at the vertices."""
+        """Sum forces of triangles (f,) on p and q at the vertices."""
         pull: ComplexArray = (self.share * by_p) * self.g + (self.share * by_q) * self.g.conj()
         at = self.corners.ravel()
         real, imaginary = (np.bincount(at, part.ravel(), minlength=self.n) for part in (pull.real, pull.imag))

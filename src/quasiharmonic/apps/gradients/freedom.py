@@ -1,6 +1,7 @@
-"""Where the vertices of a map may go: anywhere, nowhere, along a line that fixes the gauge, or along curves.
+"""The permitted movements of a map's vertices: free, fixed, along a line that fixes the gauge, or along curves.
 
-Unknowns are those of `SlidingSystem`: both coordinates of a free vertex, the way along its tangent of one that slides.
+The unknowns are those of `SlidingSystem`: both coordinates of a free vertex, and the distance along the tangent of a
+sliding vertex.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from quasiharmonic.geometry.curves.boundary_curves import Track
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-# Of the energy, the weight of the barrier that keeps a boundary near its curves: as `energy.sliding` has it.
+# Weight of the barrier that keeps the boundary near its curves, relative to the energy; as in
+# `energies.newton.sliding`.
 _WEIGHT = 1e-2
-# Of a curve's length, the step over which the barrier's slopes are differenced.
+# Step for differences of the barrier's gradient, relative to the curve's length.
 _STEP = 1e-6
 
 
 class Freedom:
-    """Vertices that are held, vertices that keep to lines through where they are, and all others.
+    """Fixed vertices, vertices on lines through their positions, and free vertices.
 
     Parameters
     ----------
@@ -32,19 +34,19 @@ class Freedom:
     n : int
         Number of vertices.
     fixed : (k,) int64
-        Vertices that stay.
+        Fixed vertices.
     linear_solver : str
     sliding : (l,) int64
-        Vertices that keep to lines.
+        Vertices that move along lines.
     tangent : (l,) complex128
-        The lines' directions, of length 1.
+        Unit directions of the lines.
 
     Attributes
     ----------
     system : SlidingSystem
-        Its matrix is by the unknowns.
+        The linear system of the unknowns.
     resting : bool
-        Whether a vertex that slides is held where it is.
+        Whether a sliding vertex is kept at its position, at a kink or an end of its curve.
     """
 
     resting = False
@@ -65,21 +67,21 @@ class Freedom:
             self.system.tangent = tangent
 
     def extra(self) -> float:
-        """What is minimised beside the energy, where the vertices are."""
+        """The value of additional terms of the objective at the current positions."""
         return 0.0
 
     def aim(self, pull: ComplexArray) -> None:
-        """Get ready for the forces (n,) of the map at hand."""
+        """Prepare the system for the forces (n,) at the current map."""
 
     def gathered(self, load: ComplexArray) -> ComplexArray:
-        """Loads (n,) on the unknowns; of a vertex that slides the real part, and the imaginary one is zero."""
+        """Loads (n,) on the unknowns; a sliding vertex uses the real part, and its imaginary part is zero."""
         system = self.system
         out = load[system.free]
         out[system.at] = (system.tangent.conj() * out[system.at]).real
         return out
 
     def slopes(self, pull: ComplexArray) -> ComplexArray:
-        """The derivative by the unknowns of all that is minimised, from the forces (n,)."""
+        """The gradient of the objective by the unknowns, from the forces (n,)."""
         return self.gathered(pull)
 
     def spread(self, step: ComplexArray) -> ComplexArray:
@@ -90,27 +92,27 @@ class Freedom:
         return out
 
     def advance(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
-        """The map after a step of the unknowns, None where it cannot be taken."""
+        """The map after a step of the unknowns; None if the step is not possible."""
         return w + self.spread(step)
 
     def keep(self) -> None:
-        """Stay where the last step that was tried has led."""
+        """Accept the positions of the last step that was evaluated."""
 
 
 class OnCurves(Freedom):
     """Boundary vertices that slide along curves, as in `quasiharmonic.polish`.
 
-    The barrier that keeps the boundary's edges near the curves has the bounds and the weight that a polish begun here
-    would give it, and keeps them.
+    A barrier keeps the boundary's edges near the curves. Its bounds and weight are those of a polish started here, and
+    stay constant.
 
     Parameters
     ----------
     energy : DeformationEnergy
     track : Track
     fixed : (k,) int64
-        Held vertices, with or without those that slide.
+        Fixed vertices; may include those that slide.
     loops : sequence of (l,) int64
-        The boundary.
+        Boundary loops.
     exponent : int
         The map is in units of ``2 ** exponent``.
     linear_solver : str
@@ -134,7 +136,7 @@ class OnCurves(Freedom):
         self.system.couple(self._straying.pairs[self._both])
 
     def extra(self) -> float:
-        """The barrier, where the last step that was tried has led."""
+        """The barrier's value at the positions of the last step that was evaluated."""
         return self._weight * self._straying.value(self._there)
 
     def aim(self, pull: ComplexArray) -> None:
@@ -149,7 +151,7 @@ class OnCurves(Freedom):
         self.resting = bool(rests.any())
         tangent: ComplexArray = np.where(rests, 0, np.where(turned, back, ahead))
         system.tangent = tangent
-        # Only to the side that it falls to may a vertex leave a kink.
+        # A vertex may leave a kink only on the side on which the objective decreases.
         self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
         system.bend = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
         bends = self._barrier_bends(s)
@@ -180,11 +182,11 @@ class OnCurves(Freedom):
         self._s = self._there
 
     def _by_edges(self, s: FloatArray) -> FloatArray:
-        """The barrier's slopes by the lengths at each edge's ends, in units; (e, 2)."""
+        """The barrier's derivatives by the arc lengths at each edge's ends, in units; (e, 2)."""
         return self._weight * self._unit * self._straying.derivatives(s)[0]
 
     def _barrier_slopes(self, s: FloatArray) -> FloatArray:
-        """The barrier's slopes by the lengths of the vertices that slide, in units; (l,)."""
+        """The barrier's derivatives by the arc lengths of the sliding vertices, in units; (l,)."""
         out, by_edges = np.zeros(s.size), self._by_edges(s)
         for end in (0, 1):
             number = self._straying.pairs[:, end]
@@ -193,14 +195,14 @@ class OnCurves(Freedom):
 
     @cached_property
     def _colours(self) -> IntArray:
-        """Three kinds of vertices that slide, such that no edge has two of a kind."""
+        """A colouring of the sliding vertices with three colours; no edge joins two of the same colour."""
         colours = np.arange(self._s.size) % 2
         one, other = self._straying.pairs[self._both].T
         colours[other[colours[one] == colours[other]]] = 2
         return colours
 
     def _barrier_bends(self, s: FloatArray) -> FloatArray:
-        """Its second derivatives edge by edge, (e, 2, 2): `DeviationBarrier` leaves out terms, as Gauss-Newton does."""
+        """The barrier's second derivatives by edge, (e, 2, 2), by differences; `DeviationBarrier` omits some terms."""
         pairs = self._straying.pairs
         out = np.zeros((len(pairs), 2, 2))
         lengths = np.array([chain.curve.length for chain in self._track.chains for _ in range(chain.sliding.sum())])

@@ -1,9 +1,9 @@
-"""Maps that are as good wherever they lie: how their derivative is made one.
+"""Select one derivative for maps whose position, rotation or scale does not change the energy.
 
-Where nothing is held, a flattened surface may be shifted and turned at will, where one vertex is held turned about it,
-and where the energy is blind to scale enlarged as well. Of all maps that are as good the derivative is that of the one
-which lies nearest to the map at hand by least squares over the vertices (Procrustes): in a small change the vertices'
-displacements have no common part that shifts or turns them. A map whose scale is free keeps the surface's area.
+Without fixed vertices, shifts and rotations of a flattened map do not change its energy. With one fixed vertex,
+rotations about it do not. Some energies are also independent of scale. The derivative is that of the map nearest to the
+given one by least squares over the vertices (Procrustes). So the vertices' displacements have no common shift or
+rotation. If the scale is free, the map keeps the surface's area.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from quasiharmonic.util.arrays import ComplexArray, IntArray, work
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """What a map may do at no cost.
+    """The transformations of a map that do not change its energy.
 
     Attributes
     ----------
     w : (n,) complex128
         The map.
     pin : int or None
-        The vertex that is held, if one is.
+        The fixed vertex, if there is one.
     scales : bool
-        Whether it may be enlarged.
+        Whether the energy is independent of the map's scale.
     loops : sequence of (l,) int64
-        Its boundary.
+        Boundary loops of the map.
     """
 
     w: ComplexArray
@@ -40,12 +40,12 @@ class Gauge:
 
     @property
     def arms(self) -> ComplexArray:
-        """Places (n,) from what the map is turned about: the vertex that is held, or the middle of all."""
+        """Positions (n,) relative to the centre of rotation: the fixed vertex, or the mean of all vertices."""
         centre = self.w.mean() if self.pin is None else self.w[self.pin]
         return np.asarray(self.w - centre)
 
     def fixing(self) -> tuple[IntArray, IntArray, ComplexArray]:
-        """Vertices to hold, and one to keep on a line, so that nothing of this is possible.
+        """Vertices to fix, and one to keep on a line, that exclude these transformations.
 
         Returns
         -------
@@ -60,7 +60,7 @@ class Gauge:
         return np.array([first]), np.array([second]), apart[[second]] / abs(apart[second])
 
     def projected(self, dw: ComplexArray) -> ComplexArray:
-        """A displacement, or a gradient, (n,) without its part in what costs nothing."""
+        """Remove the part of a displacement or gradient (n,) that lies along these transformations."""
         out = dw - dw.mean() if self.pin is None else dw
         arms = self.arms
         square = work(arms, arms)
@@ -70,20 +70,20 @@ class Gauge:
 
     @property
     def keeps_area(self) -> bool:
-        """Whether a map whose scale is free is given the surface's area, as `quasiharmonic.flatten` does."""
+        """Whether a map with a free scale is scaled to the surface's area, as in `quasiharmonic.flatten`."""
         return self.scales and self.pin is None
 
     def fixed(self, dw: ComplexArray, held: ComplexArray, more: float) -> ComplexArray:
-        """The displacement (n,) that is the derivative's, of all that are as good.
+        """Return the displacement (n,) that defines the derivative, from any equivalent one.
 
         Parameters
         ----------
         dw, held : (n,) complex128
-            One of them; the displacements of held vertices alone.
+            An equivalent displacement, and the displacements of fixed vertices only.
         more : float
             The change of the logarithm of the surface's size.
         """
-        # What is held carries the others along, and they turn about it.
+        # A moving fixed vertex shifts the others, and they rotate about it.
         along = 0j if self.pin is None else held[self.pin]
         out = self.projected(dw - along) + along
         if self.keeps_area:
@@ -91,7 +91,7 @@ class Gauge:
         return out
 
     def pulled(self, pull: ComplexArray) -> tuple[ComplexArray, complex, float]:
-        """The transpose of `fixed`: the gradient (n,) by the displacement, what the pin has, that by ``more``."""
+        """The transpose of `fixed`: gradients by the displacement (n,), by the pin's position and by ``more``."""
         out = self.projected(pull)
         if not self.keeps_area:
             return out, complex((pull - out).sum()), 0.0
@@ -100,12 +100,12 @@ class Gauge:
 
     @cached_property
     def _by_area(self) -> ComplexArray:
-        """The derivative (n,) of the logarithm of the map's size by its places."""
+        """The derivative (n,) of the logarithm of the map's size by its positions."""
         return log_size(self.w, self.loops)
 
 
 def log_size(w: ComplexArray, loops: Sequence[IntArray]) -> ComplexArray:
-    """The derivative (n,) of half the logarithm of a map's area, which is a matter of its boundary, by its places."""
+    """The derivative (n,) of half the logarithm of the map's area by its positions; only the boundary contributes."""
     by_area, area = np.zeros_like(w), 0.0
     for loop in loops:
         here = w[loop]

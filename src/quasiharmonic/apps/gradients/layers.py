@@ -1,7 +1,7 @@
-"""Maps as functions of arrays, for the frameworks that differentiate programs: many problems at a time, forth and back.
+"""Maps as functions of batches of arrays, for automatic differentiation, with forward and backward passes.
 
-What PyTorch and JAX each need is thin; what they have in common is here. An argument has the shape of one problem's, or
-that with further axes in front, over which it is a batch; batches go together as NumPy broadcasts them.
+The packages for PyTorch and JAX share this module. An argument has the shape of one problem's argument, with optional
+leading batch axes. Batches of several arguments are broadcast as in NumPy.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, real_array
 
-#: Of one argument: what a framework hands over, as NumPy has it.
+#: An argument, converted to NumPy.
 Array = NDArray[Any]
 
 
 class MapNotFound(ValueError):  # noqa: N818  what it says is what happened
-    """No injective map was found, so that there is nothing to differentiate.
+    """No injective map was found, so there is no derivative.
 
     Attributes
     ----------
     result : MapResult
-        What there is instead, with its status and diagnosis.
+        The result found, with its status and diagnosis.
     """
 
     def __init__(self, result: MapResult) -> None:
@@ -48,12 +48,12 @@ class MapNotFound(ValueError):  # noqa: N818  what it says is what happened
 
 
 class DoubtfulDerivative(UserWarning):
-    """A gradient has been asked for that its derivative has `Doubt` about."""
+    """Warns that a gradient's derivative has a `Doubt`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layer(ABC):
-    """A map as a function of arrays. Layers that do the same are equal: programs are compiled once for them."""
+    """A map as a function of arrays. Layers with equal settings are equal, so programs are compiled once for them."""
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and isinstance(other, Layer) and self._settings == other._settings
@@ -63,7 +63,7 @@ class Layer(ABC):
 
     @cached_property
     def _settings(self) -> tuple[Any, ...]:
-        """What it was made of: arrays, numbers and words by what they hold, problems, energies and rails themselves."""
+        """The layer's settings for comparison: arrays and plain values by content, other objects by identity."""
         found: list[Any] = []
         for field in fields(self):
             value = getattr(self, field.name)
@@ -85,21 +85,21 @@ class Layer(ABC):
 
     @abstractmethod
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        """Find one problem's map, or take it as it was found before, and make its derivative.
+        """Return the derivative of one problem's map; the map is computed unless ``uv`` is given.
 
         Raises
         ------
         MapNotFound
-            When there is none.
+            If no injective map was found.
         """
 
     def batch(self, arrays: Mapping[str, Array]) -> tuple[int, ...]:
-        """The axes over which arguments are a batch together.
+        """Return the common batch axes of the arguments.
 
         Raises
         ------
         ValueError
-            When batches do not go together.
+            If the batch axes cannot be broadcast.
         """
         leads = {name: array.shape[: array.ndim - len(self.shapes[name])] for name, array in arrays.items()}
         try:
@@ -109,7 +109,7 @@ class Layer(ABC):
             raise ValueError(f"batches must go together as NumPy broadcasts them, not {batches}") from None
 
     def item(self, arrays: Mapping[str, Array], item: tuple[int, ...]) -> dict[str, Array]:
-        """The arguments of one problem of the batch."""
+        """Return the arguments of one item of the batch."""
         own = {}
         for name, array in arrays.items():
             lead = array.shape[: array.ndim - len(self.shapes[name])]
@@ -173,7 +173,7 @@ class PolishedLayer(Layer):
 
 @dataclass(frozen=True, eq=False)
 class FlattenLayer(Layer):
-    """`quasiharmonic.flatten` as a function of ``rest`` and, where vertices are held, ``target``."""
+    """`quasiharmonic.flatten` as a function of ``rest`` and, if there are fixed vertices, ``target``."""
 
     F: IntArray
     vertices: tuple[int, int]
@@ -196,7 +196,7 @@ class FlattenLayer(Layer):
         start: ArrayLike | None,
         solver: str,
     ) -> FlattenLayer:
-        """From what a caller hands over; of ``rest`` and ``target``, a framework's own arrays, little is looked at."""
+        """Make a layer from a call's arguments; only the shape of ``rest`` is read, as it may be a traced array."""
         if (fixed is None) != (target is None):
             raise ValueError("fixed and target belong together: vertices that are held, and where")
         shape = tuple(getattr(rest, "shape", ()))
@@ -231,7 +231,7 @@ class FlattenLayer(Layer):
 
 
 def posed(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
-    """A problem with a target and rest positions of a batch's, where there are such."""
+    """Return the problem with the target and rest positions of a batch item, where given."""
     target, V = arrays.get("target", problem.target), arrays.get("rest", problem.V)
     if np.array_equal(V, problem.V):
         return problem.with_target(target)
@@ -239,18 +239,18 @@ def posed(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
 
 
 def forth(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray, list[Derivative]]:
-    """The maps of a batch of problems (…, n, 2), and their derivatives.
+    """Compute the maps (…, n, 2) of a batch of problems, and their derivatives.
 
     Parameters
     ----------
     layer : Layer
     arrays : mapping of str to array
-        The arguments that there are, by name.
+        The given arguments, by name.
 
     Raises
     ------
     MapNotFound, ValueError
-        As one of the problems does, with a note that says which.
+        If one of the problems raises it; a note names the batch item.
     """
     lead = layer.batch(arrays)
     uv, derivatives = np.empty((*lead, *layer.places)), []
@@ -269,12 +269,12 @@ def forth(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray, list[D
 def back(
     layer: Layer, derivatives: Sequence[Derivative], cotangent: FloatArray, wanted: Sequence[str]
 ) -> dict[str, Array]:
-    """The gradients of a function of the maps (…, n, 2), by name, each with the whole batch's axes.
+    """Return the gradients of a function of the maps (…, n, 2), by name, each with all batch axes.
 
     Warns
     -----
     DoubtfulDerivative
-        When a derivative has doubts.
+        If a derivative has doubts.
     """
     lead = cotangent.shape[:-2]
     out: dict[str, Array] = {
@@ -292,7 +292,7 @@ def back(
 def along(
     layer: Layer, derivatives: Sequence[Derivative], lead: tuple[int, ...], tangents: Mapping[str, Array]
 ) -> FloatArray:
-    """How the maps of a batch move (…, n, 2) as arguments do."""
+    """Return the change of the maps of a batch (…, n, 2) for changes of the arguments."""
     out = np.empty((*lead, *layer.places))
     for item, derivative in zip(np.ndindex(lead), derivatives, strict=True):
         _warn(derivative, item)
@@ -301,14 +301,14 @@ def along(
 
 
 def summed(gradient: Array, shape: tuple[int, ...]) -> Array:
-    """A gradient with a batch's axes, summed over those that the argument has not, or has but one of."""
+    """Sum a gradient over the batch axes that the argument lacks or has with length 1."""
     gradient = gradient.sum(axis=tuple(range(gradient.ndim - len(shape))))
     short = tuple(i for i, size in enumerate(shape) if size == 1 and gradient.shape[i] != 1)
     return np.asarray(gradient.sum(axis=short, keepdims=True) if short else gradient)
 
 
 def expected(name: str, shape: tuple[int, ...], one: tuple[int, ...]) -> None:
-    """Raise a ValueError for an argument that is neither one problem's nor a batch of such."""
+    """Raise ValueError if an argument has neither one problem's shape nor that with batch axes in front."""
     if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
         raise ValueError(f"{name} must have shape {one}, or that with a batch in front, not {tuple(shape)}")
 

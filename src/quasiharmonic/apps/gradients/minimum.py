@@ -1,8 +1,8 @@
-"""A map brought to rest to rounding, and the second derivative there, factored once.
+"""Converge a map to rounding, and factor the second derivative there.
 
-A polish ends where Newton's model promises less than a ten-thousandth, and its matrices are made positive. Here steps
-are Newton's own, with second derivatives as they are, and the last of them is no longer than rounding makes it. Where
-they are not positive definite, as may be on the way, so much of what is negative on triangles is left out as it takes.
+A polish stops when Newton's model predicts a decrease below a tolerance, and its matrices are made positive definite.
+This module takes Newton steps with exact second derivatives, until rounding limits the last step. If the exact matrix
+is not positive definite, only as much of the negative curvature of triangles is removed as necessary.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.util.arrays import ComplexArray
 from quasiharmonic.util.progress import heartbeat
 
-# Steps at most, and how often one is halved.
+# Maximum numbers of steps, and of halvings of one step.
 _STEPS, _HALVINGS = 100, 40
-# Where second derivatives have a negative direction, how much of what is negative on triangles is left out, in turn.
+# If the matrix is not positive definite, these fractions of the triangles' negative curvature are removed in turn.
 _CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
-# A step that strains no triangle by more than this is none; one as short as the second, and not half as long as the one
-# before, is rounding; and a map whose last step strains more than the third is not at rest.
+# Steps with a strain of at most _NOTHING on every triangle count as zero. Exact steps below _SHORT that are more than
+# half as long as the step before are limited by rounding. If the last step strains more than _AT_REST, the map has not
+# converged.
 _NOTHING, _SHORT, _AT_REST = 1e-12, 1e-6, 1e-6
-# After a step as short as this second derivatives are the same to so many digits, and are not factored anew.
+# After a step this short, second derivatives have the same leading digits, and are not factored again.
 _NEAR = 1e-8
-# What the energy may rise by, of itself: its rounding.
+# Relative increase of the energy that counts as rounding.
 _ROUNDING = 1e-13
-# With the diagonal scaled to one, an eigenvalue as small as this is none.
+# With a unit diagonal, an eigenvalue below this counts as zero; and the number of power iterations.
 _SINGULAR, _ITERATIONS = 1e-10, 2
-# A triangle's singular values, the smaller over the larger, from where on it is as good as collapsed.
+# A triangle whose ratio of smaller to larger singular value is below this counts as nearly collapsed.
 _THIN = 1e-8
 
 
@@ -47,17 +48,17 @@ class Minimum:
     ----------
     energy : DeformationEnergy
     w : (n,) complex128
-        An injective map near it, the vertices of ``freedom`` on their curves.
+        An injective map near the stationary point; sliding vertices of ``freedom`` are on their curves.
     freedom : Freedom
     settle : bool
-        Go there; or stay, and take the forces that are left as staying what they are.
+        Converge first. Otherwise keep the map, and treat the remaining forces as constant.
 
     Attributes
     ----------
     w : (n,) complex128
-        The map at rest; injective, decided exactly.
+        The converged map, certified as injective.
     forces : Forces
-        At it.
+        Forces at ``w``.
     doubts : list of Doubt
     """
 
@@ -75,7 +76,7 @@ class Minimum:
             self._judge(left)
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """The displacement (n,) of the vertices under a load (n,) on them."""
+        """Return the displacement (n,) of the vertices under a load (n,) on them."""
         freedom = self._freedom
         on_unknowns = freedom.gathered(load)
         if self._lu is None:
@@ -84,7 +85,7 @@ class Minimum:
             return freedom.spread(self._lu.solve(on_unknowns.view(np.float64)).view(np.complex128))
 
     def _settle(self, steps: int) -> float:
-        """Take steps until there is none to take, and leave the system factored; the strain of the step not taken."""
+        """Take steps until converged, leave the system factored, and return the strain of the step not taken."""
         last = np.inf
         for left in range(steps, -1, -1):
             heartbeat()
@@ -96,21 +97,22 @@ class Minimum:
             if not left or not self._moved(step):
                 return size
             if self._exact and size <= _NEAR:
-                # Quadratic convergence: this was the last step, and the factor is good to as many digits.
+                # Convergence is quadratic, so this was the last step, and the factor is accurate to the same number of
+                # digits.
                 self._at()
                 return size
             last = size
         raise AssertionError("the last step has been returned from")
 
     def _at(self) -> ComplexArray:
-        """Look at the map at hand; the slopes by the unknowns."""
+        """Evaluate the energy at the current map; return the gradient by the unknowns."""
         self._deformation: Deformation = self._energy.deform(self.w)
         pull = self._energy.gradient_of(self._deformation, self.w.size)
         self._freedom.aim(pull)
         return self._freedom.slopes(pull)
 
     def _direction(self, gradient: ComplexArray) -> tuple[ComplexArray, bool]:
-        """Newton's step, and whether by the second derivatives as they are."""
+        """Return Newton's step, and whether it uses the exact second derivatives."""
         system = self._freedom.system
         for clamped in (0.0, *_CLAMPED):
             if 0 < clamped < self._clamped:
@@ -125,13 +127,13 @@ class Minimum:
         return system.solve_diagonal(-gradient), False
 
     def _strain(self, step: ComplexArray) -> float:
-        """By how much of itself a step changes a triangle, at most."""
+        """The maximum relative change of a triangle under a step."""
         energy, moved = self._energy, self._freedom.spread(step)[self._energy.F.T]
         dp, dq = np.sum(energy.g.conj() * moved, axis=0), np.sum(energy.g * moved, axis=0)
         return float(np.max((np.abs(dp) + np.abs(dq)) / np.abs(self._deformation.p)))
 
     def _moved(self, step: ComplexArray) -> bool:
-        """Take as much of a step as is good; False if none of it is."""
+        """Take the longest acceptable part of a step; return False if there is none."""
         before = self._energy.value_of(self._deformation) + self._freedom.extra()
         t = 1.0
         for _ in range(_HALVINGS):
@@ -155,20 +157,20 @@ class Minimum:
         return Forces(corners, self.w.size, energy.g, energy.share, d.p, d.q, by_p, by_q, form)
 
     def _by_lu(self) -> None:
-        """Factor the second derivatives as they are although they have a negative direction."""
+        """Factor the exact second derivatives by LU although they have a negative direction."""
         from scipy.sparse import dia_array
         from scipy.sparse.linalg import splu
 
         system = self._freedom.system
         system.assemble(self._energy.curvature_of(self._deformation, negative=1.0))
         matrix = system.matrix()
-        # Unknowns that there are none of, across a line, have empty rows.
+        # Unused unknowns, across the line of a sliding vertex, have empty rows.
         empty = (abs(matrix) @ np.ones(matrix.shape[0])) == 0
         self._lu = splu((matrix + dia_array((empty[None].astype(np.float64), [0]), shape=matrix.shape)).tocsc())
         self.doubts.append(Doubt.NOT_LEAST)
 
     def _judge(self, left: float) -> None:
-        """Say what is doubtful."""
+        """Record the doubts."""
         if not left <= _AT_REST:
             self.doubts.append(Doubt.NOT_AT_REST)
         if self._least_eigenvalue() < _SINGULAR:
@@ -180,7 +182,7 @@ class Minimum:
             self.doubts.append(Doubt.SLIDING)
 
     def _least_eigenvalue(self) -> float:
-        """About the least modulus of an eigenvalue, the diagonal scaled to one; from above."""
+        """Estimate the smallest modulus of an eigenvalue, with a unit diagonal, from above."""
         system = self._freedom.system
         if not system.free.size:
             return 1.0

@@ -1,4 +1,4 @@
-"""The derivative of maps that have been polished: boundary held, or sliding along curves."""
+"""The derivative of polished maps with a fixed boundary or a boundary that slides along curves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-#: Why a map must be injective.
+#: Error message for maps that are not injective.
 NOT_FOUND = "there is no derivative of a map that was not found"
 
 
@@ -37,34 +37,35 @@ def polish_derivative(
     linear_solver: str = "auto",
     slide: bool | BoundaryCurves = False,
 ) -> Derivative:
-    """Bring a polished map to rest to rounding, and differentiate it by held places and rest positions.
+    """Converge a polished map to rounding, and differentiate it by target and rest positions.
 
     Parameters
     ----------
     V, F, fixed, energy, weights, linear_solver, slide
-        As `quasiharmonic.polish` had them.
+        As for the call of `quasiharmonic.polish` that made the map.
     uv : (n, 2) array
         The polished map.
 
     Returns
     -------
     Derivative
-        Of the map with the least energy next to ``uv``, which is ``Derivative.uv``.
+        The derivative of the energy's minimum near ``uv``; this map is ``Derivative.uv``.
 
     Raises
     ------
     ValueError
-        As `quasiharmonic.polish`, and as there when ``uv`` is not injective: of a map that was not found there is no
-        derivative.
+        As `quasiharmonic.polish`. If ``uv`` is not injective, it has no derivative.
 
     Notes
     -----
-    By implicit differentiation, with the second derivative as it is. An energy of one's own may depend on the rest
-    positions through p and q alone. Where the boundary slides, its curves do not change, nor does the scale of the
-    map; the barrier that keeps edges near curves that are not straight (`quasiharmonic.geometry.curves.deviation`) has
-    the bounds and the weight that it would have in a polish begun at ``uv``, and is taken as keeping them: along such
-    curves derivatives are as a rule good to half a percent and not to rounding, without a doubt that says so. A disk
-    that slides around on a circle, with no vertex pinned, may turn at will, and its derivative is doubtful.
+    The method is implicit differentiation with the exact second derivative. A custom energy may depend on the rest
+    positions through p and q only. If the boundary slides, its curves and the map's scale are constant.
+
+    For curves that are not straight, a barrier keeps edges near them (`quasiharmonic.geometry.curves.deviation`). Its
+    bounds and weight are those of a polish started at ``uv``, and count as constant. Derivatives along these curves are
+    therefore typically accurate to 0.5 % only, and no doubt reports this.
+
+    A disk that slides on a circle without fixed vertices can rotate freely, so its derivative has a doubt.
 
     Examples
     --------
@@ -112,24 +113,24 @@ def polish_derivative(
 
 
 def surface_strain(domain: Domain) -> RestStrain:
-    """How triangles change with the rest positions, seen from the side on which they are counterclockwise."""
+    """The change of triangles with the rest positions; planar triangles are taken as counterclockwise."""
     domain.check_areas()
     return RestStrain(domain.V, domain.F, signed=False)
 
 
 def log_surface(strain: RestStrain) -> FloatArray:
-    """The derivative (n, d) of half the logarithm of a surface's area by the rest positions."""
+    """The derivative (n, d) of half the logarithm of the surface's area with respect to the rest positions."""
     share = (strain.m / strain.m.sum()).astype(np.complex128)
     return strain.pull(share, np.zeros_like(share))
 
 
 def on_track(track: Track) -> IntArray:
-    """Vertices that are where their curves say: those that slide, and those at corners."""
+    """Vertices whose positions the curves determine: those that slide, and those at corners."""
     return np.concatenate([chain.vertices for chain in track.chains])
 
 
 def placed(w: ComplexArray, exponent: int, held: IntArray, given: FloatArray) -> FloatArray:
-    """A map out of its units, what is held where it was given to the last bit."""
+    """Scale a map out of its units, with fixed vertices exactly at their given positions."""
     uv: FloatArray = np.ldexp(as_rows(w), exponent)
     uv[held] = given[held]
     return uv

@@ -1,8 +1,8 @@
-"""How rest triangles change when vertices of the surface move, and the transpose of that.
+"""The change of rest triangles for displacements of the surface's vertices, and its transpose.
 
-A triangle that is laid into the plane, vertex 0 at the origin and vertex 1 on the positive x axis, changes by the
-linear field ``dz = a z + b z̄``: a is its growth, b its shear, and since vertex 1 stays on the axis ``Im (a + b) = 0``.
-A map of it with the derivatives p and q, whose corners stay where they are, then changes by
+Lay a triangle into the plane, with vertex 0 at the origin and vertex 1 on the positive x axis. It changes by the
+linear field ``dz = a z + b z̄``: a is its growth and b its shear. Vertex 1 stays on the axis, so ``Im (a + b) = 0``.
+If the corners of its image do not move, the derivatives p and q of the map change by
 
     dp = −(p a + q b̄),    dq = −(p b + q ā),    and the triangle's area m by  dm = 2 m Re a.
 """
@@ -16,38 +16,38 @@ import numpy as np
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
 
-# As `mesh.reference` corrects angles (§F.1).
+# The same minimum angle as in `mesh.reference` (§F.1).
 _LEAST_ANGLE = np.pi / 6
 
 
 class Strain(ABC):
-    """The triangles in which gradients are taken, as functions of the rest positions."""
+    """The triangles in which gradients are computed, as functions of the rest positions."""
 
     @abstractmethod
     def of(self, dV: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """The growth and shear (f,) of each triangle as the vertices (n, d) move."""
+        """Return the growth and shear (f,) of each triangle for displacements (n, d) of the vertices."""
 
     @abstractmethod
     def pull(self, by_a: ComplexArray, by_b: ComplexArray) -> FloatArray:
-        """The gradient by positions (n, d) of what has these gradients (f,), ``∂/∂Re + i ∂/∂Im``, by a and b."""
+        """Return the gradient by positions (n, d) from the gradients (f,), ``∂/∂Re + i ∂/∂Im``, by a and b."""
 
 
 class RestStrain(Strain):
-    """Of triangles as they lie.
+    """The strain of the rest triangles.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) float64
     F : (f, 3) int64
-        Triangles, none without area.
+        Triangles with positive area.
     signed : bool
-        Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Those in space never are, nor are those of
-        a planar surface that is seen from its own side (`mesh.shapes`).
+        Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Triangles in space are always
+        counterclockwise, and so are those of a planar surface in `mesh.shapes`.
 
     Raises
     ------
     ValueError
-        When areas leave the range of doubles; names the triangles.
+        If areas exceed the range of doubles; the message names the triangles.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class RestStrain(Strain):
                 f"the areas of {named('triangle', 'triangles', lost)} at rest leave the range of doubles: scale the "
                 "surface to about unit size"
             )
-        # In the triangle's plane, as (d, f): along the first side and across it.
+        # Unit vectors in the triangle's plane, (d, f): along the first side, and perpendicular to it.
         coordinates = np.ascontiguousarray(V.T)
         start, one, two = (coordinates[:, at] for at in self._corners)
         self._along = (one - start) / z1
@@ -97,13 +97,13 @@ class RestStrain(Strain):
 
 
 class CorrectedStrain(Strain):
-    """Of triangles whose angles have been corrected (§F.1): vertex 2 is the only one that moves in its frame.
+    """The strain of triangles with corrected angles (§F.1), in whose frame only vertex 2 moves.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) float64
     F : (f, 3) int64
-        Triangles, none without area.
+        Triangles with positive area.
     half : (3, f) complex128
         Half the gradients of the hat functions in the corrected triangles.
     """
@@ -115,10 +115,10 @@ class CorrectedStrain(Strain):
         raised = np.maximum(angles, _LEAST_ANGLE)
         total = raised.sum(axis=0)
         self._share, self._per_angle = raised / total, np.pi / total
-        # By a shear b the side e turns by Im (b ē/e), and an angle is the difference of two directions.
+        # A shear b rotates the side e by Im (b ē/e), and an angle is the difference of two directions.
         turn = sides.conj() / sides
         self._by_shear: ComplexArray = np.where(angles > _LEAST_ANGLE, sign, 0.0) * (turn[(2, 0, 1), :] - turn)
-        # Vertex 2 lies at sin θ₁ / sin θ₂ e^{iθ₀}.
+        # Vertex 2 is at sin θ₁ / sin θ₂ e^{iθ₀}.
         zero, one, two = np.pi * self._share
         self._cot_one, self._cot_two = 1 / np.tan(one), 1 / np.tan(two)
         self._z2: ComplexArray = np.sin(one) / np.sin(two) * np.exp(1j * zero)

@@ -1,7 +1,7 @@
-"""The derivative of quasi-harmonic maps: by the tensors, by the fixed vertices' places, by the surface.
+"""The derivative of quasi-harmonic maps by tensors, target positions and rest positions.
 
-The map is the solution of a linear system, so there is no more to it than one solve with the factor that the map itself
-took. Written as forces, it is at rest with the energy ``Σ m φ(p, q)``,
+The map solves a linear system, so a derivative needs one more solve with the same factor. The map is the stationary
+point of the energy ``Σ m φ(p, q)``,
 
     φ = c (|p|² + |q|²) − 2 Re (ω p q̄),    c = (1 + |μ|²) / (1 − |μ|²),    ω = 2μ / (1 − |μ|²).
 """
@@ -29,7 +29,7 @@ from quasiharmonic.util.arrays import ComplexArray, check_choice
 
 
 class _Response:
-    """A factored Laplacian as a derivative asks for its inverse."""
+    """The inverse that `Derivative` needs, from a factored Laplacian."""
 
     def __init__(self, operator: FactoredLaplacian) -> None:
         self._operator = operator
@@ -45,29 +45,29 @@ def quasi_harmonic_derivative(
     reference: Reference = "equilateral",
     linear_solver: str = "auto",
 ) -> Derivative:
-    """The quasi-harmonic map of a tensor field, and its derivative by tensors, held places and rest positions.
+    """Compute a quasi-harmonic map and its derivative by tensors, target positions and rest positions.
 
     Parameters
     ----------
     problem, mu, reference, linear_solver
-        As of `quasiharmonic.quasi_harmonic_map`.
+        As for `quasiharmonic.quasi_harmonic_map`.
 
     Returns
     -------
     Derivative
-        Its ``uv`` is that map, to the last bit. With the reference ``"equilateral"`` the rest positions do not matter.
+        Its ``uv`` is exactly that map. With the reference ``"equilateral"``, it does not depend on the rest positions.
 
     Raises
     ------
     ValueError
         As `quasiharmonic.quasi_harmonic_map`.
     quasiharmonic.linsolve.NotPositiveDefinite
-        When rounding leaves no positive definite Laplacian.
+        If rounding makes the Laplacian not positive definite.
 
     Notes
     -----
-    The factor is the one that the map took. All derivatives on one `Problem` share the memory of a single one, so where
-    two of them with different tensors are asked by turns, it is made anew.
+    The derivative uses the map's factor. All derivatives of one `Problem` share the memory of one factor, so
+    alternating between derivatives with different tensors computes it again.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""From the plane back to the surface, and from one surface to another.
+"""Inverses of maps, and maps from one surface to another through the plane.
 
 The package builds on `geometry.exact.point_location`. Start reading in `inverse`, then `transfer`.
 """

@@ -1,12 +1,11 @@
-"""From the plane back to the surface.
+"""The inverse of a map, from the plane to the surface.
 
-A map φ of a surface into the plane that is bijective onto its image has an inverse. `InverseMap` finds, for points
-of the plane, the triangle that each lies in and its barycentric coordinates there, and with them positions,
-normals or any values given on the surface; and the other way round.
+A map of a surface into the plane that is bijective onto its image has an inverse. `InverseMap` finds the triangle that
+contains a point of the plane, and the point's barycentric coordinates. From these it computes positions, normals or any
+values given on the surface. It also maps points of the surface to the plane.
 
-Which triangle contains a point, if any, is decided exactly for the coordinates as stored: no point of the closed
-image is declared outside, and none outside is declared in it. Points that rounding has put beside the boundary are
-outside.
+Whether a triangle contains a point is decided exactly for the stored coordinates. A point that rounding has moved out
+of the image is outside.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
-# Points handled at a time: what is in work stays in the cache. And pairs of a point and an edge.
+# Points per block, so that the arrays fit into the cache; and pairs of a point and an edge per block.
 _POINTS, _PAIRS = 1 << 14, 1 << 20
 
-#: What values on a surface can be given for.
+#: The elements that values on a surface belong to.
 Per = Literal["vertex", "corner", "triangle"]
 
 
@@ -49,9 +48,9 @@ class SurfacePoints:
     Attributes
     ----------
     triangle : (...) int64
-        The triangle that each point lies in; -1 where there is no point.
+        Triangle that contains each point; -1 if there is no point.
     barycentric : (..., 3) float64
-        Its barycentric coordinates: weights of the triangle's corners that add up to 1. NaN where there is none.
+        Barycentric coordinates: weights of the triangle's corners that sum to 1. NaN if there is no point.
     """
 
     triangle: IntArray
@@ -59,7 +58,7 @@ class SurfacePoints:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """Where there is a point; (...) bool."""
+        """Which points exist; (...) bool."""
         return self.triangle >= 0
 
 
@@ -73,38 +72,35 @@ class InverseMap(ReadOnly):
     F : (f, 3) array of int
         Triangles.
     uv : (n, 2) array
-        Its map: every triangle strictly positive, no place covered twice.
+        The map. Every triangle must be strictly positive, and the map bijective.
     overlapping : bool
-        Accept a map that covers places twice, or a mesh whose boundary is not simple loops, as long as every
-        triangle is positive. Of the several points that then lie at one place, the one in the triangle of the
-        smallest index is meant.
+        Accept maps that overlap themselves and meshes whose boundary is not made of simple loops, if every triangle
+        is positive. If several triangles contain a point, `locate` returns the one with the smallest index.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape or dtype, or the map is not bijective (or, with ``overlapping``, not
-        injective); the message names the elements.
+        If an array has the wrong shape or dtype, or the map is not bijective (with ``overlapping``: not injective);
+        the message names the elements.
 
     Attributes
     ----------
     V, F, uv : arrays
         As given, as float64 and int64.
     certificate : Certificate
-        The exact verdict on the map.
+        The exact certificate of the map.
 
     Notes
     -----
-    Building takes time in proportion to the number of triangles, a query nearly the same time for each point
-    however many triangles there are and however much their sizes differ. On an edge or at a vertex, which belong to
-    several triangles, the one of the smallest index is found, and the weights of the other corners are zero
-    exactly.
+    Building takes time proportional to the number of triangles. The time of a query depends little on the number
+    and the sizes of the triangles. For a point on an edge or at a vertex, the triangle of the smallest index is
+    found, and the weights of the other corners are exactly zero.
 
-    How exact positions are is a matter of the map. Doubles tell places of the plane apart down to u·max|uv|, with
-    u = 2⁻⁵³, and where the map shrinks lengths to σ₂ (`quasiharmonic.Distortion.sigma2`) that much in the plane is
-    1/σ₂ times as much on the surface. So a point that goes to the plane and back returns to within about
-    10·u·max|uv|/σ₂ of where it was: 10⁻¹⁵ of the surface's size where nothing is shrunk, 10⁻⁹ and worse where a map
-    into a letter squeezes triangles a millionfold. No arithmetic mends that after the place has been rounded; keep
-    the `SurfacePoints` where points of the surface are wanted exactly.
+    The accuracy of positions depends on the map. Doubles resolve the plane to u·max|uv|, with u = 2⁻⁵³. If the map
+    shrinks lengths by σ₂ (`quasiharmonic.Distortion.sigma2`), this is 1/σ₂ times as much on the surface. So a point
+    that is mapped to the plane and back returns to within about 10·u·max|uv|/σ₂ of its position. Relative to the
+    surface's size this is 10⁻¹⁵ without shrinking, and 10⁻⁹ or more if triangles shrink by a factor of a million.
+    To keep points of the surface exactly, keep their `SurfacePoints`.
 
     Examples
     --------
@@ -143,22 +139,22 @@ class InverseMap(ReadOnly):
         return self.V, self.F, self.uv
 
     def locate(self, points: ArrayLike) -> SurfacePoints:
-        """The points of the surface that lie at places of the plane.
+        """Find the points of the surface at positions in the plane.
 
         Parameters
         ----------
         points : (..., 2) array
-            Places; any real dtype, taken as float64.
+            Positions; any real dtype, converted to float64.
 
         Returns
         -------
         SurfacePoints
-            Triangle -1 outside of the map's image, and for places that are not finite.
+            Triangle -1 for positions outside the image and for positions that are not finite.
 
         Raises
         ------
         ValueError
-            When the last axis is not of length 2.
+            If the last axis does not have length 2.
         """
         places = np.array(points, dtype=np.float64)
         if places.ndim < 1 or places.shape[-1] != 2:
@@ -172,25 +168,25 @@ class InverseMap(ReadOnly):
         return SurfacePoints(triangle.reshape(shape), barycentric.reshape(*shape, 3))
 
     def nearest(self, points: ArrayLike, at: SurfacePoints | None = None) -> SurfacePoints:
-        """The points of the surface that lie nearest to places of the plane.
+        """Find the points of the surface nearest to positions in the plane.
 
         Parameters
         ----------
         points : (..., 2) array
-            Places, in the map's image or not.
+            Positions, inside or outside the image.
         at : SurfacePoints, optional
-            What `locate` says of them, if it has been asked.
+            The result of `locate` for them, if known.
 
         Returns
         -------
         SurfacePoints
-            Those of `locate` where it finds one, and else the nearest point of the image's boundary, up to rounding;
-            triangle -1 only for places that are not finite.
+            The points found by `locate`; for positions outside the image, the nearest point of its boundary, up to
+            rounding. Triangle -1 only for positions that are not finite.
 
         Raises
         ------
         ValueError
-            When the last axis is not of length 2.
+            If the last axis does not have length 2.
         """
         at = self.locate(points) if at is None else at
         places = np.asarray(points, dtype=np.float64)
@@ -198,7 +194,7 @@ class InverseMap(ReadOnly):
         if not lost.size:
             return at
         edges = boundary_edges(self.F, len(self.uv))
-        # Squares of lengths must not leave the numbers' range.
+        # Scaled, so that squared lengths stay within the range of doubles.
         size = np.abs(self.uv[edges]).max()
         row, share = _nearest_on(places.reshape(-1, 2)[lost] / size, *(self.uv[edges] / size).swapaxes(0, 1))
         triangle, barycentric = at.triangle.copy().ravel(), at.barycentric.copy().reshape(-1, 3)
@@ -210,7 +206,7 @@ class InverseMap(ReadOnly):
         return SurfacePoints(triangle.reshape(at.triangle.shape), barycentric.reshape(at.barycentric.shape))
 
     def _edge_triangles(self, edges: IntArray) -> tuple[IntArray, IntArray]:
-        """The triangle of each boundary edge, and the corner that the edge leaves."""
+        """The triangle of each boundary edge, and the corner at which the edge starts."""
         n = len(self.uv)
         keys = (self.F * n + self.F[:, (1, 2, 0)]).ravel()
         order = np.argsort(keys)
@@ -218,7 +214,7 @@ class InverseMap(ReadOnly):
         return found // 3, found % 3
 
     def vertices(self) -> SurfacePoints:
-        """The vertices of the surface, as points of it; none for a vertex of no triangle."""
+        """Return the vertices as points of the surface; triangle -1 for vertices without triangles."""
         triangle = np.full(len(self.V), -1, dtype=np.int64)
         barycentric = np.full((len(self.V), 3), np.nan)
         vertex, first = np.unique(self.F, return_index=True)
@@ -227,9 +223,9 @@ class InverseMap(ReadOnly):
         return SurfacePoints(triangle, barycentric)
 
     def plane(self, at: SurfacePoints) -> FloatArray:
-        """Where points of the surface lie in the plane: the map itself.
+        """Map points of the surface to the plane.
 
-        Rounding does not take a point beyond its triangle's box, so it stays on a side along an axis.
+        The result is clipped to the bounding box of each triangle, so points on a side along an axis stay on it.
 
         Parameters
         ----------
@@ -239,19 +235,19 @@ class InverseMap(ReadOnly):
         Returns
         -------
         (..., 2) float64
-            NaN where there is no triangle.
+            NaN if there is no triangle.
 
         Raises
         ------
         ValueError
-            When ``at`` names a triangle that is not there.
+            If ``at`` refers to a triangle out of range.
         """
         places = self.values(at, self.uv)
         corners = self.uv[self.F[np.asarray(at.triangle)]]
         return np.clip(places, corners.min(axis=-2), corners.max(axis=-2))
 
     def surface(self, at: SurfacePoints) -> FloatArray:
-        """Positions of points of the surface.
+        """Return the positions of points of the surface.
 
         Parameters
         ----------
@@ -261,19 +257,19 @@ class InverseMap(ReadOnly):
         Returns
         -------
         (..., 3) float64
-            In space, in the units of ``V``; (..., 2) where ``V`` is planar. NaN where there is no triangle.
+            In the units of ``V``; (..., 2) if ``V`` is planar. NaN if there is no triangle.
 
         Raises
         ------
         ValueError
-            When ``at`` names a triangle that is not there.
+            If ``at`` refers to a triangle out of range.
         """
         return self.values(at, self.V)
 
     def normals(self, at: SurfacePoints) -> FloatArray:
-        """Unit normals of the triangles, on the side from which they are counterclockwise.
+        """Return the unit normals of triangles, on the side on which they are counterclockwise.
 
-        For smooth normals, interpolate those of the vertices with `values`.
+        For smooth normals, interpolate vertex normals with `values`.
 
         Parameters
         ----------
@@ -283,36 +279,36 @@ class InverseMap(ReadOnly):
         Returns
         -------
         (..., 3) float64
-            NaN where there is no triangle.
+            NaN if there is no triangle.
 
         Raises
         ------
         ValueError
-            When the surface is planar.
+            If the surface is planar.
         """
         return self.values(at, self._normals, per="triangle")
 
     def values(self, at: SurfacePoints, values: ArrayLike, *, per: Per = "vertex") -> FloatArray:
-        """Values at points of the surface.
+        """Interpolate values at points of the surface.
 
         Parameters
         ----------
         at : SurfacePoints
         values : (n, ...), (f, 3, ...) or (f, ...) array
-            Values, of any shape, for every vertex, for the three corners of every triangle (so that they may jump
-            at edges), or for every triangle.
+            Values of any shape, for every vertex, every corner of every triangle, or every triangle. Values at corners
+            may be discontinuous across edges.
         per : {"vertex", "corner", "triangle"}
-            Which of those.
+            The elements that the values belong to.
 
         Returns
         -------
         (..., ...) float64
-            Interpolated linearly on each triangle, or the triangle's own; NaN where there is no point.
+            Interpolated linearly on each triangle, or the triangle's value. NaN if there is no point.
 
         Raises
         ------
         ValueError
-            When a shape does not fit, or ``at`` names a triangle that is not there.
+            If a shape does not match, or ``at`` refers to a triangle out of range.
         """
         check_choice("per", per, get_args(Per))
         given = np.asarray(values, dtype=np.float64)
@@ -349,9 +345,9 @@ class InverseMap(ReadOnly):
         Parameters
         ----------
         columns, rows : int
-            Points along u and v, at least 2 each.
+            Number of points along u and v, at least 2 each.
         box : (4,) float, optional
-            Least u and v, greatest u and v, the ends of the grid; by default those of the map's image.
+            Minimum u and v, then maximum u and v of the grid; the bounding box of the image by default.
 
         Returns
         -------
@@ -363,7 +359,7 @@ class InverseMap(ReadOnly):
         Raises
         ------
         ValueError
-            When there are fewer than 2 points along an axis.
+            If there are fewer than 2 points along an axis.
         """
         if columns < 2 or rows < 2:
             raise ValueError(f"a grid has at least 2 points along each axis, not {columns} by {rows}")
@@ -385,7 +381,7 @@ class InverseMap(ReadOnly):
 
 
 def _nearest_on(points: FloatArray, a: FloatArray, b: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Which of the segments from ``a`` to ``b`` (k, 2) is nearest to each point (m, 2), and how far along, 0 to 1."""
+    """The segment from ``a`` to ``b`` (k, 2) nearest to each point (m, 2), and the parameter 0 to 1 on it."""
     row, share = np.empty(len(points), dtype=np.int64), np.empty(len(points))
     side = b - a
     length = np.einsum("ki,ki->k", side, side)
@@ -401,7 +397,7 @@ def _nearest_on(points: FloatArray, a: FloatArray, b: FloatArray) -> tuple[IntAr
 
 
 def _check(certificate: Certificate, overlapping: bool) -> None:
-    """Refuse a map that has no inverse."""
+    """Raise ValueError if the map has no inverse."""
     if not certificate.injective:
         raise ValueError(f"this map has no inverse. {certificate.summary()}")
     if not (certificate.bijective or overlapping):

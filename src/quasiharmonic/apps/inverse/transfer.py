@@ -1,8 +1,7 @@
-"""From one surface to another by way of the plane.
+"""Maps between surfaces through the plane.
 
-Two surfaces with bijective maps φ and ψ onto the same region are mapped to each other by ψ⁻¹∘φ. As a composition of
-injective maps it is injective, and both verdicts are exact. Data can be carried over with it, between meshes that
-have nothing in common.
+If φ and ψ are bijective maps of two surfaces onto the same region, ψ⁻¹∘φ maps one surface to the other. A composition
+of injective maps is injective, and both maps are certified exactly. The map transfers data between unrelated meshes.
 """
 
 from __future__ import annotations
@@ -16,31 +15,31 @@ from quasiharmonic.apps.inverse.inverse import InverseMap, Per, SurfacePoints
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import FloatArray, check_choice
 
-#: What becomes of vertices without a partner.
+#: The value of vertices without a corresponding point.
 Outside = Literal["nan", "nearest"]
 
 
 class SurfaceMap:
-    """The map ψ⁻¹∘φ of one surface to another, through their maps φ and ψ into the plane.
+    """The map ψ⁻¹∘φ between two surfaces with maps φ and ψ into the plane.
 
     Parameters
     ----------
     source, target : InverseMap
-        The surfaces with φ and ψ; both maps bijective.
+        The surfaces with φ and ψ. Both maps must be bijective.
 
     Raises
     ------
     ValueError
-        When one of the maps is not bijective.
+        If one of the maps is not bijective.
 
     Attributes
     ----------
     source, target : InverseMap
     onto : bool
-        Whether the two maps' images are the same region, exactly: then every point of either surface has its
-        partner. Otherwise those have whose places are in both images. So it is for outlines with straight sides
-        along the axes, such as the unit square; along others, rounding and different boundary vertices leave a
-        margin.
+        Whether both images are exactly the same region. Then every point of either surface has a corresponding point.
+        Otherwise only points in the intersection of the images have one. Images with straight sides along the axes,
+        such as the unit square, can be the same. With other outlines, rounding and different boundary vertices leave
+        a margin.
 
     Examples
     --------
@@ -64,7 +63,7 @@ class SurfaceMap:
         self.onto = _outline(source) == _outline(target)
 
     def __call__(self, at: SurfacePoints) -> SurfacePoints:
-        """The target's points for points of the source.
+        """Map points of the source to points of the target.
 
         Parameters
         ----------
@@ -74,16 +73,16 @@ class SurfaceMap:
         Returns
         -------
         SurfacePoints
-            Points of the target; none where the source's point has no partner.
+            Points of the target; triangle -1 where there is no corresponding point.
         """
         return self.target.locate(self.source.plane(at))
 
     def inverse(self) -> SurfaceMap:
-        """The map φ⁻¹∘ψ from the target to the source."""
+        """Return the map φ⁻¹∘ψ from the target to the source."""
         return SurfaceMap(self.target, self.source)
 
     def transfer(self, values: ArrayLike, *, per: Per = "vertex", outside: Outside = "nan") -> FloatArray:
-        """Bring values from the target to the vertices of the source.
+        """Transfer values from the target to the vertices of the source.
 
         Parameters
         ----------
@@ -91,19 +90,19 @@ class SurfaceMap:
             Values on the target; see `InverseMap.values`.
         per : {"vertex", "corner", "triangle"}
         outside : {"nan", "nearest"}
-            What vertices without a partner get, as rounding and other boundary vertices leave some at the rim: NaN, or
-            the value at the point of the target's image that is nearest in the plane. Vertices of no triangle, whose
-            places are not finite, have none.
+            The value of vertices without a corresponding point: NaN, or the value at the nearest point of the target's
+            image in the plane. Rounding and different boundary vertices can leave such vertices at the boundary.
+            Vertices without a finite position always get NaN.
 
         Returns
         -------
         (n, ...) float64
-            The target's value at the partner of each of the source's vertices.
+            The target's value at the corresponding point of every vertex of the source.
 
         Raises
         ------
         ValueError
-            When the shape of the values does not fit, or an option has no such value.
+            If the shape of the values does not match, or an option is unknown.
         """
         check_choice("outside", outside, get_args(Outside))
         at = self.target.locate(self.source.uv)
@@ -113,15 +112,15 @@ class SurfaceMap:
 
 
 def _outline(mapped: InverseMap) -> set[tuple[tuple[float, float], ...]]:
-    """The corners of the image's boundary: equal for equal regions, and for no others.
+    """The corners of the image's boundary loops; equal for two maps if and only if the image regions are equal.
 
-    Loops that are simple and disjoint turn at a vertex exactly if it is a corner of the region.
+    Simple, disjoint loops turn at a vertex exactly if it is a corner of the region.
     """
     outline = set()
     for loop in mapped.certificate.loops:
         here = mapped.uv[loop]
         turns = orientation(np.roll(here, 1, axis=0), here, np.roll(here, -1, axis=0)) != 0
-        # Without the sign of zero, and from the least corner on.
+        # Remove the sign of zero, and start each loop at its smallest corner.
         corners = [(x + 0.0, y + 0.0) for x, y in here[turns].tolist()]
         first = corners.index(min(corners))
         outline.add((*corners[first:], *corners[:first]))

@@ -1,9 +1,9 @@
 """Maps as functions of JAX, with gradients.
 
-Arrays are in double precision (``mu`` in complex128), so ``jax.config.update("jax_enable_x64", True)`` comes first,
-and on the CPU. Every argument may have further axes in front, over which it is a batch; `jax.vmap` adds one as well.
-Under `jax.jit` the maps are made by calling back (`jax.pure_callback`). There are gradients, once (`jax.grad`,
-`jax.vjp`); JAX refuses `jax.jvp` of them.
+Arrays are in double precision (``mu`` in complex128) and on the CPU. First call
+``jax.config.update("jax_enable_x64", True)``. Every argument may have leading batch axes; `jax.vmap` adds one as well.
+Under `jax.jit` the maps are computed by a callback (`jax.pure_callback`). First derivatives are available in reverse
+mode (`jax.grad`, `jax.vjp`). JAX does not support `jax.jvp` of these functions.
 
 The package builds on `apps.gradients.layers`. Start reading here, then `callbacks`.
 """
@@ -43,31 +43,32 @@ def quasi_harmonic_map(
     reference: Reference = "equilateral",
     linear_solver: str = "auto",
 ) -> jax.Array:
-    """`quasiharmonic.quasi_harmonic_map` of arrays.
+    """Return quasi-harmonic maps of arrays, as `quasiharmonic.quasi_harmonic_map`.
 
     Parameters
     ----------
     problem : Problem
-        Triangles, which vertices are held, and what stands in for arguments that are left out.
+        Triangles, fixed vertices, and the values of omitted arguments.
     mu : (…, f) array of complex128, optional
-        Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ − i ∂/∂Im μ``, as JAX has it.
+        Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ − i ∂/∂Im μ``, JAX's convention.
     target : (…, k, 2) array of float64, optional
+        Target positions of the fixed vertices.
     rest : (…, n, 2) or (…, n, 3) array of float64, optional
-        It matters only with a ``reference`` other than ``"equilateral"``.
+        Rest positions. They matter only with a ``reference`` other than ``"equilateral"``.
     reference, linear_solver
-        As of `quasiharmonic.quasi_harmonic_map`.
+        As for `quasiharmonic.quasi_harmonic_map`.
 
     Returns
     -------
     (…, n, 2) array of float64
-        Injective only where the target is convex or μ is right.
+        Injective only if the target is convex or μ is suitable.
 
     Raises
     ------
     TypeError
-        When an argument is no array, or of another dtype.
+        If an argument is not an array, or has the wrong dtype.
     ValueError
-        When it is on another device, has another shape, or `quasiharmonic.quasi_harmonic_map` raises it.
+        If an argument is on another device or has the wrong shape, or `quasiharmonic.quasi_harmonic_map` raises it.
     """
     return applied(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
 
@@ -82,17 +83,19 @@ def injective_map(
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> jax.Array:
-    """Injective maps, polished and brought to rest to rounding: `quasiharmonic.solve` of arrays.
+    """Return polished injective maps of arrays, as `quasiharmonic.solve`, converged to rounding.
 
     Parameters
     ----------
     problem : Problem
-        Triangles, which vertices are held, and what stands in for arguments that are left out.
+        Triangles, fixed vertices, and the values of omitted arguments.
     target : (…, k, 2) array of float64, optional
+        Target positions of the fixed vertices.
     rest : (…, n, 2) or (…, n, 3) array of float64, optional
+        Rest positions.
     polish, slide, start, linear_solver
-        As of `quasiharmonic.solve`; ``start`` serves the whole batch. Where the boundary slides along curves that are
-        not straight gradients are good to half a percent as a rule, not to rounding (`polish_derivative`).
+        As for `quasiharmonic.solve`; ``start`` is shared by the whole batch. If the boundary slides along curves that
+        are not straight, gradients are typically accurate to 0.5 % (see `polish_derivative`).
 
     Returns
     -------
@@ -101,12 +104,12 @@ def injective_map(
     Raises
     ------
     TypeError
-        When an argument is no array, or of another dtype.
+        If an argument is not an array, or has the wrong dtype.
     ValueError
-        When it is on another device, has another shape, or `quasiharmonic.solve` raises it.
+        If an argument is on another device or has the wrong shape, or `quasiharmonic.solve` raises it.
     MapNotFound
-        When no injective map was found for one of the batch. Under `jax.jit` it comes as an error of JAX's own that
-        has this one's words.
+        If no injective map was found for one item of the batch. Under `jax.jit`, JAX raises its own error with this
+        message.
     """
     first = None if start is None else np.asarray(start, dtype=np.float64)
     return applied(PolishedLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
@@ -123,7 +126,7 @@ def flatten(
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> jax.Array:
-    """Maps with a free boundary, brought to rest to rounding: `quasiharmonic.flatten` of arrays.
+    """Return maps with a free boundary, as `quasiharmonic.flatten`, converged to rounding.
 
     Parameters
     ----------
@@ -132,27 +135,27 @@ def flatten(
     F : (f, 3) array of int
         Triangles.
     fixed : (k,) array of int, optional
-        Vertices held at ``target``.
+        Fixed vertices.
     target : (…, k, 2) array of float64, optional
-        Their positions.
+        Target positions of the fixed vertices.
     energy, weights, start, linear_solver
-        As of `quasiharmonic.flatten`; ``start`` serves the whole batch.
+        As for `quasiharmonic.flatten`; ``start`` is shared by the whole batch.
 
     Returns
     -------
     (…, n, 2) array of float64
-        Without ``fixed`` its gradient is that of the map which stays nearest to this one, wherever `flatten` would
-        lay it: let nothing depend on where it lies.
+        Without ``fixed``, the gradient is that of the map nearest to this one, although `flatten` would lay it out
+        differently. Use functions that do not depend on the map's position and rotation.
 
     Raises
     ------
     TypeError
-        When an argument is no array, or of another dtype.
+        If an argument is not an array, or has the wrong dtype.
     ValueError
-        When it is on another device, has another shape, or `quasiharmonic.flatten` raises it.
+        If an argument is on another device or has the wrong shape, or `quasiharmonic.flatten` raises it.
     MapNotFound
-        When no injective map was found for one of the batch. Under `jax.jit` it comes as an error of JAX's own that
-        has this one's words.
+        If no injective map was found for one item of the batch. Under `jax.jit`, JAX raises its own error with this
+        message.
     """
     layer = FlattenLayer.of(rest, F, fixed, target, energy=energy, weights=weights, start=start, solver=linear_solver)
     return applied(layer, {"rest": rest, "target": target})

@@ -1,4 +1,4 @@
-"""One function of JAX with a gradient of its own for all maps, made by calling back to NumPy."""
+"""The JAX function, with a custom gradient, that all maps share; it computes them by callbacks to NumPy."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.gradients.layers import Array, Layer, back, expected, forth
 from quasiharmonic.util.arrays import FloatArray
 
-# JAX keeps nothing but arrays from one way to the other. The last derivatives are kept here, so many of them; those of
-# others are made again, from maps that are found already.
+# JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
+# computed again from their maps.
 _KEPT = 16
 _lock = Lock()
 _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
 
 def applied(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
-    """The maps of a layer's arguments, those that are given.
+    """Return the maps of a layer for its arguments; arguments that are None are omitted.
 
     Raises
     ------
     TypeError, ValueError
-        When one is no array, or of another dtype, device or shape.
+        If an argument is not an array, or has the wrong dtype, device or shape.
     """
     given = {name: array for name, array in arguments.items() if array is not None}
     for name, array in given.items():
         _check(name, array, layer.shapes[name])
-    # All with as many axes in front, so that one that `jax.vmap` adds is the first of each.
+    # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
     axes = {name: np.ndim(array) - len(layer.shapes[name]) for name, array in given.items()}
     most = max(axes.values(), default=0)
     arrays = (jnp.expand_dims(array, tuple(range(most - axes[name]))) for name, array in given.items())
@@ -46,7 +46,7 @@ def applied(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
 
 @dataclass(frozen=True)
 class _Call:
-    """A function of a layer's; equal to another of the same, so that JAX compiles and keeps one program for both."""
+    """A function of a layer; equal calls compare equal, so that JAX compiles one program for them."""
 
     function: Callable[..., Any]
     layer: Layer
@@ -89,7 +89,7 @@ def _lead(layer: Layer, names: tuple[str, ...], arrays: tuple[jax.Array, ...]) -
 
 
 def _found(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
-    """The maps, their derivatives kept."""
+    """Compute the maps, and cache their derivatives."""
     given = _given(names, arrays)
     uv, derivatives = forth(layer, given)
     with _lock:
@@ -101,7 +101,7 @@ def _found(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
 
 
 def _pulled(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *arrays: Any) -> list[Array]:
-    """The gradients by all arguments, over the whole batch."""
+    """The gradients with respect to all arguments, for the whole batch."""
     given, uv, cotangent = _given(names, arrays), np.asarray(uv), np.asarray(cotangent)
     lead = np.broadcast_shapes(uv.shape[:-2], cotangent.shape[:-2])
     uv, cotangent = (np.broadcast_to(array, (*lead, *layer.places)) for array in (uv, cotangent))
@@ -112,7 +112,7 @@ def _pulled(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *arra
             derivative = _recent.get(_key(layer, own, uv[item]))
         derivatives.append(derivative or layer.derivative(own, uv[item]))
     found = back(layer, derivatives, cotangent, names)
-    # JAX has ∂/∂Re − i ∂/∂Im.
+    # JAX's convention is ∂/∂Re − i ∂/∂Im.
     return [found[name].conj() for name in names]
 
 
@@ -121,7 +121,7 @@ def _given(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
 
 
 def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer, bytes]:
-    """What a derivative is found by: all that it was made of."""
+    """The cache key of a derivative: its layer and a digest of its arrays."""
     digest = hashlib.blake2b(np.ascontiguousarray(uv).tobytes())
     for array in own.values():
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -129,7 +129,7 @@ def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer,
 
 
 def _summed(gradient: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """A gradient with a batch's axes, summed over those that the argument has not, or has but one of."""
+    """A gradient with batch axes, summed over the axes that the argument lacks or has with length 1."""
     gradient = gradient.sum(axis=tuple(range(gradient.ndim - len(shape))))
     short = tuple(i for i, size in enumerate(shape) if size == 1 and gradient.shape[i] != 1)
     return gradient.sum(axis=short, keepdims=True) if short else gradient

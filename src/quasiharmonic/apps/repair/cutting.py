@@ -1,4 +1,4 @@
-"""Closed surfaces, and surfaces with handles, cut open until they fit into the plane."""
+"""Cut closed surfaces and surfaces with handles open, so that they fit into the plane."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vert
 
 
 class CutMesh(NamedTuple):
-    """A surface that was cut open.
+    """A surface after cutting.
 
     Attributes
     ----------
     V : (n + c, d) float64
         Vertices: the old ones first, then copies of those along the cuts.
     F : (f, 3) int64
-        The same triangles in the same order; those on one side of a cut refer to the copies.
+        The same triangles in the same order. Triangles on one side of a cut refer to the copies.
     origin : (n + c,) int64
-        The old vertex that each one is or is a copy of.
+        The old index of each vertex or copy.
     """
 
     V: FloatArray
@@ -33,19 +33,19 @@ class CutMesh(NamedTuple):
 
 @accepts_mesh
 def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, min_gain: float = np.inf) -> CutMesh:
-    """Cut a surface along edges into a disk, which has one boundary loop and fits into any outline without holes.
+    """Cut a surface along edges into disks, each with one boundary loop.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
         Vertices.
     F : (f, 3) array of int
-        Triangles of any number of surfaces, each of which becomes a disk. One that is a disk stays as it is.
+        Triangles of any number of surfaces. Each becomes a disk, and disks are left unchanged by default.
     edges : (k, 2) array of int, optional
-        Edges to be cut in any case.
+        Edges that are always cut.
     min_gain : float
-        What cuts must be worth beyond those that make a disk, as `quasiharmonic.find_cuts` has it: 0.1
-        for surfaces that are to lie flat with little distortion. By default there are no others.
+        Minimum gain of additional cuts, as in `quasiharmonic.find_cuts`; 0.1 for surfaces that should flatten with low
+        distortion. By default there are no additional cuts.
 
     Returns
     -------

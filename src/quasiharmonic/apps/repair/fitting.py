@@ -1,4 +1,4 @@
-"""A surface made ready for a map: its boundary where it is, or laid along an outline."""
+"""Set up the problem of mapping a surface, with its boundary fixed in place or laid along an outline."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from quasiharmonic.targets.outlines.contours import in_unit
 from quasiharmonic.targets.outlines.nesting import filled
 from quasiharmonic.util.arrays import FloatArray, IntArray, named
 
-# Outlines of several islands stand so far apart, as a share of their width.
+# Distance between the outlines of several islands, relative to their width.
 _GAP = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The problem of mapping a surface.
+    """The mapping problem of a surface.
 
     Attributes
     ----------
     problem : Problem
     held : list of int
-        Boundary vertices whose place somebody has chosen, or which were found for the outline's corners.
+        Boundary vertices whose positions the caller chose, or that were assigned to the outline's corners.
     filled : int
-        Holes of the outline that the surface does not have.
+        Number of holes of the outline that were filled because the surface has no holes.
     """
 
     problem: Problem
@@ -44,15 +44,15 @@ class Fitted:
 def held_in_place(
     island: Island, fixed: NDArray[np.integer] | None = None, *, reference: Reference | None = None
 ) -> Fitted:
-    """Hold an island's boundary, or other vertices, where its map has them.
+    """Fix an island's boundary, or other vertices, at their current positions.
 
     Parameters
     ----------
     island : Island
     fixed : (k,) int, optional
-        Vertices of the mesh that the island is a part of; its boundary by default.
+        Vertices of the mesh that contains the island; the island's boundary by default.
     reference : {"equilateral", "rest", "corrected"}, optional
-        As `Problem` takes it.
+        As for `Problem`.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def held_in_place(
     Raises
     ------
     ValueError
-        As `Problem`; when there is nothing to hold, or it has no place.
+        As `Problem`. If there is no boundary to fix, or a fixed vertex has no position.
     """
     if fixed is None:
         own = np.unique(boundary_edges(island.F, len(island.vertices)))
@@ -86,7 +86,7 @@ def laid_along(
     reference: Reference | None = None,
     beside: int = 0,
 ) -> Fitted:
-    """Lay a surface's boundary along an outline, whose holes are filled for a surface that has none.
+    """Lay a surface's boundary along an outline; the outline's holes are filled if the surface has none.
 
     Parameters
     ----------
@@ -95,11 +95,11 @@ def laid_along(
     contours : sequence of (k, 2) float64
     corners : AskedCorners, optional
     corner_angle : float
-        Both as `boundary_to` takes them.
+        As for `boundary_to`.
     reference : {"equilateral", "rest", "corrected"}, optional
-        As `Problem` takes it.
+        As for `Problem`.
     beside : int
-        Which copy of the outline, from the left: several islands have one each, side by side.
+        Index of the outline's copy, from the left; each of several islands has its own.
 
     Returns
     -------
@@ -108,7 +108,7 @@ def laid_along(
     Raises
     ------
     ValueError
-        As `boundary_to` and `Problem`; when corners are none of the boundary.
+        As `boundary_to` and `Problem`. If a corner is not on the boundary.
     """
     if beside:
         right = beside * (1 + _GAP) * float(np.ptp(np.concatenate(contours)[:, 0]))
@@ -118,7 +118,7 @@ def laid_along(
     try:
         fills = holes > 0 and len(boundary_loops(F, len(V))) == 1
     except ValueError:
-        # What has no loops is no surface; below it is said why.
+        # A mesh without boundary loops is not a valid surface; the error is raised below.
         fills = False
     chosen = None if corners is None else corners.on(V, F)
     onto = whole if fills else list(contours)
@@ -129,17 +129,17 @@ def laid_along(
 
 
 def at_corners(fixed: IntArray, target: FloatArray, contours: Sequence[FloatArray], angle: float = 20.0) -> list[int]:
-    """Find the boundary vertices that lie at the corners of an outline, in the order of these.
+    """Find the boundary vertices at the corners of an outline, in the order of the corners.
 
     Parameters
     ----------
     fixed : (b,) int64
     target : (b, 2) float64
-        As `boundary_to` gives them.
+        Results of `boundary_to`.
     contours : sequence of (k, 2) float64
-        What they were laid along.
+        The outline that they were laid along.
     angle : float
-        Degrees by which the outline turns at a corner, at the least.
+        Minimum turning angle of a corner, in degrees.
     """
     sharp = [corners_of(unit, angle) for unit in in_unit(list(contours))[0]]
     goals = np.concatenate([contour[marks] for contour, marks in zip(contours, sharp, strict=True)])

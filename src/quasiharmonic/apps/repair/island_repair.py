@@ -1,12 +1,12 @@
 """Repair of one island, patch by patch.
 
-    inverted triangles ──▶ vertices within some rings of them are free ──▶ a map of each patch, its boundary held ─┐
-            ▲                                                                                                      │
-            └──────────────────────── more rings ◀────────── left as it was ◀──── none found ◀─────────────────────┤
-                         the others polished ◀── vertices put back where they were ◀── found ◀─────────────────────┘
+    inverted triangles ──▶ free vertices within some rings of them ──▶ a map of each patch with fixed boundary ─┐
+            ▲                                                                                                   │
+            └────────────────── more rings ◀────────── unchanged ◀──────── no map found ◀───────────────────────┤
+                  other vertices polished ◀── vertices returned to old positions ◀── found ◀────────────────────┘
 
-A patch either comes out with all its triangles positive or is left as it was, so a repair makes no map worse. The last
-patch of all is the whole island.
+Each patch either becomes positive on all its triangles or stays unchanged, so a repair never makes a map worse. The
+last patch is the whole island.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, named, named_edges
 
-# Rings of vertices around inverted triangles that may move, tried in turn ...
+# Rings of vertices around inverted triangles that are free, tried in turn,
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32
-# ... while at most this part of the island's interior may; and iterations on a patch that is not the whole island.
+# while they are at most this fraction of the island's interior. Iterations on a patch other than the whole island.
 _MOST, _ITERATIONS = 0.5, 100
 
 
 class IslandRepair:
-    """An island on its way.
+    """The repair of one island.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class IslandRepair:
         The mesh's vertices.
     island : Island
     max_iterations : int
-        Linear solves to spend at most on the whole island.
+        Maximum number of linear solves on the whole island.
     linear_solver : str
     callback : callable, optional
         Called with a `Step` at every iteration.
@@ -53,11 +53,11 @@ class IslandRepair:
     Attributes
     ----------
     uv : (m, 2) float64
-        Where the island's vertices are by now.
+        Current positions of the island's vertices.
     reason : str
-        Why triangles are still inverted, once that is known.
+        Why triangles are still inverted; empty before this is known.
     diagnosis : Diagnosis or None
-        What forbids a map, by the mesh's own numbers.
+        The obstruction to a map, in the mesh's numbering.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class IslandRepair:
         self._max_iterations = max_iterations
         self._linear_solver = linear_solver
         self._callback = callback
-        # The more inverted triangles a vertex has, the more likely it is the one that is out of place.
+        # Vertices with more inverted triangles are more likely to be misplaced, and return to their positions last.
         suspicion = np.bincount(self._F[self.inverted].ravel(), minlength=len(self.uv))
         self._innocence = np.argsort(np.argsort(-suspicion, kind="stable"))
 
@@ -90,11 +90,11 @@ class IslandRepair:
 
     @property
     def moved_mask(self) -> BoolArray:
-        """Which of the island's vertices are no longer where they were; (m,) bool."""
+        """Which of the island's vertices have moved; (m,) bool."""
         return np.asarray((self.uv != self.island.uv).any(axis=1) & ~(np.isnan(self.uv).any(axis=1)))
 
     def run(self, whole: bool) -> None:
-        """Repair what can be, by patches first unless the ``whole`` island may change."""
+        """Repair the island: first by patches, unless ``whole``, then as a whole."""
         tried: set[bytes] = set()
         for rings in () if whole else _RINGS:
             free = self._around(self._repairable(), rings)
@@ -112,12 +112,12 @@ class IslandRepair:
             self._explain()
 
     def _repairable(self) -> IntArray:
-        """Inverted triangles that have a vertex to move."""
+        """Inverted triangles that have a free vertex."""
         left = self.inverted
         return left[~self._held[self._F[left]].all(axis=1)]
 
     def _around(self, triangles: IntArray, rings: int) -> BoolArray:
-        """Interior vertices within some rings of triangles; their own are the first."""
+        """Interior vertices within a number of rings of triangles; the triangles' own vertices are the first ring."""
         near: BoolArray = np.zeros(len(self.uv), dtype=np.bool_)
         near[self._F[triangles]] = True
         for _ in range(rings - 1):
@@ -125,25 +125,25 @@ class IslandRepair:
         return near & ~self._held
 
     def _components(self, free: BoolArray) -> Iterator[BoolArray]:
-        """Take free vertices apart into those that no edge joins."""
+        """Split free vertices into the sets that edges connect."""
         among = free[self._F]
         touched = among.any(axis=1)
-        # Vertices that are not free make way for one that is, so that triangles join free vertices only.
+        # In every triangle, fixed vertices are replaced by a free one, so that triangles join free vertices only.
         one = np.take_along_axis(self._F, among.argmax(axis=1)[:, None], axis=1)
         label = components(np.where(among, self._F, one)[touched], len(free))
         for first in np.unique(label[free]):
             yield free & (label == first)
 
     def _patch(self, free: BoolArray) -> tuple[Problem, IntArray, IntArray]:
-        """The patch of triangles that touch free vertices, the others held.
+        """The patch of triangles that touch free vertices; its other vertices are fixed.
 
-        Where its boundary passes through a vertex repeatedly, the vertex is there repeatedly.
+        If its boundary passes through a vertex several times, the patch has several copies of the vertex.
 
         Returns
         -------
         problem : Problem
         vertices, triangles : (m,), (k,) int64
-            Which of the island its own are.
+            The island's indices of the patch's vertices and triangles.
         """
         triangles = np.flatnonzero(free[self._F].any(axis=1))
         F, first = renumbered(fans(self._F[triangles])[0], self._F[triangles])
@@ -153,16 +153,16 @@ class IslandRepair:
         return problem, vertices, triangles
 
     def _attempt(self, free: BoolArray, iterations: int, *, keep: bool) -> None:
-        """Map a patch anew; where that fails, nothing changes.
+        """Map a patch again; if this fails, nothing changes.
 
-        With ``keep``, vertices return to where they were as far as that inverts nothing.
+        With ``keep``, vertices return to their old positions if this inverts no triangle.
         """
         try:
             problem, vertices, triangles = self._patch(free)
         except ValueError as error:
             self.reason = str(error)
             return
-        # Tutte's embedding does for most patches; where it does not, what forbids a map is known next.
+        # Tutte's embedding suffices for most patches. If it fails, the diagnosis shows whether a map can exist.
         for allowed in (1, iterations):
             result = solve(problem, max_iterations=allowed, linear_solver=self._linear_solver, callback=self._callback)
             if _uninterrupted(result).injective:
@@ -175,7 +175,7 @@ class IslandRepair:
                     return
 
     def _take(self, free: BoolArray, vertices: IntArray, uv: FloatArray, keep: bool) -> None:
-        """Accept a patch's map."""
+        """Use a patch's map; undo it if triangles wind several times around a vertex."""
         before = self.uv.copy()
         self.uv[vertices] = uv
         self._polish(self._put_back(free) if keep else free)
@@ -184,7 +184,7 @@ class IslandRepair:
             self.reason = "The maps found of a part of the island wind more than once around one of its vertices."
 
     def _put_back(self, moved: BoolArray) -> BoolArray:
-        """Return vertices to where they were; those that could not be."""
+        """Return vertices to their old positions where possible; return the mask of those that stay moved."""
         moved, start = moved.copy(), self.island.uv
         F = self._F[moved[self._F].any(axis=1)]
         able = np.asarray(np.isfinite(start).all(axis=1))
@@ -194,7 +194,7 @@ class IslandRepair:
                 rows = F[moved[F[:, i]] & able[F[:, i]]]
                 a, b, c = start[rows[:, i]], self.uv[rows[:, i - 2]], self.uv[rows[:, i - 1]]
                 back[rows[orientation(a, b, c) <= 0, i]] = False
-            # Each may, but not two of a triangle at once: the first in line.
+            # Two vertices of a triangle must not return at once; take the one that is least likely to be misplaced.
             turn = np.where(back, self._innocence, -1)
             first = turn[F].max(axis=1)
             for i in range(3):
@@ -205,7 +205,7 @@ class IslandRepair:
             moved &= ~back
 
     def _polish(self, free: BoolArray) -> None:
-        """Lower the distortion of free vertices' triangles, as far as their rest shapes are any."""
+        """Lower the distortion of free vertices' triangles, for patches without degenerate rest triangles."""
         for part in self._components(free):
             problem, vertices, _ = self._patch(part)
             if not rest_shapes(problem.V, problem.F).flat.size:
@@ -215,9 +215,9 @@ class IslandRepair:
                 self.uv[vertices] = _uninterrupted(polished).uv
 
     def _overwound(self, free: BoolArray) -> bool:
-        """Whether triangles wind more than once around an interior vertex of the patch, as positive ones can.
+        """Whether triangles wind more than once around an interior vertex of the patch; positive triangles can do so.
 
-        At boundary vertices the boundary, which stays, may leave no choice.
+        Boundary vertices are not checked, because the fixed boundary may force this.
         """
         patch = np.zeros(len(self.uv), dtype=np.bool_)
         patch[self._F[free[self._F].any(axis=1)]] = True
@@ -227,7 +227,7 @@ class IslandRepair:
         return bool(found.multiply_wound.size and np.setdiff1d(found.multiply_wound, np.concatenate(found.loops)).size)
 
     def _explain(self) -> None:
-        """Say why there still are inverted triangles, as far as no attempt has said it."""
+        """Set the reason for remaining inverted triangles, unless an attempt already has."""
         island, left = self.island, self.inverted
         nowhere = np.flatnonzero(self._held & ~np.isfinite(self.uv).all(axis=1))
         corners = island.vertices[self._F]
@@ -237,13 +237,13 @@ class IslandRepair:
         elif twice.size:
             self.reason = f"A vertex is used twice in {named('triangle', 'triangles', island.triangles[twice])}."
         elif self._held[self._F[left]].all(axis=1).any():
-            # Triangles that the boundary alone inverts are part of no patch.
+            # Triangles with three boundary vertices belong to no patch.
             boundary = np.flatnonzero(self._held)
             problem = Problem(self._V, self._F, boundary, self.uv[boundary], reference="equilateral")
             self._blame(diagnose(problem), np.arange(len(self.uv)), np.arange(len(self._F)))
 
     def _blame(self, found: Diagnosis, vertices: IntArray, triangles: IntArray) -> None:
-        """Keep a patch's diagnosis, by the mesh's numbers."""
+        """Store a patch's diagnosis in the mesh's numbering."""
         vertices, triangles = self.island.vertices[vertices], self.island.triangles[triangles]
         self.diagnosis = replace(
             found, obstructions=tuple(_renamed(o, vertices, triangles) for o in found.obstructions)
@@ -253,14 +253,14 @@ class IslandRepair:
 
 
 def _uninterrupted(result: MapResult) -> MapResult:
-    """A result, unless Ctrl-C has ended the search: that is meant for the whole repair."""
+    """Return the result; if Ctrl-C ended the search, raise KeyboardInterrupt to end the whole repair."""
     if result.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return result
 
 
 def _renamed(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
-    """An obstruction by other numbers of vertices and triangles; its message then names the elements anew."""
+    """Renumber the elements of an obstruction; its message then names the new numbers."""
     there = replace(
         found,
         vertices=vertices[found.vertices],

@@ -1,6 +1,6 @@
-"""Repair of a map with inverted triangles: its boundary stays, and as much of its interior as can.
+"""Repair a map with inverted triangles: keep its boundary and as much of its interior as possible.
 
-A map comes apart into islands at its seams, and each is repaired on its own (`IslandRepair`).
+Seams split a map into islands. `IslandRepair` repairs each island separately.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from quasiharmonic.util.progress import reports_progress
 
 @dataclass(frozen=True, eq=False)
 class RepairedIsland:
-    """What became of an island; numbers are the mesh's, from 0.
+    """The repair report of one island; indices are the mesh's, from 0.
 
     Attributes
     ----------
     triangles : (k,) int64
-        Its triangles, ascending.
+        Triangles of the island, ascending.
     inverted_before, inverted : (a,), (b,) int64
-        Those that were not strictly positive, and those that are still not.
+        Triangles that were not strictly positive before the repair, and those that still are not.
     moved_vertices : (c,) int64
-        Vertices that are in another place than before.
+        Vertices whose position changed.
     mirrored : bool
-        Whether every triangle was strictly negative, as in an island that was turned over on purpose, one of several.
-        It then was left, unless asked for, and is judged as the other side shows it.
+        Whether every triangle was strictly negative. In a map of several islands this is often intended. The island
+        is left unchanged unless ``unmirror`` is set, and is certified as its reflection.
     bijective : bool
-        Whether the island, as it now is, covers no place twice. What its boundary overlaps stays so.
+        Whether the repaired island is bijective. Overlaps of its fixed boundary remain.
     reason : str
-        Why triangles are still inverted; empty where none is.
+        Why triangles are still inverted; empty if there are none.
     diagnosis : Diagnosis or None
-        What forbids a map with this boundary, examined where triangles are still inverted.
+        The obstruction to a map with this boundary, computed if triangles are still inverted.
     """
 
     triangles: IntArray
@@ -61,7 +61,7 @@ class RepairedIsland:
         return not self.inverted.size
 
     def summary(self) -> str:
-        """Say in a sentence what was done."""
+        """Describe the repair in one line."""
         where = which_island(self.triangles)
         overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
         if self.mirrored:
@@ -77,7 +77,7 @@ class RepairedIsland:
         return f"{where}: {done}{overlap}{left}"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; of the triangles, the first and how many there are."""
+        """The report for JSON, with the first triangle and the number of triangles."""
         return {
             "first_triangle": int(self.triangles[0]),
             "triangles": len(self.triangles),
@@ -94,17 +94,17 @@ class RepairedIsland:
 
 @dataclass(frozen=True, eq=False)
 class RepairResult:
-    """A repaired map.
+    """A repaired map with a report for every island.
 
     Attributes
     ----------
     uv : (m, 2) float64
-        Places. Those that no vertex moved from are as they were, to the last bit.
+        Vertex positions. Positions of vertices that did not move are bitwise unchanged.
     FT : (f, 3) int64
-        For every corner the row of ``uv`` it is at: as given, unless a vertex moved from a row that others use.
-        Then it has a new row at the end.
+        For every corner its row of ``uv``. If a moved vertex shared its row with other vertices, it has a new row at
+        the end.
     islands : tuple of RepairedIsland
-        By their first triangle.
+        Reports, in the order of each island's first triangle.
     """
 
     uv: FloatArray
@@ -113,18 +113,18 @@ class RepairResult:
 
     @property
     def injective(self) -> bool:
-        """Whether every triangle that has a place is strictly positive, and there is one."""
+        """Whether there is an island, and every triangle of every island is strictly positive."""
         return bool(self.islands) and all(island.injective for island in self.islands)
 
     @property
     def moved_vertices(self) -> IntArray:
-        """Vertices of the mesh that are in another place than before, ascending."""
+        """Vertices of the mesh whose position changed, ascending."""
         return np.unique(
             np.concatenate([np.empty(0, dtype=np.int64), *(island.moved_vertices for island in self.islands)])
         )
 
     def summary(self) -> str:
-        """What was done, in all and for each island that needed it."""
+        """Describe the repair, in total and for every island that needed it."""
         before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
         lines = [
             f"{counted('island', 'islands', len(self.islands))}: "
@@ -134,7 +134,7 @@ class RepairResult:
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: everything but the map itself."""
+        """The report for JSON, without the map."""
         return {
             "injective": self.injective,
             "inverted_before": sum(len(island.inverted_before) for island in self.islands),
@@ -158,11 +158,11 @@ def repair(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> RepairResult:
-    """Right the inverted triangles of a map; the boundary stays, and as much of the interior as can.
+    """Repair the inverted triangles of a map, keeping its boundary and as much of its interior as possible.
 
-    Around inverted triangles, patches of growing size are mapped anew with their boundary held. Of a patch that
-    comes out with all triangles positive, vertices return to where they were as far as that inverts nothing, and the
-    others go where the distortion (symmetric Dirichlet) is least. What a patch cannot do the whole island may.
+    Patches of growing size around inverted triangles are mapped again with their boundaries fixed. In a successful
+    patch, vertices return to their old positions where this inverts no triangle. The other vertices minimise the
+    symmetric Dirichlet energy. If a patch fails, the whole island is mapped again.
 
     Parameters
     ----------
@@ -171,34 +171,33 @@ def repair(
     F : (f, 3) array of int
         Triangles.
     uv : (m, 2) array
-        The map: places. Interior vertices may be anywhere, even at NaN.
+        Vertex positions of the map. Interior vertices may have any position, even NaN.
     FT : (f, 3) array of int, optional
-        For a map with seams, the row of ``uv`` that each corner is at; a triangle with a corner at -1 has no place
-        and is left alone. By default ``F``. See `quasiharmonic.geometry.mesh.seams.SeamedMesh` for what counts as a
-        seam.
+        For a map with seams, the row of ``uv`` of each corner; ``F`` by default. Triangles with a corner of -1 have no
+        position and are left unchanged. `quasiharmonic.geometry.mesh.seams.SeamedMesh` defines seams.
     whole : bool
-        Map every island that has inverted triangles anew as a whole, and polish it.
+        Map every island that has inverted triangles again as a whole, and polish it.
     unmirror : bool
-        Turn islands over that are mirrored, each in its place. Otherwise they are left as they are: of several islands
-        some often are, on purpose, to use a picture twice.
+        Reflect mirrored islands in place. By default they are left unchanged, because islands are often mirrored on
+        purpose to use an image twice.
     max_iterations : int
-        Linear solves to spend at most on an island as a whole.
+        Maximum number of linear solves when an island is mapped as a whole.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
-        not within a single factorisation.
+        Called with a `Step` at every iteration. Between iterations it is called again with the last `Step` at least
+        every half second, except during a factorisation.
 
     Returns
     -------
     RepairResult
-        With the map and, island by island, what changed, certified exactly; and why, where triangles are still
-        inverted: that is no exception.
+        The map and, for every island, the changes and the certified result. If triangles are still inverted, it
+        reports the reason and raises no exception.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape or dtype, or indices that refer to nothing.
+        If an array has the wrong shape or dtype, or indices are out of range.
     KeyboardInterrupt
         By Ctrl-C.
 
@@ -250,7 +249,7 @@ def repair(
 
 
 def _mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
-    """A mirrored island, turned over within its box if asked for."""
+    """Report a mirrored island, reflected within its bounding box if ``turn``."""
     uv = island.uv.copy()
     if turn:
         uv[:, 0] = uv[:, 0].min() + uv[:, 0].max() - uv[:, 0]

@@ -1,8 +1,8 @@
 """Maps as layers of PyTorch, with gradients.
 
-Tensors are in double precision (``mu`` in complex128) and on the CPU. Every argument may have further axes in front,
-over which it is a batch. There are gradients, once, by backward and by forward mode. Under `torch.compile` a map is a
-break in the graph: what is around it is compiled. Transforms of `torch.func` are refused.
+Tensors are in double precision (``mu`` in complex128) and on the CPU. Every argument may have leading batch axes. First
+derivatives are available in backward and forward mode. `torch.compile` breaks the graph at a map, and compiles the code
+around it. Transforms of `torch.func` are not supported and raise an error.
 
 The package builds on `apps.gradients.layers`. Start reading here, then `function`.
 """
@@ -42,31 +42,32 @@ def quasi_harmonic_map(
     reference: Reference = "equilateral",
     linear_solver: str = "auto",
 ) -> torch.Tensor:
-    """`quasiharmonic.quasi_harmonic_map` of tensors.
+    """Return quasi-harmonic maps of tensors, as `quasiharmonic.quasi_harmonic_map`.
 
     Parameters
     ----------
     problem : Problem
-        Triangles, which vertices are held, and what stands in for arguments that are left out.
+        Triangles, fixed vertices, and the values of omitted arguments.
     mu : (…, f) tensor of complex128, optional
-        Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ + i ∂/∂Im μ``, as PyTorch has it.
+        Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ + i ∂/∂Im μ``, PyTorch's convention.
     target : (…, k, 2) tensor of float64, optional
+        Target positions of the fixed vertices.
     rest : (…, n, 2) or (…, n, 3) tensor of float64, optional
-        It matters only with a ``reference`` other than ``"equilateral"``.
+        Rest positions. They matter only with a ``reference`` other than ``"equilateral"``.
     reference, linear_solver
-        As of `quasiharmonic.quasi_harmonic_map`.
+        As for `quasiharmonic.quasi_harmonic_map`.
 
     Returns
     -------
     (…, n, 2) tensor of float64
-        Injective only where the target is convex or μ is right.
+        Injective only if the target is convex or μ is suitable.
 
     Raises
     ------
     TypeError
-        When an argument is no tensor, or of another dtype.
+        If an argument is not a tensor, or has the wrong dtype.
     ValueError
-        When it is on another device, has another shape, or `quasiharmonic.quasi_harmonic_map` raises it.
+        If an argument is on another device or has the wrong shape, or `quasiharmonic.quasi_harmonic_map` raises it.
     """
     return applied(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
 
@@ -81,17 +82,19 @@ def injective_map(
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> torch.Tensor:
-    """Injective maps, polished and brought to rest to rounding: `quasiharmonic.solve` of tensors.
+    """Return polished injective maps of tensors, as `quasiharmonic.solve`, converged to rounding.
 
     Parameters
     ----------
     problem : Problem
-        Triangles, which vertices are held, and what stands in for arguments that are left out.
+        Triangles, fixed vertices, and the values of omitted arguments.
     target : (…, k, 2) tensor of float64, optional
+        Target positions of the fixed vertices.
     rest : (…, n, 2) or (…, n, 3) tensor of float64, optional
+        Rest positions.
     polish, slide, start, linear_solver
-        As of `quasiharmonic.solve`; ``start`` serves the whole batch. Where the boundary slides along curves that are
-        not straight gradients are good to half a percent as a rule, not to rounding (`polish_derivative`).
+        As for `quasiharmonic.solve`; ``start`` is shared by the whole batch. If the boundary slides along curves that
+        are not straight, gradients are typically accurate to 0.5 % (see `polish_derivative`).
 
     Returns
     -------
@@ -100,11 +103,11 @@ def injective_map(
     Raises
     ------
     TypeError
-        When an argument is no tensor, or of another dtype.
+        If an argument is not a tensor, or has the wrong dtype.
     ValueError
-        When it is on another device, has another shape, or `quasiharmonic.solve` raises it.
+        If an argument is on another device or has the wrong shape, or `quasiharmonic.solve` raises it.
     MapNotFound
-        When no injective map was found for one of the batch.
+        If no injective map was found for one item of the batch.
     """
     first = None if start is None else np.asarray(start, dtype=np.float64)
     return applied(PolishedLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
@@ -121,7 +124,7 @@ def flatten(
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> torch.Tensor:
-    """Maps with a free boundary, brought to rest to rounding: `quasiharmonic.flatten` of tensors.
+    """Return maps with a free boundary, as `quasiharmonic.flatten`, converged to rounding.
 
     Parameters
     ----------
@@ -130,26 +133,26 @@ def flatten(
     F : (f, 3) array of int
         Triangles.
     fixed : (k,) array of int, optional
-        Vertices held at ``target``.
+        Fixed vertices.
     target : (…, k, 2) tensor of float64, optional
-        Their positions.
+        Target positions of the fixed vertices.
     energy, weights, start, linear_solver
-        As of `quasiharmonic.flatten`; ``start`` serves the whole batch.
+        As for `quasiharmonic.flatten`; ``start`` is shared by the whole batch.
 
     Returns
     -------
     (…, n, 2) tensor of float64
-        Without ``fixed`` its gradient is that of the map which stays nearest to this one, wherever `flatten` would
-        lay it: let nothing depend on where it lies.
+        Without ``fixed``, the gradient is that of the map nearest to this one, although `flatten` would lay it out
+        differently. Use functions that do not depend on the map's position and rotation.
 
     Raises
     ------
     TypeError
-        When an argument is no tensor, or of another dtype.
+        If an argument is not a tensor, or has the wrong dtype.
     ValueError
-        When it is on another device, has another shape, or `quasiharmonic.flatten` raises it.
+        If an argument is on another device or has the wrong shape, or `quasiharmonic.flatten` raises it.
     MapNotFound
-        When no injective map was found for one of the batch.
+        If no injective map was found for one item of the batch.
     """
     layer = FlattenLayer.of(rest, F, fixed, target, energy=energy, weights=weights, start=start, solver=linear_solver)
     return applied(layer, {"rest": rest, "target": target})

@@ -1,4 +1,4 @@
-"""One function of PyTorch's autograd for all maps."""
+"""The autograd function of PyTorch that all maps share."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _COMPILED = "maps are made by NumPy and SciPy: under torch.compile they are a br
 
 @torch.compiler.disable(reason=_COMPILED)  # type: ignore[untyped-decorator]
 def applied(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch.Tensor:
-    """The maps of a layer's arguments, those that are given.
+    """Return the maps of a layer for its arguments; arguments that are None are omitted.
 
     Raises
     ------
     TypeError, ValueError
-        When one is no tensor, or of another dtype, device or shape.
+        If an argument is not a tensor, or has the wrong dtype, device or shape.
     """
     given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in given.items():
@@ -31,20 +31,20 @@ def applied(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch
 
 
 class _Map(torch.autograd.Function):  # type: ignore[misc]
-    """From arguments to maps."""
+    """The autograd function from arguments to maps."""
 
     @staticmethod
     def forward(
         layer: Layer, names: tuple[str, ...], *tensors: torch.Tensor
     ) -> tuple[torch.Tensor, Sequence[Derivative]]:
-        """Find the maps, and what is kept for the way back."""
+        """Compute the maps and their derivatives."""
         arrays = {name: _numpy(tensor) for name, tensor in zip(names, tensors, strict=True)}
         uv, derivatives = forth(layer, arrays)
         return torch.from_numpy(uv), derivatives
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-        """Keep it."""
+        """Keep the derivatives for the backward and forward modes."""
         ctx.layer, ctx.names, *tensors = inputs
         uv, ctx.derivatives = output
         ctx.shapes, ctx.lead = [tuple(tensor.shape) for tensor in tensors], tuple(uv.shape[:-2])
@@ -53,7 +53,7 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, cotangent: torch.Tensor | None, _: None) -> tuple[torch.Tensor | None, ...]:
-        """Gradients by the arguments that need them."""
+        """Gradients with respect to the arguments that need them."""
         if cotangent is None:
             return (None,) * (2 + len(ctx.names))
         needed = [name for name, needs in zip(ctx.names, ctx.needs_input_grad[2:], strict=True) if needs]
@@ -69,7 +69,7 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
 
     @staticmethod
     def jvp(ctx: Any, _layer: None, _names: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor, None]:
-        """How the maps move."""
+        """The change of the maps with the arguments."""
         moved = {
             name: _numpy(tangent) for name, tangent in zip(ctx.names, tangents, strict=True) if tangent is not None
         }
@@ -77,16 +77,16 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
-        """Refused."""
+        """Raise NotImplementedError."""
         raise NotImplementedError(
             "a batch of maps is one call, with further axes in front of the arguments: leave torch.func.vmap out"
         )
 
 
 def _numpy(tensor: torch.Tensor) -> Array:
-    """What a tensor holds; those that stand for others within transforms of `torch.func` hold nothing."""
+    """A tensor's values; raises NotImplementedError for the placeholder tensors of `torch.func`."""
     try:
-        # Tensors that are conjugates, or negated parts of such, are so in name only until they are resolved.
+        # Conjugated or negated tensors are lazy until they are resolved.
         return tensor.detach().resolve_conj().resolve_neg().numpy()
     except RuntimeError as error:
         raise NotImplementedError(

@@ -1,4 +1,4 @@
-"""Warps of images and of the plane by landmarks, without folds.
+"""Injective warps of images by landmarks.
 
 The package builds on `solver`. Start reading in `warping`.
 """

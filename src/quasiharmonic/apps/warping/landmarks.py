@@ -1,4 +1,4 @@
-"""Landmarks of pictures: points and curves that are to go somewhere, and a mesh of the picture that has them."""
+"""Landmarks of images: points and curves with target positions, and a mesh of the image that contains them."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_finite, map_array, named, real_array
 
-# At least so many cells along the shorter side of a picture, so that there is a way past landmarks.
+# Minimum number of cells along the shorter side, so that vertices can move between landmarks and the border.
 _ACROSS = 6
 
-#: A polyline (a, 2), a ≥ 2, and the one (b, 2) that it goes to.
+#: A polyline (a, 2), a ≥ 2, and its target polyline (b, 2).
 CurvePair = tuple[ArrayLike, ArrayLike]
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Points of a picture and where they go.
+    """Points of an image and their target positions.
 
     Attributes
     ----------
     before, after : (k, 2) float64
     weights : (k,) float64
-        What missing costs; infinite where a landmark arrives exactly.
+        Cost of missing the target position; infinite for landmarks that reach it exactly.
     """
 
     before: FloatArray
@@ -35,7 +35,7 @@ class Landmarks:
 
     @property
     def hard(self) -> BoolArray:
-        """Which arrive exactly; (k,) bool."""
+        """Which landmarks reach their target position exactly; (k,) bool."""
         return np.isinf(self.weights)
 
 
@@ -47,21 +47,21 @@ def landmarks_of(
     step: float,
     size: IntArray,
 ) -> Landmarks:
-    """Check landmarks, and put points onto curves.
+    """Check landmarks, and sample curves as landmarks.
 
     Parameters
     ----------
     landmarks, target, weights, curves
-        As of `quasiharmonic.warp_by_landmarks`.
+        As in `quasiharmonic.warp_by_landmarks`.
     step : float
-        Of points on curves, at most.
+        Maximum spacing of the points on curves.
     size : (2,) int64
-        Where the picture's last pixel is, x and y.
+        Position of the image's last pixel, x and y.
 
     Raises
     ------
     ValueError
-        When they are malformed, outside of the picture, or at the same place.
+        If landmarks are malformed, outside the image, or at the same position.
     """
     before, after = _points(landmarks, "landmarks"), _points(target, "target")
     if before.shape != after.shape:
@@ -82,7 +82,7 @@ def landmarks_of(
         one, other = _resampled(*pair, f"curve {number}", step)
         for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
             _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
-        # A closed curve ends where it began, and curves may meet.
+        # A closed curve ends at its first point, and curves may share points.
         new = ~(one[:, None] == before).all(axis=2).any(axis=1)
         new[-1] &= len(one) < 2 or not np.array_equal(one[0], one[-1])
         before, after = np.concatenate([before, one[new]]), np.concatenate([after, other[new]])
@@ -91,7 +91,7 @@ def landmarks_of(
 
 
 def on_border(points: FloatArray, size: IntArray) -> BoolArray:
-    """Which points (k, 2) are on a picture's border."""
+    """Which points (k, 2) are on the image's border."""
     edge: BoolArray = ((points == 0) | (points == size)).any(axis=1)
     return edge
 
@@ -104,7 +104,7 @@ def _points(points: ArrayLike, name: str) -> FloatArray:
 
 
 def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
-    """A weight for each of ``k`` landmarks, positive, infinite by default."""
+    """Check the weights of ``k`` landmarks; infinite by default."""
     array = np.full(k, np.inf) if weights is None else real_array("weights", weights)
     if array.shape != (k,):
         raise ValueError(f"weights must have shape ({k},), one for every landmark, not {array.shape}")
@@ -115,7 +115,7 @@ def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
 
 
 def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) -> None:
-    """Refuse points at the same place."""
+    """Raise ValueError if two points are at the same position."""
     _, first, count = np.unique(array, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
         place = array[first[count > 1][0]]
@@ -125,7 +125,7 @@ def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) 
 
 
 def _resampled(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tuple[FloatArray, FloatArray]:
-    """Points on two polylines at equal parts of their lengths, neither further apart than a step."""
+    """Points on two polylines at equal fractions of their lengths, spaced by at most ``step`` on both."""
     lines = [real_array(name, line) for line in (start, end)]
     for line in lines:
         if line.ndim != 2 or line.shape[1] != 2 or len(line) < 2:
@@ -145,7 +145,7 @@ def _resampled(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tupl
 
 
 def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) -> None:
-    """Refuse landmarks outside of a picture."""
+    """Raise ValueError if landmarks are outside the image."""
     outside = np.flatnonzero(~inside)
     if outside.size:
         raise ValueError(
@@ -155,7 +155,7 @@ def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) ->
 
 
 def carried(border: FloatArray, before: FloatArray, after: FloatArray, size: IntArray) -> FloatArray:
-    """How far points of a picture's border go along with landmarks on it; (m, 2)."""
+    """The displacements of border points, interpolated between the landmarks on the border; (m, 2)."""
     corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=np.float64)
     given = (corners[:, None] == before).all(axis=2).any(axis=1)
     knots = np.concatenate([corners[~given], before])
@@ -166,7 +166,7 @@ def carried(border: FloatArray, before: FloatArray, after: FloatArray, size: Int
 
 
 def _along(border: FloatArray, size: IntArray) -> FloatArray:
-    """How far around a picture points of its border are, from the first pixel to the right; (m,)."""
+    """The distance of border points from the first pixel along the border, first to the right; (m,)."""
     (x, y), (width, height) = border.T, size
     return np.select(
         [y == 0, x == width, y == height], [x, width + y, 2 * width + height - x], 2 * (width + height) - y
@@ -174,7 +174,7 @@ def _along(border: FloatArray, size: IntArray) -> FloatArray:
 
 
 def picture_mesh(landmarks: FloatArray, width: int, height: int, along: int) -> tuple[FloatArray, IntArray]:
-    """Triangulate a picture by a grid that makes room for landmarks, which come last; so many cells along its side."""
+    """Triangulate a grid of ``along`` cells per longer side, without points near landmarks; landmarks come last."""
     from scipy.spatial import Delaunay, cKDTree
 
     spacing = max(width - 1, height - 1) / along
@@ -185,7 +185,7 @@ def picture_mesh(landmarks: FloatArray, width: int, height: int, along: int) -> 
     near = np.zeros(len(grid), dtype=bool)
     if len(landmarks):
         near = cKDTree(landmarks).query(grid)[0] < 0.5 * spacing
-    # Points of the border make room only for landmarks that are on it themselves, corners only for one at the corner.
+    # Remove border points only near landmarks on the border, and corners only if a landmark is at the same position.
     if landmark_sides.any():
         distance = cKDTree(landmarks[landmark_sides.any(axis=1)]).query(grid)[0]
         near &= ~sides.any(axis=1) | (distance < np.where(sides.all(axis=1), 1e-300, 0.5 * spacing))

@@ -1,4 +1,4 @@
-"""Warping of pictures by landmarks, with their border or along any planar map, with no folds."""
+"""Injective warps of images by landmarks or by any planar map."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.refine.mapping import injective_map
 from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, not_negative, whole_number
 
-# Pixels drawn at a time: what is in work stays in the cache.
+# Pixels drawn per block, so that the arrays fit into the cache.
 _PIXELS = 1 << 15
-# Triangles with more pixels than this on average are filled one by one.
+# If triangles have more pixels than this on average, they are filled one by one.
 LARGE = 100
 
 
 @dataclass(frozen=True, eq=False)
 class WarpResult:
-    """A warped picture and the map that warped it.
+    """A warped image and the map that warped it.
 
     Attributes
     ----------
     image : array
-        Of the picture's shape and dtype.
+        The warped image, with the shape and dtype of the input.
     points : (n, 2) float64
-        Vertices of a mesh of the picture, x to the right and y down, in pixels.
+        Vertices of a mesh of the image, x to the right and y down, in pixels.
     F : (f, 3) int64
-        Its triangles.
+        Triangles of the mesh.
     positions : (n, 2) float64
-        Where they go.
+        Warped positions of the vertices.
     result : MapResult
-        With the certificate; the warp folds nowhere if it is bijective.
+        The map with its certificate. The warp is injective if its certificate is bijective.
     """
 
     image: NDArray[Any]
@@ -61,35 +61,37 @@ def warp_by_landmarks(
     resolution: int = 48,
     energy: str | Energy = "symmetric-dirichlet",
 ) -> WarpResult:
-    """Warp a picture such that landmarks go where they are told and nothing folds.
+    """Warp an image so that landmarks reach their target positions without inverted triangles.
 
-    The border stays, unless landmarks are on it: then it goes along, straight between one and the next. Corners count
-    as landmarks that stay, if they are not given. So any number of landmarks will do, also one or none.
+    If no landmarks are on the border, it is fixed. Otherwise it moves with them and is interpolated linearly between
+    neighbouring landmarks. Image corners are fixed unless they are given as landmarks. Any number of landmarks is
+    allowed, also none.
 
     Parameters
     ----------
     image : (height, width) or (height, width, channels) array
         Any real dtype.
     landmarks : (k, 2) array
-        Points of the picture, x to the right and y down; the centre of the first pixel is (0, 0), and of the last
+        Points of the image, x to the right and y down. The centre of the first pixel is (0, 0), that of the last
         (width − 1, height − 1).
     target : (k, 2) array
-        Where they go. The picture keeps its size: what goes beyond is cut off, what nothing comes to is 0.
+        Target positions of the landmarks. The image keeps its size. Content that moves outside is cut off, and pixels
+        without content are 0.
     weights : (k,) array, optional
-        How much landmarks inside the picture count: each is missed where that costs less than getting there. To miss
-        one of weight 1 by a pixel costs as much as a unit of energy on a pixel. Those of infinite weight arrive
-        exactly, as all do by default.
+        Weights of landmarks inside the image; infinite by default. Landmarks of infinite weight reach their target
+        positions exactly. Others may miss them to reduce distortion. At weight 1, missing by one pixel costs one unit
+        of energy on one pixel.
     curves : sequence of pairs of (a, 2) and (b, 2) arrays, optional
-        Polylines inside the picture and those that they go to, equal parts of the length to equal parts, at points no
-        further apart than the cells of the mesh: between these corners are cut.
+        Polylines inside the image and their target polylines, matched by equal fractions of their lengths. They are
+        sampled with a spacing of at most one mesh cell, which cuts corners between samples.
     smoothness : float, optional
-        A length in pixels: as far around landmarks the warp is smooth as a thin plate is
-        (`quasiharmonic.energies.bending`), and stretches no more, however fine the mesh is. An eighth of the picture's
-        longer side by default. With 0 a landmark is a cusp, the sharper the finer the mesh.
+        Length in pixels; an eighth of the image's longer side by default. Up to this distance from a landmark the warp
+        is smooth like a thin plate (`quasiharmonic.energies.bending`), and its stretch does not depend on the mesh
+        size. With 0 each landmark is a cusp, which becomes sharper on finer meshes.
     resolution : int
-        Cells of the mesh along the longer side.
+        Number of mesh cells along the longer side.
     energy : str or Energy
-        Distortion that is lowered once the map is free of folds; see `quasiharmonic.polish`.
+        Distortion to minimise once the map is injective; see `quasiharmonic.polish`.
 
     Returns
     -------
@@ -98,10 +100,10 @@ def warp_by_landmarks(
     Raises
     ------
     ValueError
-        When an array has the wrong shape, a landmark is outside of the picture, before or after, or stands for two,
-        a number is out of its range, or the moved border meets itself.
+        If an array has the wrong shape, a landmark or its target position is outside the image, two landmarks are at
+        the same position, a number is out of its range, or the moved border intersects itself.
     RuntimeError
-        When no map without folds was found.
+        If no injective warp was found.
 
     Examples
     --------
@@ -129,7 +131,7 @@ def warp_by_landmarks(
     held = given.hard
     target = np.concatenate([points[border] + carried(points[border], before[edge], after[edge], size), after[held]])
     fixed = np.concatenate([border, own[held]])
-    # Landmarks can pass each other: on the picture's own triangles what that costs is spread from the start.
+    # Landmarks can pass each other. The corrected reference spreads the resulting distortion from the start.
     result = injective_map(points, F, fixed, target, reference="corrected", polish=None if length else energy)
     if result.certificate.crossings.size:
         raise ValueError("target: the border that goes along with the landmarks on it crosses itself")
@@ -147,32 +149,32 @@ def warp_by_landmarks(
 def warp_along(
     image: ArrayLike, points: ArrayLike, F: ArrayLike, positions: ArrayLike, *, shape: tuple[int, int] | None = None
 ) -> NDArray[Any]:
-    """Draw a picture where a planar map takes it.
+    """Draw an image under a planar map.
 
     Parameters
     ----------
     image : (height, width) or (height, width, channels) array
         Any real dtype.
     points : (n, 2) array
-        A mesh over the picture or a part of it, in pixels.
+        Vertices of a mesh over the image or a part of it, in pixels.
     F : (f, 3) array of int
-        Its triangles.
+        Triangles of the mesh.
     positions : (n, 2) array
-        Where the mesh goes, bijectively.
+        Positions of the vertices under the map, which must be bijective.
     shape : (int, int), optional
-        Height and width of the result; the picture's by default.
+        Height and width of the result; the input's by default.
 
     Returns
     -------
     array
-        Of the picture's dtype. Each pixel is taken from where it comes from, between pixels linearly; those
-        outside the moved mesh are 0.
+        Of the image's dtype. Each pixel is interpolated bilinearly at its source position. Pixels outside the mapped
+        mesh are 0.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape, a point is not finite, or the map is not bijective: the message says
-        which and why.
+        If an array has the wrong shape, a point is not finite, or the map is not bijective; the message gives the
+        reason.
     """
     from scipy.ndimage import map_coordinates
 
@@ -211,12 +213,12 @@ def _picture(image: ArrayLike) -> NDArray[Any]:
 
 
 def _sources(inverse: InverseMap, height: int, width: int) -> FloatArray:
-    """Where each pixel comes from, row by row, NaN where from nowhere; (height · width, 2)."""
+    """The source position of each pixel, row by row, NaN for pixels without source; (height · width, 2)."""
     filled = np.full((height, width, 2), np.nan)
     if height * width > LARGE * len(inverse.F):
         _fill(inverse, filled)
     source = filled.reshape(-1, 2)
-    # What is left lies on edges, so close to one that rounding could tell either side, or outside: decided exactly.
+    # The remaining pixels are near edges, where rounding could change the result, or outside. Locate them exactly.
     left = np.flatnonzero(np.isnan(source[:, 0]))
     for start in range(0, left.size, _PIXELS):
         here = left[start : start + _PIXELS]
@@ -226,14 +228,14 @@ def _sources(inverse: InverseMap, height: int, width: int) -> FloatArray:
 
 
 def _fill(inverse: InverseMap, source: FloatArray) -> None:
-    """Enter where pixels come from that lie inside triangles beyond any doubt; on each the map is affine."""
+    """Fill in the source positions of pixels that are inside a triangle despite rounding; each map is affine there."""
     height, width = source.shape[:2]
     corners, origins = inverse.uv[inverse.F], inverse.V[inverse.F]
     first = np.clip(np.ceil(corners.min(axis=1)), 0, (width, height)).astype(np.int64)
     last = np.clip(np.floor(corners.max(axis=1)), -1, (width - 1, height - 1)).astype(np.int64)
     sides = corners[:, 1:] - corners[:, :1]
     area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-    # Of a barycentric coordinate, by twice as much as rounding can do.
+    # Twice the bound on the rounding error of a barycentric coordinate.
     extent = np.abs(sides).max(axis=1) * 2
     doubt = 2.0**-48 * extent[:, 0] * extent[:, 1] / area
     for t in np.flatnonzero((first <= last).all(axis=1) & (doubt < 2.0**-30)).tolist():
@@ -249,5 +251,5 @@ def _fill(inverse: InverseMap, source: FloatArray) -> None:
 
 
 def _drawable(kind: np.dtype[Any]) -> np.dtype[Any]:
-    """A type that SciPy draws from, without loss."""
+    """Return a dtype that SciPy can draw from without loss."""
     return kind if kind.kind in "iu" or kind in (np.float32, np.float64) else np.dtype(np.float64)

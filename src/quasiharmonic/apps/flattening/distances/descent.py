@@ -1,10 +1,10 @@
-"""A flat map that keeps distances: Newton's steps down their energy, among bijective maps.
+"""Flat maps that keep distances: Newton steps on the distance energy among bijective maps.
 
-A pair of vertices far apart couples what no triangle does, and a matrix with all pairs in it would fill up when it is
-factored. But each vertex has pairs in all directions, so the pairs alone are nearly as good as a weight at every
-vertex: with ``H = M + (P − D)``, in M the triangles' matrix and the pairs' blocks D on the diagonal, and P the pairs'
-matrix, a dozen conjugate gradients preconditioned by the factors of M give Newton's direction. The product with M
-comes for free: it is what the residuals were before they were preconditioned.
+A pair of distant vertices couples vertices that share no triangle, so the factors of a matrix with all pairs would have
+much fill. Each vertex has pairs in all directions, so the diagonal blocks of the pairs are a good approximation. Write
+``H = M + (P − D)``: P is the pairs' matrix, D its diagonal blocks, and M the triangles' matrix plus D. Conjugate
+gradients with the factors of M as preconditioner give Newton's direction in about a dozen iterations. Products with M
+need no work, as they are the residuals before preconditioning.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Ste
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, map_array, not_negative, whole_number
 from quasiharmonic.util.progress import reports_progress
 
-# So many pairs are kept, along segments across so many edges. On a cortex of 9,465 vertices twice as many pairs lower
-# the error by a hundredth of it, half as many raise it by as much.
+# Number of pairs, and of edges that a segment crosses. On a cortex of 9,465 vertices, twice as many pairs lower the
+# error by 1 %, and half as many raise it by 1 %.
 _PAIRS, _CROSSINGS = 300_000, 3
-# The more sources the better, but what distances from one cost grows with the square of the rings: of sources times
-# that there are so many, within bounds.
+# More sources are better, but the cost of the distances from one grows with the square of the rings. So the number of
+# sources times the squared rings is constant, within bounds.
 _WORK, _FEWEST, _MOST = 1_000_000, 1000, 4000
-# Gradients are followed until the residual has fallen to this share, or there were so many.
+# Conjugate gradients stop at this reduction of the residual, or after this number of iterations.
 _ACCURACY, _GRADIENTS = 0.1, 20
 
 
@@ -53,14 +53,13 @@ def keep_distances(
     callback: Callable[[Step], object] | None = None,
     record_every: int = 0,
 ) -> MapResult:
-    """Bring distances in the plane near to distances along the surface; every map on the way is bijective.
+    """Lower the error of distances in a bijective map; all maps on the way are bijective.
 
-    What is lowered is the mean, over a sample of pairs of vertices at most ``rings`` edges apart, of how far their
-    distance is off, as `quasiharmonic.distortion` measures it but for errors below 30 % counting by squares, and a
-    small share of the symmetric Dirichlet energy, which keeps triangles from collapsing
-    (`quasiharmonic.apps.flattening.distances.energy`). The sample has 2,500 vertices, or all if there are no more, with
-    120 others each, drawn at random, always the same; for fewer rings up to 4,000 vertices, for more down to 1,000, and
-    300,000 pairs in all.
+    The objective is a mean over a sample of vertex pairs at most ``rings`` edges apart. It is the distance error of
+    `quasiharmonic.distortion`, except that errors below 30 % count quadratically. A small multiple of the symmetric
+    Dirichlet energy keeps triangles from collapsing (`quasiharmonic.apps.flattening.distances.energy`). With 20 rings,
+    the sample has 2,500 vertices, or all if there are fewer, with 120 others each. Fewer rings use up to 4,000
+    vertices, and more rings down to 1,000; there are 300,000 pairs in all. The sample is random but deterministic.
 
     Parameters
     ----------
@@ -69,38 +68,38 @@ def keep_distances(
     F : (f, 3) array of int
         Triangles of a connected surface with at least one boundary loop and without handles.
     uv : (n, 2) array
-        A bijective map of any size, such as `flatten` makes.
+        A bijective map of any size, for example from `flatten`.
     rings : int
-        How many edges apart vertices of a pair are at most.
+        Maximum number of edges between the vertices of a pair.
     max_iterations : int
-        Newton steps at most.
+        Maximum number of Newton steps.
     tolerance : float
-        The descent has converged when Newton's model promises a further decrease below this fraction of the energy.
-        Not negative.
+        The descent has converged when Newton's model predicts a decrease below this fraction of the energy. Not
+        negative.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at the start and after every step, and with the last one again at least every half second
-        in between, but not within a single factorisation.
+        Called with a `Step` at the start and after every step. Between steps it is called again with the last `Step` at
+        least every half second, except during a factorisation.
     record_every : int
-        Keep the map of every ``record_every``-th step in the result's ``path``; none of them by default.
+        Keep the map of every ``record_every``-th step in the result's ``path``; with 0, the default, none are kept.
 
     Returns
     -------
     MapResult
-        Its ``uv`` is bijective, certified, and in the surface's own unit of length: distances in it are nearest to the
-        surface's as they are. The status is ``POLISHED``, ``STILL_FALLING`` after the last iteration, ``EXHAUSTED``
-        when no better bijective map was found, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+        ``uv`` is certified as bijective, and in the surface's unit of length, at the scale that fits distances best.
+        The status is ``POLISHED`` if converged, ``STILL_FALLING`` after ``max_iterations``, ``EXHAUSTED`` if no better
+        bijective map was found, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
 
     Raises
     ------
     ValueError
-        When the input is malformed (see `Problem`), the surface has handles, a rest triangle has no area, or ``uv`` is
-        not bijective; the message says where.
+        If the input is malformed (see `Problem`), the surface has handles, a rest triangle has no area, or ``uv`` is
+        not bijective; the message names the elements.
 
     Examples
     --------
-    A dome seen from above, its rim pressed together, is spread out:
+    A dome seen from above is compressed at its boundary; the descent spreads it out:
 
     >>> import numpy as np
     >>> from quasiharmonic import distortion
@@ -136,7 +135,7 @@ def keep_distances(
 
 
 def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first: int = 0) -> MapResult:
-    """Bring distances in a bijective map of a piece near to those along it.
+    """Lower the error of distances in a bijective map of a piece.
 
     Parameters
     ----------
@@ -144,16 +143,16 @@ def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first:
     uv : (n, 2) float64
         A bijective map of any size.
     rings : int
-        As `keep_distances` has it.
+        As for `keep_distances`.
     settings : Settings
-        Of which the density is not read.
+        Options; the density is ignored.
     first : int
-        The number of the first step.
+        Number of the first step.
 
     Returns
     -------
     MapResult
-        As `keep_distances` makes it, ``uv`` in the piece's unit and ``path`` in the surface's.
+        As for `keep_distances`, with ``uv`` in the piece's unit and ``path`` in the surface's.
     """
     began = time.perf_counter()
     distances = sampled(piece.V, piece.F, sampling_of(rings))
@@ -187,25 +186,25 @@ def kept(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first:
 
 
 def sampling_of(rings: int) -> Sampling:
-    """The pairs that a descent keeps: as many whatever the rings, from fewer sources where these are many."""
+    """The sampling for a number of rings: a constant number of pairs, from fewer sources if there are many rings."""
     sources = int(np.clip(_WORK // rings**2, _FEWEST, _MOST))
     return Sampling(rings, sources, _PAIRS // sources, _CROSSINGS)
 
 
 def in_scale(uv: FloatArray, distances: SurfaceDistances, F: IntArray, loops: list[IntArray]) -> FloatArray:
-    """A bijective map scaled such that its distances are nearest to the surface's, its middle at the origin."""
-    # A power of two first, so that squares of lengths neither overflow nor vanish.
+    """Scale a bijective map so that its distances fit the surface's best, and centre it at the origin."""
+    # First scale by a power of two, so that squared lengths neither overflow nor underflow.
     uv = np.ldexp(uv, -int(np.frexp(np.ptp(uv, axis=0).max())[1]))
     scale = distances.error(uv).scale
     scaled = scale * (uv - uv.mean(axis=0))
     if certify(F, scaled, loops=loops).bijective:
         return scaled
-    # Triangles so thin that rounding inverts them: powers of two leave them as they are.
+    # Rounding inverts very thin triangles; scaling by a power of two does not change their signs.
     return np.ldexp(uv, int(np.rint(np.log2(scale))))
 
 
 def followed(descent: DistanceDescent, settings: Settings, report: Callable[[float], None]) -> Status:
-    """Take steps until there is no other to take, or Ctrl-C comes.
+    """Take steps until converged, stalled or interrupted by Ctrl-C; return the status.
 
     Parameters
     ----------
@@ -228,7 +227,7 @@ def followed(descent: DistanceDescent, settings: Settings, report: Callable[[flo
 
 
 class DistanceDescent(GuardedDescent):
-    """Steps of a map that stays bijective, down an energy of distances.
+    """Newton steps on an energy of distances for a map that stays bijective.
 
     Parameters
     ----------
@@ -237,7 +236,7 @@ class DistanceDescent(GuardedDescent):
         A bijective map, of about unit size.
     linear_solver : str
     rim : Rim
-        The surface's boundary.
+        Boundary of the surface.
     """
 
     pairs: PairForm
@@ -247,13 +246,13 @@ class DistanceDescent(GuardedDescent):
         super().__init__(energy, uv, linear_solver, rim)
 
     def assemble(self, negative: float) -> None:
-        """Fill in the matrix of the triangles and contacts, and of the pairs what is on the diagonal."""
+        """Assemble the matrix of triangles and contacts, plus the diagonal blocks of the pairs."""
         super().assemble(negative)
         self.pairs = self._between.pairs_at(self.w)
         self.system.add_blocks(*(part[self.system.free] for part in self.pairs.diagonal))
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """Newton's direction under a load on the free vertices, by conjugate gradients."""
+        """Return Newton's direction for a load on the free vertices, by conjugate gradients."""
         free, whole = self.system.free, np.zeros(self.w.size, dtype=np.complex128)
         direction, residual = np.zeros_like(load), load
         step, by_matrix = self.system.solve(load), load

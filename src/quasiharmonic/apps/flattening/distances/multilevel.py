@@ -1,15 +1,15 @@
-"""A flat map of a large surface that keeps distances, by way of a coarse mesh.
+"""Flat maps of large surfaces that keep distances, computed on a coarse mesh.
 
-    surface ─▶ coarse meshes ─▶ flattened there ─▶ descent of distances there ─▶ carried back, smoothed ─▶ map
+    surface ─▶ coarse meshes ─▶ flattened there ─▶ distance descent there ─▶ carried back, smoothed ─▶ map
 
-What keeps distances is smooth at the scale of their rings, so few vertices suffice to say it: distances are taken
-between the vertices of a coarse mesh, along one about twice as fine, and descended on the coarse one. A ring there is
-as long as several here. What has been carried back is bijective, and its triangles are smoothed and opened up as those
-of any map that comes from a coarse mesh.
+A map that keeps distances is smooth at the scale of the rings, so a coarse mesh suffices. Distances between vertices of
+the coarse mesh are measured along a mesh about twice as fine. One ring of the coarse mesh is as long as several rings
+of the surface. The map that is carried back is bijective, and its triangles are smoothed and improved like those of
+other maps from coarse meshes.
 
-On a cortex of 298,464 triangles, pairs up to 20 rings apart, this takes a seventh of the time of a descent on the
-mesh itself; the mean error is 12.7 % (root mean square 20.2 %), there 12.6 % (23.2 %). Distances on coarse meshes are
-off by a hundredth or two: where a map could keep them nearly, a descent on the mesh itself does it better.
+On a cortex of 298,464 triangles with pairs up to 20 rings apart, this takes a seventh of the time of a descent on the
+whole mesh. The mean error is 12.7 % (root mean square 20.2 %), compared with 12.6 % (23.2 %). Distances on coarse
+meshes have errors of 1 to 2 %. If a map can nearly keep distances, a descent on the whole mesh is better.
 """
 
 from __future__ import annotations
@@ -32,35 +32,35 @@ from quasiharmonic.energies.newton.newton_descent import in_units
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Step
 
-# On the coarse mesh so many rings at least are as long as those asked for.
+# Minimum length of the requested rings, in rings of the coarse mesh.
 _RINGS = 3.0
-# Distances between its vertices are taken along the next finer mesh, which minds more of the folds, unless they are of
-# more rings there than this.
+# Distances are measured along the next finer mesh, which follows more of the folds, unless the rings are more than this
+# number of its rings.
 _FAR = 20
 
 
 def kept_by_coarse(piece: Piece, rings: int, settings: Settings, *, least: int = 9000) -> MapResult | None:
-    """Flatten a large surface such that distances are kept.
+    """Flatten a large surface so that distances are kept, with a coarse mesh.
 
     Parameters
     ----------
     piece : Piece
     rings : int
-        How many of the surface's edges apart vertices of a pair are at most.
+        Maximum number of the surface's edges between the vertices of a pair.
     settings : Settings
-        Of which the density is not read. Steps are of the coarse mesh; ``path`` gets the last map alone.
+        Options; the density is ignored. Steps are counted on the coarse mesh, and ``path`` gets the final map only.
     least : int
-        How many vertices the coarse mesh has at least.
+        Minimum number of vertices of the coarse mesh.
 
     Returns
     -------
     MapResult or None
-        Bijective, in the piece's unit. None where no mesh is coarser, or the way ends in rounding.
+        A bijective map in the piece's unit. None if there is no coarser mesh, or rounding prevents a map.
 
     Raises
     ------
     KeyboardInterrupt
-        Except in the descent, which it ends.
+        If Ctrl-C comes outside the distance descent; there it only ends the descent.
     """
     began = time.perf_counter()
     n, solver = len(piece.V), settings.linear_solver
@@ -95,7 +95,7 @@ def kept_by_coarse(piece: Piece, rings: int, settings: Settings, *, least: int =
     found = carried(hierarchy, level, hierarchy.level(0), descent.uv, solver)
     if found is None:
         return None
-    # Once more than other maps: on a cortex this lowers the mean error by a hundredth of it.
+    # Smooth once more than other maps; on a cortex this lowers the mean error by 1 %.
     found = touched_up(piece.V, piece.F, piece.loops, found, solver)
     seconds, energies = time.perf_counter() - middle, (history[0].energy, descent.distortion)
     stages.append(Stage("guarded descent, distances, coarse", len(history) - 1, seconds, (0, 0), energies))
@@ -112,7 +112,7 @@ def kept_by_coarse(piece: Piece, rings: int, settings: Settings, *, least: int =
 
 
 def _between(hierarchy: Hierarchy, level: Level, rings: int) -> SurfaceDistances:
-    """Distances between vertices of a level that are so many rings of the surface apart, along the next finer mesh."""
+    """Distances between vertices of a level up to this number of the surface's rings, along the next finer mesh."""
     finer = hierarchy.level(hierarchy.finer(level.stop))
     if rings * np.sqrt(finer.vertices.size / len(hierarchy.V)) > _FAR:
         finer = level

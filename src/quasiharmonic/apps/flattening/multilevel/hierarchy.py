@@ -1,14 +1,14 @@
-"""Coarse meshes of a surface whose boundary is coarsened too, and the way back.
+"""Coarse meshes of a surface with coarse boundaries, and the prolongation of maps to finer meshes.
 
-Each boundary loop is filled by a fan around a vertex of its own, its *hub*, which makes the boundary's vertices inner
-ones and lets `quasiharmonic.geometry.coarsening.levels` take them out as any other; hubs stay, and no new edge ends at
-them. So what is left without the hubs is a coarse mesh with coarse loops.
+Each boundary loop is filled by a fan around a new vertex, its *hub*. Boundary vertices then become interior vertices,
+and `quasiharmonic.geometry.coarsening.levels` can remove them like others. Hubs are kept, and get no new edges. Without
+the hubs, a coarse mesh with coarse loops remains.
 
-On the way back a vertex goes to where the surface says that it is. Its ring is laid out flat around it, by the angles
-and lengths at rest; the affine map that takes the ring nearest to where it is now takes the vertex along. That
-is exact where the map is affine. Where it inverts a triangle the vertex goes where its triangles are
-best shaped, as in `quasiharmonic.geometry.coarsening.prolongation`: inside of its ring, and of the coarse surface's
-image.
+Prolongation positions each removed vertex according to the surface's shape. The vertex's ring is laid out flat around
+it by its rest angles and lengths. The affine map that fits the flat ring best to the ring's current positions also maps
+the vertex. This is exact if the map is affine. If it inverts a triangle, the vertex gets the position that gives its
+triangles the best shape, as in `quasiharmonic.geometry.coarsening.prolongation`. This position is inside its ring and
+the coarse image.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from quasiharmonic.geometry.coarsening.prolongation import places
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-# The affine map is held to a similarity where the ring does not say otherwise, with this weight.
+# Weight that keeps the affine map close to a similarity.
 _RIGID = 1e-2
-# A vertex keeps its place if none of its triangles has less than this share of the area that it has laid out flat.
+# The affine position is used if every triangle has at least this fraction of its area in the flat layout.
 _LEAST = 0.05
-#: Triangles of a mesh whose triangles were never there are no lower than this share of their longest side.
+#: Minimum height of a coarse mesh's triangles, relative to their longest side.
 LOWEST = 0.05
-# Angles around a vertex of the boundary add up to this at most when its ring is laid out.
+# Maximum sum of the angles around a boundary vertex when its ring is laid out.
 _WIDEST = 1.9 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One mesh of a hierarchy, with vertices numbered for itself.
+    """One mesh of a hierarchy, with its own vertex numbering.
 
     Attributes
     ----------
     stop : int
-        Which of the hierarchy's.
+        The hierarchy's stop that the mesh belongs to.
     vertices : (m,) int64
-        Its vertices as the finest mesh numbers them, ascending.
+        The finest mesh's indices of its vertices, ascending.
     F : (f, 3) int64
     loops : list of (l,) int64
     """
@@ -54,7 +54,7 @@ class Level:
 
 
 class Hierarchy:
-    """Coarser and coarser meshes of a surface.
+    """A sequence of increasingly coarse meshes of a surface.
 
     Parameters
     ----------
@@ -63,16 +63,16 @@ class Hierarchy:
     F : (f, 3) int64
         Triangles of a connected surface.
     loops : list of (l,) int64
-        Its boundary loops.
+        Boundary loops of the surface.
     goal : int
-        How many vertices the coarsest mesh is to have; it has more where no other can be taken out.
+        Number of vertices of the coarsest mesh; it has more if no others can be removed.
 
     Attributes
     ----------
     V : (n, 3) float64
         As given.
     stops : list of int
-        Where there is a mesh, finest first; 0 is the surface itself.
+        Rounds after which there is a mesh, finest first; 0 is the surface itself.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, loops: list[IntArray], goal: int) -> None:
@@ -83,11 +83,11 @@ class Hierarchy:
         held[n:] = True
         self._coarsening = coarsen(np.concatenate([F, filled]), held.size, held, goal + len(loops))
         self._rounds = len(self._coarsening.rounds)
-        # Where there are meshes: before some of the rounds, and after the last.
+        # There are meshes before some of the rounds, and after the last.
         self.stops = [*sorted(self._coarsening.levels), self._rounds]
 
     def stations(self, ratio: float) -> list[int]:
-        """Some of the `stops`, coarsest first: each mesh has so many times the vertices of the one before, or more."""
+        """Some of the `stops`, coarsest first; each mesh has at least ``ratio`` times the vertices of the last."""
         left = self._left()
         chosen = [0]
         for stop in self.stops[1:]:
@@ -98,22 +98,22 @@ class Hierarchy:
         return chosen[::-1]
 
     def coarsest(self, least: float) -> int:
-        """The last of the `stops` whose mesh has so many vertices or more; 0 where none has."""
+        """Return the last of the `stops` whose mesh has at least ``least`` vertices; 0 if none has."""
         left = self._left()
         return max((stop for stop in self.stops if left[stop] >= least), default=0)
 
     def finer(self, stop: int) -> int:
-        """The stop before one."""
+        """Return the next finer stop."""
         return self.stops[self.stops.index(stop) - 1]
 
     def _left(self) -> IntArray:
-        """How many vertices there are after none, one, … of the rounds."""
+        """Numbers of vertices left after each number of rounds."""
         removed = [0, *(sum(vertices.size for vertices, _ in removals) for removals in self._coarsening.rounds)]
         left: IntArray = self._n - np.cumsum(removed)
         return left
 
     def level(self, stop: int) -> Level:
-        """The mesh after so many rounds, one of `stops`."""
+        """Return the mesh at a stop."""
         T = self._coarsening.F if stop == self._rounds else self._coarsening.levels[stop]
         T = T[T.max(axis=1) < self._n]
         used = np.zeros(self._n, dtype=bool)
@@ -130,15 +130,15 @@ class Hierarchy:
         Parameters
         ----------
         w : (n,) complex128
-            By the numbers of the finest mesh; those of the mesh at ``start`` are read.
+            The map in the finest mesh's numbering; only vertices of the mesh at ``start`` are read.
         start, stop : int
             Stops, ``stop < start``.
         wary : (n,) bool
-            Vertices of the boundary that are put within the coarse image, so that their edges do not meet others there;
-            the rest goes where the surface says.
+            Boundary vertices that are placed inside the coarse image, so that their edges do not intersect others. The
+            other vertices are placed by the surface's shape.
         height : float
-            Of wary ears, which have no place within: so high above the edge they stand on, as a share of its length.
-            If all are wary and this is small enough, the map is bijective where it was.
+            Height of wary ears, which cannot be placed inside, above their edges, relative to the edges' lengths. If
+            all boundary vertices are wary and the height is small enough, a bijective map stays bijective.
 
         Returns
         -------
@@ -155,7 +155,7 @@ class Hierarchy:
         return w
 
     def _opened(self, rings: IntArray) -> IntArray:
-        """Rings of vertices of the boundary without their hubs, from one end to the other."""
+        """Return the rings of boundary vertices without their hubs, from one end to the other."""
         hub = (rings >= self._n).argmax(axis=1)
         turn = (hub[:, None] + 1 + np.arange(rings.shape[1] - 1)) % rings.shape[1]
         return np.take_along_axis(rings, turn, axis=1)
@@ -163,12 +163,12 @@ class Hierarchy:
     def _placed(
         self, w: ComplexArray, vertices: IntArray, ring: IntArray, rim: bool, wary: BoolArray, height: float
     ) -> ComplexArray:
-        """Places for vertices whose rings (r, d) are closed, or open where they are of the rim."""
+        """Positions of vertices with rings (r, d), which are closed, or open if ``rim``."""
         flat = self._laid_out(vertices, ring, rim)
         around = w[ring]
         place = _carried(flat, around)
         if rim and ring.shape[1] == 2:
-            # An ear lies to the left of x₁ → x₂, and all else to the right.
+            # An ear lies to the left of x₁ → x₂, and the rest of the surface to the right.
             return np.where(wary[vertices], around[:, 0] + (0.5 + 1j * height) * (around[:, 1] - around[:, 0]), place)
         good = _keeps_shape(flat, place, around, rim)
         if rim:
@@ -177,13 +177,13 @@ class Hierarchy:
         if poor.size:
             ring_now = around[poor]
             if rim:
-                # Of an open ring either end may be the apex of the fan that fills it.
+                # Either end of an open ring can be the apex of the fan that fills it.
                 ring_now = np.where(_fan_positive(ring_now)[:, None], ring_now, np.roll(ring_now, 1, axis=1))
             place[poor] = places(ring_now)
         return place
 
     def _laid_out(self, vertices: IntArray, ring: IntArray, rim: bool) -> ComplexArray:
-        """Rings at rest, laid out flat around their vertices; (r, d) complex128, of about unit size."""
+        """Lay rest rings out flat around their vertices; (r, d) complex128, of about unit size."""
         arm = self.V[ring] - self.V[vertices][:, None]
         length = np.linalg.norm(arm, axis=2)
         following = np.roll(arm, -1, axis=1)
@@ -201,7 +201,7 @@ class Hierarchy:
 
 
 def _carried(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
-    """Where the affine maps that take flat rings nearest to given ones take their centres; (r,) complex128."""
+    """Images of the rings' centres under the affine maps that fit flat rings best to given ones; (r,) complex128."""
     weight = 1 / (flat.real**2 + flat.imag**2 + 1e-12)
     columns = np.stack([np.ones(flat.shape, dtype=np.complex128), flat, flat.conj()], axis=2)
     weighted = columns.conj() * weight[:, :, None]
@@ -215,13 +215,13 @@ def _carried(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
 
 
 def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, rim: bool) -> BoolArray:
-    """Whether no triangle around a vertex has lost most of the area that it should have."""
+    """Whether all triangles around a vertex keep a minimum fraction of their expected area."""
     now, then = around - place[:, None], flat
     last = -1 if rim else None
     following = np.roll(then, -1, axis=1)
     area = (now.conj() * np.roll(now, -1, axis=1)).imag[:, :last]
     rest = (then.conj() * following).imag[:, :last]
-    # Both sides of a seam are at one place at rest: a triangle between them has no area there, but needs some.
+    # Both sides of a seam coincide at rest. A triangle between them has no area there, but needs some in the plane.
     longest = np.maximum(np.maximum(np.abs(then), np.abs(following)), np.abs(following - then))[:, :last]
     rest = np.maximum(rest, LOWEST * longest**2)
     scale = area.sum(axis=1) / rest.sum(axis=1)

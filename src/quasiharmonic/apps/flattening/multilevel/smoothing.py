@@ -1,7 +1,7 @@
-"""A map that has come from a coarser mesh made ready for Newton's steps: smoothed, and its worst triangles opened up.
+"""Prepare a map that comes from a coarser mesh for Newton steps: smooth it, and improve its worst triangles locally.
 
-Most vertices have come to a good place. What the others, one in a hundred, cost the whole mesh in steps costs next to
-nothing where they are.
+Most vertices already have good positions. The remaining one percent would cost many steps on the whole mesh, but local
+steps on patches around them are cheap.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# Towards the weighted middle of its neighbours a vertex goes this share of the way, so often; no weight is below this.
+# Fraction of the way to the weighted mean of its neighbours that a vertex moves, number of sweeps, and minimum weight.
 _SHARE, _SWEEPS, _LEAST_WEIGHT = 0.8, 4, 0.02
-# Triangles are opened up whose density is so many times that of three quarters of all, with so many rings around them,
-# if it is not most of the mesh, in so many steps at most, to this tolerance.
+# A triangle is bad if its density is _BAD times the 75 % quantile. Patches have this number of rings around bad
+# triangles, at most this fraction of the mesh, this maximum number of steps, and this tolerance.
 _BAD, _RINGS, _MOST, _STEPS, _TOLERANCE = 20.0, 2, 0.4, 20, 1e-2
 
 
 def touched_up(
     V: FloatArray, F: IntArray, loops: Sequence[IntArray], uv: FloatArray, linear_solver: str = "auto"
 ) -> FloatArray:
-    """Lower the distortion of a bijective map at little cost.
+    """Lower the distortion of a bijective map at low cost.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def touched_up(
         Rest positions.
     F : (f, 3) int64
     loops : sequence of (l,) int64
-        The boundary.
+        Boundary loops.
     uv : (n, 2) float64
         A bijective map.
     linear_solver : str
@@ -51,7 +51,7 @@ def touched_up(
     Returns
     -------
     (n, 2) float64
-        Bijective.
+        A bijective map.
     """
     energy = thick_energy(V, F)
     before = in_units(uv, 0)
@@ -62,7 +62,7 @@ def touched_up(
 
 
 def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
-    """The symmetric Dirichlet energy of a mesh, its thinnest triangles thickened, for descents from afar."""
+    """The symmetric Dirichlet energy with the thinnest rest triangles thickened, for maps far from the minimum."""
     shapes = rest_shapes(V, F, lowest=LOWEST)
     laid = np.zeros((len(F), 3), dtype=np.complex128)
     laid[:, 1], laid[:, 2] = shapes.unit * shapes.sides[0], -shapes.unit * shapes.sides[2]
@@ -71,7 +71,7 @@ def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
 
 
 def _smoothed(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: ComplexArray) -> ComplexArray:
-    """Move inner vertices towards the middles of their neighbours, weighted as in the Laplacian, and invert none."""
+    """Move interior vertices towards the Laplacian mean of their neighbours, without inverting triangles."""
     n = len(V)
     z1, z2 = rest_frames(V, F)
     corners = np.stack([np.zeros(z2.shape), z1, z2])
@@ -108,7 +108,7 @@ def _opened(
     energy: DeformationEnergy,
     linear_solver: str,
 ) -> FloatArray:
-    """The map with patches around its worst triangles descended, all else held."""
+    """Descend on patches around the worst triangles, with all other vertices fixed."""
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
     loose = np.zeros(len(V), dtype=bool)

@@ -1,7 +1,7 @@
-"""A map to start from by way of coarse meshes: flattened where that costs little, then carried to finer ones.
+"""Initial maps from coarse meshes: flatten a coarse mesh, then carry the map to finer meshes.
 
-A limb of a thousand triangles, which a map into a disk shrinks to a millionth, has ten on the coarse mesh, and what
-would be steps of the whole mesh are steps of a small one. The same goes for the way out of an overlap.
+A limb of a thousand triangles, which a map into a disk shrinks to a millionth, has about ten triangles on the coarse
+mesh. So steps on the coarse mesh replace steps on the whole mesh, also to resolve overlaps.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from quasiharmonic.energies.newton.newton_descent import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: Vertices of the coarsest mesh, and how many times as many each mesh that is stopped at has at least.
+#: Number of vertices of the coarsest mesh, and minimum ratio between the vertex counts of successive meshes.
 COARSEST, RATIO = 150, 4.0
-# How far the maps of coarse meshes are taken: they are only beginnings. Steps at most, on the coarsest and on others.
+# Tolerance on coarse meshes, whose maps are only starts. Maximum numbers of steps on the coarsest mesh and on others.
 _TOLERANCE, STEPS = 1e-1, (300, 40)
-# Ears stand so high above their edges, one after the other, until the map is bijective.
+# Heights of ears above their edges, relative to the edges; tried in turn until the map is bijective.
 _HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
-# ... and from this height on all of the boundary is put within the coarse image, not only what has met.
+# From this height on, all boundary vertices are placed inside the coarse image, not only those at intersections.
 _LATE = 1e-3
 
 
 def coarse_start(
     V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto", *, guarded: bool = False
 ) -> FloatArray | None:
-    """Flatten a coarse mesh and carry its map to the surface.
+    """Flatten a coarse mesh, and carry its map to the surface.
 
     Parameters
     ----------
@@ -43,15 +43,15 @@ def coarse_start(
     F : (f, 3) int64
         Triangles of a connected surface without handles.
     loops : sequence of (l,) int64
-        Its boundary loops.
+        Boundary loops of the surface.
     linear_solver : str
     guarded : bool
-        Keep the boundary from running into itself from the beginning. Otherwise that is done once it has.
+        Guard the boundary against overlaps from the beginning. Otherwise it is guarded after the first overlap.
 
     Returns
     -------
     (n, 2) float64 or None
-        A bijective map of moderate distortion; None where the way ends in rounding.
+        A bijective map with moderate distortion; None if rounding prevents one.
     """
     hierarchy = Hierarchy(V, F, list(loops), COARSEST)
     return climbed(hierarchy, hierarchy.stations(RATIO), linear_solver, guarded=guarded)
@@ -60,20 +60,20 @@ def coarse_start(
 def climbed(
     hierarchy: Hierarchy, stops: Sequence[int], linear_solver: str = "auto", *, guarded: bool = False
 ) -> FloatArray | None:
-    """Flatten the coarsest of some meshes, and carry its map from each to the next, with a descent on all but the last.
+    """Flatten the coarsest of several meshes, and carry its map to each finer one, with descents on all but the last.
 
     Parameters
     ----------
     hierarchy : Hierarchy
     stops : sequence of int
-        Some of its stops, coarsest first.
+        Some of the hierarchy's stops, coarsest first.
     linear_solver, guarded
-        As `coarse_start` has them.
+        As for `coarse_start`.
 
     Returns
     -------
     (m, 2) float64 or None
-        A bijective map of the last of the meshes; None where the way ends in rounding.
+        A bijective map of the last mesh; None if rounding prevents one.
     """
     here: Level | None = None
     uv: FloatArray | None = None
@@ -94,7 +94,7 @@ def climbed(
 def carried(
     hierarchy: Hierarchy, here: Level, there: Level, uv: FloatArray, linear_solver: str = "auto"
 ) -> FloatArray | None:
-    """A bijective map of one level carried to a finer one and touched up there; None where none was found."""
+    """Carry a bijective map of one level to a finer one, and smooth it; None if no bijective map was found."""
     w = np.zeros(len(hierarchy.V), dtype=np.complex128)
     w[here.vertices] = in_units(uv, 0)
     rim = Rim(there.loops)
@@ -104,7 +104,7 @@ def carried(
         met = rim.meetings(uv)
         if not met.size and is_injective(there.F, uv):
             return touched_up(hierarchy.V[there.vertices], there.F, there.loops, uv, linear_solver)
-        # Those that met are put inside, and in the end all.
+        # Boundary vertices at intersections are placed inside the coarse image, and from _LATE on all of them.
         late = height < _LATE
         wary[there.vertices if late else there.vertices[met]] = True
     return None
@@ -113,7 +113,7 @@ def carried(
 def settled(
     V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
 ) -> tuple[FloatArray, bool]:
-    """A level's map after steps down the symmetric Dirichlet energy, bijective, and whether it had to be guarded."""
+    """Lower the symmetric Dirichlet energy of a level's bijective map; return it and whether a guard was needed."""
     rim = Rim(level.loops)
     energy = thick_energy(V, level.F)
     if not guarded:

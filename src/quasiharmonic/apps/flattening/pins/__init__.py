@@ -1,4 +1,4 @@
-"""Flat maps with fixed vertices: what they forbid, and starts that satisfy them.
+"""Flat maps with fixed vertices: impossible target positions, and initial maps that satisfy the others.
 
 The package builds on the flattening around it and on `problem.diagnosis`. Start reading in `pins`.
 """

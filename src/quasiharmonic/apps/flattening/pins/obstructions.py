@@ -1,4 +1,4 @@
-"""What forbids a bijective map with given vertices held, whatever the boundary does: conditions on the pins alone."""
+"""Conditions on fixed vertices alone that forbid a bijective map with any boundary."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from quasiharmonic.geometry.mesh.topology import Edges, edge_keys
 from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
 from quasiharmonic.util.arrays import FloatArray, IntArray, named, named_edges
 
-# Pairs that meet which are named at most.
+# Maximum number of intersecting pairs that are named.
 _MOST = 100
 
 
 def pin_obstructions(F: IntArray, n: int, found: Edges, fixed: IntArray, target: FloatArray) -> Diagnosis:
-    """Name what is wrong with pins by themselves.
+    """Find contradictions between the target positions of fixed vertices.
 
     Parameters
     ----------
@@ -26,17 +26,18 @@ def pin_obstructions(F: IntArray, n: int, found: Edges, fixed: IntArray, target:
     n : int
         Number of vertices.
     found : Edges
-        Of the triangles.
+        Edges of the triangles.
     fixed : (k,) int64
-        The pins, each once.
+        Fixed vertices, each once.
     target : (k, 2) float64
-        Where they are held.
+        Target positions of the fixed vertices.
 
     Returns
     -------
     Diagnosis
-        With pins in one place, triangles whose three pins are not wound counterclockwise, edges between two pins that
-        meet others or a pin, and pins within a triangle of others. None of them proves nothing.
+        It reports vertices with the same target position, triangles of three fixed vertices that are not
+        counterclockwise, edges between two fixed vertices that intersect others or a fixed vertex, and fixed vertices
+        inside triangles of others. An empty diagnosis proves nothing.
     """
     held = np.zeros(n, dtype=bool)
     held[fixed] = True
@@ -78,14 +79,14 @@ def _wound_wrongly(F: IntArray, held: NDArray[np.bool_], where: FloatArray, foun
 
 
 def _crossing(held: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: IntArray) -> Iterator[Obstruction]:
-    """Edges between pins that meet other such edges or other pins."""
+    """Edges between fixed vertices that intersect other such edges or other fixed vertices."""
     inner, outer = (pairs[held[pairs].all(axis=1)] for pairs in (found.interior, found.boundary))
     segments = np.concatenate([inner, outer, np.stack([fixed, fixed], axis=1)])
     joined = len(inner) + len(outer)
     if not joined:
         return
     pairs = contacts(where, segments, _MOST).pairs
-    # Two pins in one place are named elsewhere, and so are edges without length.
+    # Vertices with the same position are reported by `_shared_places`, so edges of length zero are omitted.
     apart = (where[segments[:, 0]] != where[segments[:, 1]]).any(axis=1) | (np.arange(len(segments)) >= joined)
     for i, j in pairs[(pairs[:, 0] < joined) & apart[pairs].all(axis=1)].tolist():
         ends = segments[[i, j]]
@@ -98,7 +99,7 @@ def _crossing(held: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: I
 
 
 def _covered(F: IntArray, held: NDArray[np.bool_], where: FloatArray, fixed: IntArray) -> Iterator[Obstruction]:
-    """Pins inside a triangle that other pins hold."""
+    """Fixed vertices inside a triangle of other fixed vertices."""
     whole = np.flatnonzero(held[F].all(axis=1))
     corners = where[F[whole]]
     places = where[fixed]

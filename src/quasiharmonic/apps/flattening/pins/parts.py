@@ -1,10 +1,10 @@
-"""Several surfaces that have vertices held: each where its pins say, and none over another.
+"""Several surfaces with fixed vertices: each at its target positions, without overlaps between them.
 
-each by itself (`pins`) ─▶ do they overlap each other? ─ no ─▶ done
+each surface separately (`pins`) ─▶ do they overlap? ─ no ─▶ done
 │ yes
 ▼
-all of them one piece, each where it is, or, where others are in the way, small around one of its pins, or beside
-─▶ air around all of them, and the search that a single surface gets ─▶ guarded descent of all
+all of them as one piece: each at its position, or, if it overlaps others, small around one of its pins, or beside them
+─▶ air around all of them, and the same search as for one surface ─▶ guarded descent of all
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Of the room around a pin, how much a part takes that is put there; how far from the others, in their size, one is that
-# is put beside them.
+# Fraction of the free space around a pin that a surface placed there uses; and the distance of a surface placed beside
+# the others, relative to their size.
 _SHARE, _BESIDE = 0.5, 0.25
-# Pins of a part around which room is looked for.
+# Maximum number of pins per surface around which free space is measured.
 _MOST_PINS = 100
 
 
@@ -42,38 +42,38 @@ def pinned_parts(
     weights: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> MapResult:
-    """Map surfaces into the plane bijectively, each with some vertices held and the boundary free.
+    """Map surfaces into the plane bijectively, each with some fixed vertices and an otherwise free boundary.
 
     Parameters
     ----------
     F : (f, 3) int64
-        The triangles of a mesh.
+        Triangles of the mesh.
     parts : sequence of Part
-        Those of its surfaces with a vertex that is held.
+        The surfaces that have a fixed vertex.
     fixed : (k,) int64
-        Vertices of the mesh, each once.
+        Fixed vertices of the mesh, each once.
     target : (k, 2) float64
-        Where they are held.
+        Target positions of the fixed vertices.
     settings : Settings
     weights : (f,) float64, optional
     start : (n, 2) float64, optional
-        As `pinned` has them, of the whole mesh.
+        As for `pinned`, for the whole mesh.
 
     Returns
     -------
     MapResult
-        As that of `pinned`, ``uv`` and certificate of the parts alone, one after the other. Where each has found its
-        place but they overlap each other, the status is ``INJECTIVE``.
+        As for `pinned`; ``uv`` and certificate contain only the parts, one after the other. If each part has a
+        bijective map but they overlap each other, the status is ``INJECTIVE``.
 
     Raises
     ------
     KeyboardInterrupt
-        When Ctrl-C comes before there is any bijective map of each part, with or without pins.
+        If Ctrl-C comes before there is a bijective map of each part, with or without pins.
     """
     began = time.perf_counter()
 
     def posed(part: Part) -> Pinned:
-        """The problem of a part, by its own numbers."""
+        """Return the problem of a part, in its own numbering."""
         number = np.full(int(F.max()) + 1, -1)
         number[part.vertices] = np.arange(part.vertices.size)
         here = number[fixed] >= 0
@@ -86,7 +86,7 @@ def pinned_parts(
         given = None if start is None else start[part.vertices]
         with np.errstate(all="ignore"):
             if results and results[-1].status is Status.INTERRUPTED:
-                # The others still need a place, if not their best one.
+                # The other parts still need a position, so they are only flattened freely.
                 run.lay(given)
                 run.status = Status.INTERRUPTED
             else:
@@ -110,7 +110,7 @@ def pinned_parts(
 
 
 def _side_by_side(whole: Part, results: Sequence[MapResult]) -> MapResult:
-    """The maps of all parts as one, whatever they do to each other."""
+    """Combine the maps of all parts, which may overlap."""
     uv = np.concatenate([result.uv for result in results])
     return MapResult(
         uv=uv,
@@ -123,13 +123,13 @@ def _side_by_side(whole: Part, results: Sequence[MapResult]) -> MapResult:
 
 
 def _apart(run: Pinned, whole: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
-    """Look for a bijective map of all parts, from a map of each that leaves others no room."""
+    """Find a bijective map of all parts, from separate maps that overlap each other."""
     unit = -run.exponent
     with np.errstate(all="ignore"):
         run.keep(np.ldexp(found.uv, unit))
         maps = [np.ldexp(result.uv, unit) for result in results]
         order = _most_held_first(maps, run.pins[0])
-        # Whoever comes first has its place, and decides within whose hole the others are.
+        # The first part keeps its position, which decides whether others lie in its holes.
         for turn in (order, order[::-1]):
             run.seek(_arranged(whole, maps, run.pins, turn))
             if run.certificate.bijective or run.status is Status.INTERRUPTED:
@@ -143,7 +143,7 @@ def _apart(run: Pinned, whole: Part, results: Sequence[MapResult], found: MapRes
 
 
 def _most_held_first(maps: Sequence[FloatArray], fixed: IntArray) -> list[int]:
-    """Parts by falling number of pins, the larger one first of two that have as many."""
+    """Order parts by decreasing number of pins, then by decreasing size."""
     ends = np.cumsum([len(uv) for uv in maps])
     pins = np.bincount(np.searchsorted(ends, fixed, side="right"), minlength=len(maps))
     return sorted(range(len(maps)), key=lambda k: (-int(pins[k]), -float(np.ptp(maps[k], axis=0).max())))
@@ -152,7 +152,7 @@ def _most_held_first(maps: Sequence[FloatArray], fixed: IntArray) -> list[int]:
 def _arranged(
     whole: Part, maps: Sequence[FloatArray], pins: tuple[IntArray, FloatArray], order: Sequence[int]
 ) -> FloatArray:
-    """Put bijective maps next to each other in this order: where they are, at one of their pins, or beside."""
+    """Arrange bijective maps without overlap, in this order: in place, small at one of their pins, or beside."""
     places = np.concatenate(maps)
     ends = np.cumsum([0, *(len(uv) for uv in maps)])
     owner = np.searchsorted(ends, [loop[0] for loop in whole.piece.loops], side="right") - 1
@@ -175,7 +175,7 @@ def _those_of(pins: tuple[IntArray, FloatArray], first: int, end: int) -> tuple[
 def _with_room(
     uv: FloatArray, places: FloatArray, settled: Sequence[IntArray], fixed: IntArray, target: FloatArray
 ) -> FloatArray:
-    """A map made small around that of its pins with the most room among others, or put beside them if none has any."""
+    """Shrink a map around its pin with the most free space; if no pin has any, move the map beside the others."""
     tails = places[np.concatenate(settled)]
     heads = places[np.concatenate([np.roll(loop, -1) for loop in settled])]
     around, on = winding(target, tails, heads)
@@ -190,13 +190,13 @@ def _with_room(
 
 
 def _distances(points: FloatArray, tails: FloatArray, heads: FloatArray) -> FloatArray:
-    """How far points (k, 2) are from the nearest of some segments (m, 2); (k,) float64."""
+    """Distances of points (k, 2) to the nearest of several segments (m, 2); (k,) float64."""
     along, away = (heads - tails) @ (1, 1j), (points[:, None] - tails) @ (1, 1j)
     return np.abs(away - np.clip((away / along).real, 0, 1) * along).min(axis=1)
 
 
 def _by_the_mesh(diagnosis: Diagnosis, part: Part) -> Diagnosis:
-    """A part's diagnosis with its elements by the mesh's numbers; messages keep theirs, and say so."""
+    """Convert a part's diagnosis to the mesh's numbering; messages keep the part's numbering, and say so."""
     return Diagnosis(
         tuple(
             replace(

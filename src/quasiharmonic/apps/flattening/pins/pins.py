@@ -1,12 +1,14 @@
-"""Any vertices held at given places and all else free, the boundary too: a bijective map.
+"""Bijective maps with fixed vertices and a boundary that is otherwise free.
 
-    surface ─▶ flattened freely ─▶ moved, turned and scaled onto the pins ─▶ air around it, holes filled, up to a frame
-            ─▶ surface and air as one problem of fixed boundary: frame and pins are held, the rest finds its way
-            ─▶ bijective; the air is dropped ─▶ guarded descent, nothing held but the pins ─▶ certified
+    surface ─▶ flattened freely ─▶ shifted, rotated and scaled onto the pins ─▶ air around it up to a frame, holes
+    filled
+            ─▶ surface and air solved as one problem with frame and pins fixed
+            ─▶ bijective; the air is removed ─▶ guarded descent with only the pins fixed ─▶ certified
 
-While the frame stays and no triangle of surface and air is inverted, no two points of the surface share a place. So
-the search that meets pins inside any outline meets them where there is none. Edges of air between pins can forbid a map
-that the surface alone would allow: they are split, as are those that a diagnosis names, for air may have any vertices.
+While the frame is fixed and no triangle of surface and air is inverted, the surface does not overlap itself. So the
+solver for fixed boundaries also solves this problem. Air edges between pins can forbid a map that the surface alone
+allows. These edges are split, and so are air edges that a diagnosis names, because new vertices in the air are
+harmless.
 """
 
 from __future__ import annotations
@@ -37,16 +39,16 @@ from quasiharmonic.solver.search.stages import CoarseToFine, Stages
 from quasiharmonic.solver.search.strategy import speed
 from quasiharmonic.util.arrays import FloatArray, IntArray, held_places, held_vertices
 
-# How far the map that is moved onto the pins is flattened before.
+# Tolerance and maximum number of steps for the map that is then moved onto the pins.
 _TOLERANCE, _STEPS = 1e-2, 40
-# Distance of the frame over the longer side of the box around surface and pins, in one try after the other.
+# Distance of the frame, relative to the longer side of the box around surface and pins, for each attempt in turn.
 _MARGINS = 0.5, 1.5
-# Iterations after which tensors are left for vertices, and how many of these: three times as quick in hard cases as to
-# wait until tensors have settled, and as sure, since what is tried otherwise comes after.
+# Iterations on tensors before vertices are moved, and iterations on vertices. In hard cases this takes a third of the
+# time of waiting until tensors converge. It is as reliable, since the other methods follow.
 _FIRST, _UNTANGLING = 60, 300
-# Patches in a row that may be started anew in vain, when all else has failed.
+# Maximum number of consecutive failed restarts of patches, after all other methods have failed.
 _IN_VAIN = 30
-# Linear solves at most in each try, unless more are asked for, and times that air is split as a diagnosis says.
+# Minimum of the limit on linear solves per attempt, and maximum number of times that air edges are split.
 _ITERATIONS, _SPLITS = 2000, 4
 
 
@@ -58,48 +60,48 @@ def pinned(
     weights: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> MapResult:
-    """Map a surface into the plane bijectively, with some vertices held and the boundary free.
+    """Map a surface into the plane bijectively, with some fixed vertices and an otherwise free boundary.
 
     Parameters
     ----------
     piece : Piece
     fixed : (k,) int64
-        Vertices that are held, on the boundary or not, each once; at least one.
+        Fixed vertices, on the boundary or not, each once; at least one.
     target : (k, 2) float64
-        Where they are held.
+        Target positions of the fixed vertices.
     settings : Settings
-        Of the descent once the map is bijective. The search before it is called back from, too.
+        Options of the descent that follows once the map is bijective. The search also uses its callback.
     weights : (f,) float64, optional
-        How much each triangle's distortion counts.
+        Weight of each triangle's distortion.
     start : (n, 2) float64, optional
-        An injective map to begin with, of any size and anywhere.
+        Initial injective map, at any scale and position.
 
     Returns
     -------
     MapResult
-        With ``fixed`` at ``target`` to the last bit. Where ``certificate.bijective``, the status tells how far
-        distortion was lowered, as that of `flatten`. Where not, it is ``IMPOSSIBLE`` if there is a proof that no
-        bijective map has the vertices there, which the diagnosis gives; otherwise what the search has ended with,
-        or ``INJECTIVE`` where no triangle is inverted but the surface overlaps itself.
+        The vertices ``fixed`` are exactly at ``target``. If ``certificate.bijective``, the status reports the
+        convergence of the distortion, as for `flatten`. Otherwise it is ``IMPOSSIBLE`` if the diagnosis proves that
+        there is no bijective map, ``INJECTIVE`` if no triangle is inverted but the surface overlaps itself, or else the
+        status of the search.
 
     Raises
     ------
     ValueError
-        When a rest triangle has no area. Places that no map can meet, two vertices in one for instance, are no
-        malformed input.
+        If a rest triangle has no area. Impossible target positions, such as the same one for two vertices, do not
+        raise an error.
     KeyboardInterrupt
-        When Ctrl-C comes before there is any bijective map, with or without pins.
+        If Ctrl-C comes before there is any bijective map, with or without pins.
     """
     began = time.perf_counter()
     run = Pinned(piece, fixed, target, settings, weights)
-    # Overflow gives inf or NaN, and every comparison with NaN is false: such a step is never accepted.
+    # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
     with np.errstate(all="ignore"):
         run.run(start)
     return replace(run.result(), seconds=time.perf_counter() - began)
 
 
 def moved_onto(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    """A map moved, turned and scaled so that vertices come as near to their places as can be, by least squares.
+    """Shift, rotate and scale a map so that vertices are as near to target positions as possible, by least squares.
 
     Parameters
     ----------
@@ -110,7 +112,7 @@ def moved_onto(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArra
     Returns
     -------
     (n, 2) float64
-        Only moved if there is one vertex, or none of this brings them nearer.
+        Only shifted if there is one vertex, or if the best scale is zero or not finite.
     """
     w, there = (np.ascontiguousarray(places).view(np.complex128).ravel() for places in (uv, target))
     here = w[fixed]
@@ -123,9 +125,9 @@ def moved_onto(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArra
 
 
 def _stages(problem: Problem, *, last: bool) -> Stages:
-    """What is tried, in which order: air gives way, so that vertices can be moved soon.
+    """The methods to try, in order; the air is flexible, so vertices are moved early.
 
-    Random restarts are left to the last: other air is a better chance than a hundred tries with this one.
+    Random restarts are used in the last attempt only, as other air is more promising than many restarts with this one.
     """
     stages = [stage for stage in speed(problem) if not isinstance(stage, RandomRestarts)]
     if isinstance(stages[0], CoarseToFine):
@@ -136,12 +138,12 @@ def _stages(problem: Problem, *, last: bool) -> Stages:
 
 
 def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
-    """Vertices of n and their places, checked: what `flatten` takes as ``fixed`` and ``target``.
+    """Check the arguments ``fixed`` and ``target`` of `flatten` for a mesh of n vertices.
 
     Raises
     ------
     ValueError
-        When there is none, one is no vertex or held twice, or a place is missing or not finite.
+        If no vertex is given, an index is out of range or repeated, or a position is missing or not finite.
     """
     vertices = held_vertices(fixed, n)
     if not vertices.size:
@@ -149,31 +151,32 @@ def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray,
     return vertices, held_places(target, vertices.size)
 
 
-# In powers of two: how many times further apart pins may be than the surface is large, or nearer, for energies.
+# Binary exponent: maximum ratio between the extent of the pins and the surface's size, either way, for energies.
 _APART = 100
-# In powers of two, in its unit: how far away a map may be from the origin.
+# Binary exponent: maximum distance of a map from the origin, in its unit.
 _LARGEST = 1000
-# Ends of a search that say no more than that no map was found, of which one may be injective all the same.
+# Statuses that only report that no map was found; the map may still be injective.
 _UNDECIDED = Status.INJECTIVE, Status.STALLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
 
 class Pinned:
-    """A surface with vertices held, the map of it so far, and what is to be told.
+    """The mapping of a surface with fixed vertices: the current map, and its record for the result.
 
     Parameters
     ----------
     piece, fixed, target, settings, weights
-        As `pinned` has them.
+        As for `pinned`.
 
     Attributes
     ----------
     certificate : Certificate
-        Of the map so far.
+        The certificate of the current map.
     status : Status
     exponent : int
-        The map is in units of ``2 ** exponent``: in the piece's, unless pins are so much further apart, or nearer, than
-        vertices of the surface that squares of stretches leave the numbers' range, or so far from the origin that they
-        would themselves. Energies are then measured as if they were less so; what has the least is the same.
+        The map is in units of ``2 ** exponent``, normally the piece's unit. It differs if the extent of the pins
+        differs so much from the surface's size that squared stretches exceed the range of doubles, or if the pins are
+        too far from the origin. Energies are then measured for pins at a smaller ratio or distance; the minimum is the
+        same.
     """
 
     def __init__(
@@ -181,11 +184,11 @@ class Pinned:
     ) -> None:
         self._piece, self._settings = piece, settings
         self._fixed, self._given = fixed, target
-        # A quarter of it, for the difference of the largest numbers is none.
+        # Computed from quarters, because the difference of the largest doubles overflows.
         extent, quarter = np.frexp(np.ptp(np.ldexp(target, -2), axis=0).max())
         apart = int(quarter) + 2 - piece.exponent if extent > 0 else 0
         unit = piece.exponent + apart - min(max(apart, -_APART), _APART)
-        # From the origin they may be still further away; a map there must not leave the numbers' range either.
+        # Pins may be even farther from the origin, and the map there must also stay within the range of doubles.
         self._larger = max(int(np.frexp(np.abs(target).max())[1]) - _LARGEST - unit, 0)
         self.exponent = unit + self._larger
         self._target = np.ldexp(target, -self.exponent)
@@ -199,11 +202,11 @@ class Pinned:
 
     @property
     def pins(self) -> tuple[IntArray, FloatArray]:
-        """The vertices (k,) that are held, and where (k, 2)."""
+        """The fixed vertices (k,) and their target positions (k, 2)."""
         return self._fixed, self._target
 
     def run(self, start: FloatArray | None) -> None:
-        """Find a bijective map with the vertices in place, and lower its distortion."""
+        """Find a bijective map with the vertices at their target positions, and lower its distortion."""
         moved = self.lay(start)
         if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
             self.seek(moved)
@@ -211,7 +214,7 @@ class Pinned:
             self.let_go()
 
     def lay(self, start: FloatArray | None) -> FloatArray:
-        """Flatten freely, from a start in the surface's unit if there is one, and move that onto the pins; (n, 2)."""
+        """Flatten freely, optionally from a start in the surface's unit, and move the map onto the pins; (n, 2)."""
         piece = self._piece
         rough = replace(
             self._settings, density=SymmetricDirichlet(), name="symmetric-dirichlet", callback=None, record_every=0
@@ -227,7 +230,7 @@ class Pinned:
         return moved
 
     def seek(self, moved: FloatArray) -> None:
-        """Look for a bijective map with the vertices in place, from a bijective map (n, 2) with them elsewhere."""
+        """Find a bijective map with the target positions, from a bijective map (n, 2) without them."""
         piece = self._piece
         n = len(piece.V)
         diagnosis = pin_obstructions(piece.F, n, edges(piece.F, n), self._fixed, self._target)
@@ -235,7 +238,7 @@ class Pinned:
             self.status, self._diagnosis = Status.IMPOSSIBLE, diagnosis
             return
         if not certify(piece.F, moved, loops=piece.loops).bijective:
-            # Too far away, or too large or small there, for doubles to tell its triangles.
+            # At this distance or scale, doubles cannot resolve the triangles.
             self.status = Status.ROUNDED
             return
         for margin in _MARGINS:
@@ -244,12 +247,12 @@ class Pinned:
                 return
 
     def _search(self, flat: FloatArray, margin: float, *, last: bool) -> None:
-        """Solve surface and air together, from a bijective map of the surface, with frame and pins held."""
+        """Solve surface and air together, from a bijective map of the surface, with frame and pins fixed."""
         n, piece = len(flat), self._piece
         try:
             air = air_around(piece.F, flat, piece.loops, margin=margin, around=self._target)
         except ValueError:
-            # The boundary is so near to itself that no doubles are in between.
+            # There are no doubles between close parts of the boundary.
             self.status = Status.ROUNDED
             return
         F, points = np.concatenate([piece.F, air.F]), np.concatenate([flat, air.points])
@@ -289,14 +292,14 @@ class Pinned:
                 return
 
     def _of_air(self, pairs: IntArray) -> IntArray:
-        """Those edges that belong to no triangle of the surface."""
+        """Return the edges that belong to no triangle of the surface."""
         F = self._piece.F
         n = max(int(pairs.max(initial=0)) + 1, len(self._piece.V))
         own = edge_keys(F.ravel(), np.roll(F, -1, axis=1).ravel(), n)
         return pairs[~np.isin(edge_keys(pairs[:, 0], pairs[:, 1], n), own)]
 
     def _of_surface(self, diagnosis: Diagnosis) -> Diagnosis | None:
-        """Those obstructions that neither air nor frame have a part in; None where there are none."""
+        """Return the obstructions that do not involve air or frame; None if there are none."""
         n, F = len(self._piece.V), self._piece.F
         held = np.zeros(n, dtype=bool)
         held[self._fixed] = True
@@ -306,7 +309,7 @@ class Pinned:
             if vertices.max(initial=-1) >= n or obstruction.triangles.max(initial=-1) >= len(F):
                 continue
             if obstruction.kind in (Kind.HALF_PLANES, Kind.HIDDEN):
-                # Where the pins do not go all around a vertex, there may be a place for it beyond the frame.
+                # If not all neighbours of a vertex are fixed, it may have a valid position outside the frame.
                 around = np.setdiff1d(F[np.isin(F, vertices[:1]).any(axis=1)], vertices[:1])
                 if not held[around].all():
                     continue
@@ -316,7 +319,7 @@ class Pinned:
         return Diagnosis(tuple(own), diagnosis.unchecked) if own else None
 
     def let_go(self) -> None:
-        """Lower the distortion from a bijective map, nothing held but the pins."""
+        """Lower the distortion of a bijective map with only the pins fixed."""
         began, settings = time.perf_counter(), self._settings
         descent = GuardedDescent(self._energy, self._uv, settings.linear_solver, Rim(self._piece.loops), self._fixed)
         self._solver = descent.system.solver.name
@@ -343,19 +346,19 @@ class Pinned:
             settings.callback(self._history[-1])
 
     def keep(self, uv: FloatArray) -> None:
-        """Take a map on, in units of ``2 ** exponent``, with the vertices put in place."""
+        """Store a map in units of ``2 ** exponent``, with the fixed vertices set to their target positions."""
         self._uv = uv.copy()
         self._uv[self._fixed] = self._target
         self.certificate = certify(self._piece.F, self._uv, loops=self._piece.loops)
 
     def _outward(self, uv: FloatArray) -> FloatArray:
-        """A map in the target's unit, the vertices where they were given to the last bit."""
+        """Return a map in the target's unit, with the fixed vertices exactly at their target positions."""
         placed = in_given_unit(uv, self.exponent)
         placed[self._fixed] = self._given
         return placed
 
     def result(self) -> MapResult:
-        """What is handed back."""
+        """Return the result for the current map."""
         uv = self._outward(self._uv)
         certificate = certify(self._piece.F, uv, loops=self._piece.loops)
         status = self.status

@@ -1,8 +1,8 @@
-"""Points whose spacing follows the lengths of given edges and grows away from them: the leaves of a quadtree.
+"""Points whose spacing follows the lengths of given edges and grows away from them, from the leaves of a quadtree.
 
-Squares are split until those that meet an edge are about as large as the edge is long, and then wherever a square
-would have a neighbour less than half its size. So there are a few points to every edge, whatever the range of lengths.
-Squares of one size are shifted by half, row against row, which makes their middles' triangles nearly equilateral.
+Squares are split until those at an edge are about as large as the edge's length. Neighbouring squares differ in size by
+at most a factor of two. So each edge has a few points near it for any range of lengths. In rows of squares of one size,
+points are shifted alternately, so that they form nearly equilateral triangles.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ import numpy as np
 
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Times the squares may be halved.
+# Maximum number of times that squares are halved.
 _DEEPEST = 40
-# Squares across a level are counted by one integer a square: room for this many bits of each coordinate.
+# A square is encoded as one integer with this number of bits per coordinate.
 _BITS = 31
 
 
 @dataclass(frozen=True)
 class Quadtree:
-    """A rectangle of squares, split into quarters where that is asked for, next to each other by halves at most.
+    """A rectangle of squares, split into quarters where requested; neighbours differ by at most one level.
 
     Attributes
     ----------
     corner : (2,) float64
-        The lower left one.
+        Lower left corner.
     side : float
-        Of the largest squares.
+        Side of the largest squares.
     shape : (int, int)
         Numbers of largest squares along x and y.
     split : list of (k,) int64
-        Squares that are split, level by level, as ascending integers ``y · 2³¹ + x``.
+        Split squares of each level, as ascending integers ``y · 2³¹ + x``.
     """
 
     corner: FloatArray
@@ -44,8 +44,8 @@ class Quadtree:
     def around(
         cls, places: FloatArray, sizes: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
     ) -> Quadtree:
-        """Split until squares at given places (k, 2) have at most given sizes (k,)."""
-        # As deep as the integers reach: what is smaller still gets squares larger than asked for.
+        """Split until squares at given positions (k, 2) have at most given sizes (k,)."""
+        # The depth is limited by the integers; smaller sizes get squares that are too large.
         lowest_energy = min(_DEEPEST, _BITS - 1 - int(np.ceil(np.log2(max(shape)))))
         with np.errstate(divide="ignore"):
             level = np.clip(np.ceil(np.log2(side / sizes)), 0, lowest_energy).astype(np.int64)
@@ -54,7 +54,7 @@ class Quadtree:
         for depth in range(int(level.max(initial=0)) - 1, -1, -1):
             here = places[level == depth + 1]
             asked = np.floor((here - corner) / (side * 0.5**depth)).astype(np.int64)
-            # Squares beside a split one must be there, so the squares that these are quarters of are split.
+            # Neighbours of a split square must exist, so their parent squares are split.
             x, y = below & (1 << _BITS) - 1, below >> _BITS
             beside = [(np.clip(x + dx, 0, None) >> 1, np.clip(y + dy, 0, None) >> 1) for dx, dy in _BESIDE]
             x, y = (np.concatenate([asked[:, k], *(pair[k] for pair in beside)]) for k in range(2))
@@ -64,7 +64,7 @@ class Quadtree:
         return cls(corner, side, shape, split[::-1])
 
     def leaves(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Level and integer place along x and y of every square that is not split; each (k,) int64."""
+        """Return level and integer position along x and y of every square that is not split; each (k,) int64."""
         x, y = (axis.ravel() for axis in np.meshgrid(*map(np.arange, self.shape)))
         there = (y << _BITS) + x
         levels, kept = [], []
@@ -77,7 +77,7 @@ class Quadtree:
         return np.concatenate(levels), keys & (1 << _BITS) - 1, keys >> _BITS
 
     def points(self) -> tuple[FloatArray, FloatArray]:
-        """A point in every leaf, (k, 2), and the leaves' sides (k,)."""
+        """Return a point in every leaf, (k, 2), and the leaves' sides (k,)."""
         level, x, y = self.leaves()
         size = np.asarray(self.side * 0.5**level, dtype=np.float64)
         shifted = x + np.where(y % 2, 0.75, 0.25)
@@ -85,7 +85,7 @@ class Quadtree:
         return points, size
 
     def sizes_at(self, places: FloatArray) -> FloatArray:
-        """The sides of the leaves that hold given places (k, 2) within the rectangle; (k,) float64."""
+        """Return the sides of the leaves at given positions (k, 2) in the rectangle; (k,) float64."""
         size = np.full(len(places), self.side)
         for depth, split in enumerate(self.split):
             x, y = np.floor((places - self.corner) / (self.side * 0.5**depth)).astype(np.int64).T

@@ -1,13 +1,13 @@
-"""The plane around a flat surface as triangles of good shape: outside up to a frame, and inside the holes.
+"""Triangulate the plane around a flat surface with well-shaped triangles: outside up to a frame, and inside holes.
 
-As long as no triangle of surface and air is inverted, and the frame stays, the surface does not overlap itself. Air
-with points of its own gives way, where triangles that span a whole gap lock.
+As long as no triangle of surface and air is inverted and the frame is fixed, the surface does not overlap itself. The
+air has its own points, which make it flexible; triangles that span a whole gap would lock.
 
-    boundary ──lengths──▶ quadtree ──middles, not near an edge──▶ inner points ──constrained Delaunay──▶ triangles
-             ──▶ those of the surface's inside cut out ──▶ smoothed ──▶ air
+    boundary ──lengths──▶ quadtree ──centres away from edges──▶ inner points ──constrained Delaunay──▶ triangles
+             ──▶ those inside the surface removed ──▶ smoothed ──▶ air
 
-Nothing is added on the boundary. Where a gap is narrower than the edges around it, triangles span it: there is no other
-way without splitting edges.
+No points are added on the boundary. Where a gap is narrower than the edges around it, triangles span it, as this can
+only be avoided by splitting edges.
 """
 
 from __future__ import annotations
@@ -26,32 +26,32 @@ from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, cons
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, named
 
-# Side of a square of the tree over the length of an edge in it.
+# Side of a square of the tree, relative to the length of an edge in it.
 _SPACING = 1.4
-# Inner points nearer to the boundary than this part of their square's side are left out.
+# Minimum distance of inner points to the boundary, relative to their square's side.
 _CLEARANCE = 0.55
-# The frame's sides are bent outwards by this part of their length: corners of a hull are strictly convex.
+# The frame's sides are bent outwards by this fraction of their length, so that corners of the hull are strictly convex.
 _BULGE = 0.05
-# Squares of the tree along the longer side of the frame, before any is split.
+# Number of the tree's largest squares along the longer side of the frame.
 _ACROSS = 8
 _SMOOTHINGS = 3
 _MEETS_ITSELF = "the boundary meets itself, and no air fits around it: certify(F, uv) names where"
-# Shapes above this, 1 being an equilateral triangle's, may get worse in smoothing.
+# Smoothing may reduce shape qualities above this; 1 is an equilateral triangle.
 _GOOD = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Air:
-    """What is around a flat surface.
+    """A triangulation of the surroundings of a flat surface.
 
     Attributes
     ----------
     points : (k, 2) float64
-        New points, which follow the surface's n vertices: they are vertices n … n + k - 1.
+        New points, which follow the surface's n vertices as vertices n … n + k - 1.
     F : (a, 3) int64
         Triangles between the surface's boundary vertices and the new points, counterclockwise.
     frame : (h,) int64
-        Those new vertices that lie on the frame, counterclockwise.
+        The new vertices on the frame, counterclockwise.
     """
 
     points: FloatArray
@@ -67,37 +67,37 @@ def air_around(
     margin: float = 0.5,
     around: ArrayLike | None = None,
 ) -> Air:
-    """Triangulate the plane around a flat surface, up to a frame, and its holes.
+    """Triangulate the plane around a flat surface up to a frame, and its holes.
 
     Parameters
     ----------
     F : (f, 3) array of int
-        Triangles of the surface; only their vertices' number matters here.
+        Triangles of the surface; only the number of their vertices is used.
     uv : (n, 2) array
-        A map that is bijective, as `certify` decides it. Inner vertices are not looked at.
+        A map that `certify` reports as bijective. Interior vertices are not read.
     loops : sequence of (l,) int64
-        The boundary loops, the surface to their left (`quasiharmonic.geometry.mesh.topology.boundary_loops`).
+        Boundary loops, with the surface on their left (`quasiharmonic.geometry.mesh.topology.boundary_loops`).
     margin : float
-        Distance of the frame, over the longer side of the boundary's box.
+        Distance of the frame, relative to the longer side of the boundary's bounding box.
     around : (p, 2) array, optional
-        Places that the frame is to be around, too, by the same margin.
+        Additional positions that the frame encloses, with the same margin.
 
     Returns
     -------
     Air
         Surface and air together, ``np.concatenate([F, air.F])``, are a triangle mesh whose only boundary is the frame.
-        Deterministic.
+        The result is deterministic.
 
     Raises
     ------
     ValueError
-        When the boundary meets itself, so that nothing could be around it, or ``margin`` is not positive.
+        If the boundary touches or crosses itself, or ``margin`` is not positive.
     """
     if not 0 < margin < np.inf:
         raise ValueError(f"margin must be positive, not {margin}")
     places = np.asarray(uv, dtype=np.float64)
     n, boundary = len(places), np.concatenate(loops)
-    # A power of two, so that no digit is lost on the way.
+    # Scaling by a power of two is exact.
     exponent = int(np.frexp(np.abs(places[boundary]).max())[1])
     others = np.empty((0, 2)) if around is None else np.ldexp(np.asarray(around, dtype=np.float64), -exponent)
     outline = np.ldexp(places[boundary], -exponent)
@@ -111,7 +111,7 @@ def air_around(
     points, triangles = _conforming(outline, segments, frame, inner)
     triangles = triangles[_outside(triangles, segments, len(points))]
     points = _smoothed(points, triangles, len(outline) + len(frame))
-    # What was put within the surface, by misjudgement, has gone with its triangles.
+    # Inner points that were placed inside the surface by mistake were removed with their triangles.
     used = np.unique(triangles[triangles >= len(outline)])
     number = np.concatenate([boundary, np.zeros(len(points) - len(outline), dtype=np.int64)])
     number[used] = n + np.arange(len(used))
@@ -123,7 +123,7 @@ def air_around(
 
 
 def _squares(points: FloatArray, margin: float) -> tuple[FloatArray, float, tuple[int, int]]:
-    """Corner, side and numbers of the squares that cover the points' box and a margin around it."""
+    """Corner, side and numbers of the squares that cover the points' bounding box and a margin around it."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     longer = float(extent.max())
     side = (1 + 2 * margin) * longer / _ACROSS
@@ -132,7 +132,7 @@ def _squares(points: FloatArray, margin: float) -> tuple[FloatArray, float, tupl
 
 
 def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArray:
-    """A rectangle with bent sides, counterclockwise, a point for every square along it; (h, 2) float64."""
+    """A rectangle with bent sides, counterclockwise, with one point per square along it; (h, 2) float64."""
     width, height = side * shape[0], side * shape[1]
     frame = []
     for start, along, outward, count in (
@@ -150,7 +150,7 @@ def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArra
 def _inner_points(
     tails: FloatArray, heads: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
 ) -> FloatArray:
-    """Points in the air, as dense as the boundary's edges are short, and not too near to these; (k, 2) float64."""
+    """Points in the air with the density of the boundary's edges, and not too close to them; (k, 2) float64."""
     from scipy.spatial import KDTree
 
     lengths = np.hypot(*(heads - tails).T)
@@ -162,7 +162,8 @@ def _inner_points(
         shape,
     )
     points, sizes = tree.points()
-    # In pieces no longer than half the squares that they are in, the nearest middle tells the nearest edge.
+    # Edges are cut into pieces of at most half their squares' sides, so that the nearest centre gives the nearest
+    # piece.
     pieces = []
     p, q = tails, heads
     while len(p):
@@ -185,7 +186,7 @@ def _inner_points(
 def _conforming(
     outline: FloatArray, segments: IntArray, frame: FloatArray, inner: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Triangulate all points with the segments as edges, without such inner points as lie on one."""
+    """Triangulate all points with the segments as edges; inner points that lie on a segment are dropped."""
     hull = len(outline) + np.arange(len(frame))
     while True:
         points = np.concatenate([outline, frame, inner])
@@ -201,7 +202,7 @@ def _conforming(
 
 
 def _outside(triangles: IntArray, segments: IntArray, n: int) -> BoolArray:
-    """Which triangles are on the right of the segments, (t,): those that can be reached without crossing one."""
+    """Which triangles are on the right of the segments, (t,): those connected to it without crossing a segment."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -219,7 +220,7 @@ def _outside(triangles: IntArray, segments: IntArray, n: int) -> BoolArray:
 
 
 def _smoothed(points: FloatArray, triangles: IntArray, held: int) -> FloatArray:
-    """Move points, but the first ones, to the middle of their neighbours, where no triangle gets a worse shape."""
+    """Move points after the first ``held`` to the mean of their neighbours, if no triangle's shape gets worse."""
     n = len(points)
     tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     count = np.maximum(np.bincount(tails, minlength=n), 1)
@@ -244,7 +245,7 @@ def _smoothed(points: FloatArray, triangles: IntArray, held: int) -> FloatArray:
 
 
 def _shapes(points: FloatArray, triangles: IntArray) -> FloatArray:
-    """Of triangles, 1 for equilateral ones, towards 0 for slivers, negative for inverted ones; (t,) float64."""
+    """Shape quality of triangles: 1 if equilateral, near 0 for slivers, negative if inverted; (t,) float64."""
     w = np.ascontiguousarray(points).view(np.complex128).ravel()
     corners = w[triangles.T]
     sides = (np.abs(corners - np.roll(corners, 1, axis=0)) ** 2).sum(axis=0)
