@@ -131,7 +131,10 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
 
 
 def read_edges(path: Path, n: int) -> NDArray[np.int64]:
-    """Read edges, two vertices of ``n`` on each line; blanks, commas or colons between, ``#`` before comments."""
+    """Read edges, two vertex indices below ``n`` per line; (k, 2) int64.
+
+    Blanks, commas or colons separate the indices; ``#`` starts a comment.
+    """
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError

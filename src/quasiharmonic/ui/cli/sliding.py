@@ -82,7 +82,10 @@ def told_off(rails: BoundaryCurves, island: Island) -> list[str]:
 
 
 def read_pieces(path: Path, sides: int) -> dict[int, int]:
-    """Read lines of a vertex and its side, one of so many; blanks, commas or colons between, ``#`` before comments."""
+    """Read lines of a vertex and its side; side indices must be below ``sides``.
+
+    Blanks, commas or colons separate the indices; ``#`` starts a comment.
+    """
     from quasiharmonic.io.errors import MeshFileError
 
     told: dict[int, int] = {}
