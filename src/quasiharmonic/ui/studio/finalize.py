@@ -1,4 +1,7 @@
-"""The map at rest: the one that the command makes, found from nothing and smoothed, so that all can make it again."""
+"""Compute the final map after a drag: solve from scratch, then smooth.
+
+The command does the same, so the map can be reproduced.
+"""
 
 from __future__ import annotations
 
