@@ -45,7 +45,7 @@ class _Scale:
     ----------
     label : str
     norm : matplotlib Normalize
-        Values to [0, 1]. Its limits are mostly the 1st and 99th percentiles by area.
+        Limits from the 1st and 99th percentiles by area, or from the value of a perfect map.
     colormap : str
         Diverging if a perfect map lies in the middle. No colormap contains red, which marks inverted triangles.
     beyond : {"max", "both"}

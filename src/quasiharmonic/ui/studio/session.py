@@ -162,7 +162,7 @@ class Session:
         self._busy("laying it flat")
         self._keep(freed(moment.problem, moment.recipe, moment.pins, self._step), fit=True)
 
-    # --- what the hand does ------------------------------------------------------------------------------------------
+    # --- drags and edits ---------------------------------------------------------------------------------------------
 
     def _pin(self, frame: Frame) -> None:
         moment, vertex = self.moment, asking.vertex(frame, self.moment.problem.n)
@@ -251,7 +251,7 @@ class Session:
     def _send(self, name: str, content: bytes) -> None:
         self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
 
-    # --- maps at rest, and what is told ------------------------------------------------------------------------------
+    # --- final maps and updates of the page --------------------------------------------------------------------------
 
     def _settle(self, moment: SessionState, *, fit: bool = False, energy: str | None = None,
                 slide: bool | BoundaryCurves = False) -> None:  # fmt: skip
