@@ -1,4 +1,4 @@
-"""Everything that touches a screen, a terminal, a browser or a data set: figures, the command, batches, the page.
+"""User interfaces: figures, the command line, batch runs over data sets, reports and the browser application.
 
-The packages build on everything below them. Start reading in `cli` for the command, and in `plot` for figures.
+These packages build on all other packages. Start reading in `cli` for the command, and in `plot` for figures.
 """

@@ -1,6 +1,6 @@
-"""Data sets: thousands of problems on one machine or on a cluster, with a record for each.
+"""Run data sets of many problems on one machine or on a cluster, with a record for each problem.
 
-The package builds on `solver` and `apps`. Start reading in `driver`, then `worker` for what one process does.
+The package builds on `solver` and `apps`. Start reading in `driver`, then `worker` for the work of one process.
 """
 
 from quasiharmonic.ui.batch.driver import Progress, run

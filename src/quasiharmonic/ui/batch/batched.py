@@ -1,10 +1,10 @@
-"""Small problems of a data set solved side by side, in a process that solves problems.
+"""Solve small problems of a data set together, in one worker process.
 
-A call of NumPy takes longer than what it does to some hundred triangles, so several problems are read, the first stage
-of their searches is run as one (`quasiharmonic.solver.search.batched`), and their maps are judged as one. What that
-solves gets its map and its record as it would alone. Everything else is left as if it had never been here, to be solved
-by itself: what cannot be read, what has several islands, what is not small, and what takes more than the first stage.
-So whatever goes wrong here costs time and nothing else.
+For meshes of some hundred triangles the overhead of NumPy calls exceeds the computation. So several problems are read,
+their first search stages run batched (`quasiharmonic.solver.search.batched`), and their maps are certified together.
+A problem solved here gets the same map and record as alone. All other problems are left untouched and solved
+individually: unreadable files, meshes with several islands, large meshes, and searches that need more than one stage.
+Failures here therefore cost only time.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ Job = dict[str, Any]
 
 
 class Ready(NamedTuple):
-    """A problem that has been read.
+    """Problem that has been read.
 
     Attributes
     ----------
     mesh : MeshData
     fixed : (k,) int64 or None
-        The vertices to hold, if the files say which.
+        The fixed vertices, if the files list them.
     record : dict
-        What is known of it.
+        Record so far.
     """
 
     mesh: io.MeshData
@@ -52,14 +52,14 @@ class Ready(NamedTuple):
 
 
 class _Posed(NamedTuple):
-    """The one problem that a mesh is, and the mesh once it has a map."""
+    """Problem of a mesh with one island, and a function that returns the mesh with a given map."""
 
     problem: Problem
     mapped: Callable[[FloatArray], io.MeshData]
 
 
 class _Read(NamedTuple):
-    """A map that has been written, as a reader gets it."""
+    """Written map, as read back from its file."""
 
     V: FloatArray
     F: IntArray
@@ -67,35 +67,35 @@ class _Read(NamedTuple):
 
 
 def solver_for(problem: Problem, asked: str) -> str:
-    """The linear solver for a problem: QDLDL for a small one, where the choice is free.
+    """Return the linear solver for a problem: QDLDL for a small problem if the user did not choose one.
 
-    Alone and with others a problem has the same map by it, but for rounding where its order of elimination depends on
-    what lies beside; and no other is quicker there.
+    With QDLDL a problem has the same map alone and in a batch, except for rounding: its elimination order may depend on
+    the other problems. No other solver is faster at these sizes.
     """
     return "qdldl" if asked == "auto" and len(problem.F) <= SMALL and "qdldl" in available() else asked
 
 
 def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> None:
-    """Solve what can be solved of some problems together, and write maps and records of that.
+    """Solve several problems together where possible, and write maps and records of the solved ones.
 
     Parameters
     ----------
     jobs : sequence of dict
-        As `quasiharmonic.ui.batch.worker.solve_files` takes them, of the same settings, which `Settings.together`
-        allows.
+        As for `quasiharmonic.ui.batch.worker.solve_files`; all with the same settings, which must satisfy
+        `Settings.together`.
     tell : callable
-        Called with ``{"done": k, "outcome": …, "seconds": …}`` whenever the k-th has its record.
+        Called with ``{"done": k, "outcome": …, "seconds": …}`` when the record of problem ``k`` is written.
 
     Raises
     ------
     OutputError
-        When a map or a record cannot be written, which is no fault of the problems.
+        If a map or a record cannot be written.
     """
     account.forget_peak()
     settings, folders = jobs[0]["settings"], [Path(job["folder"]) for job in jobs]
     read: dict[int, Ready] = {}
     for k, job in enumerate(jobs):
-        # What is the matter with it is found again when it is given by itself.
+        # The error is raised and recorded when the problem is solved individually.
         with suppress(Exception):
             one = ready(job)
             if len(one.mesh.F) <= SMALL:
@@ -136,7 +136,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
 
 
 def ready(job: Job) -> Ready:
-    """Read a problem; raises as what reads it does."""
+    """Read a problem; raise the errors of the readers."""
     record: Record = {**job["record"], "versions": account.versions()}
     with account.timed(record, "read"):
         mesh = io.read_mesh(job["mesh"])
@@ -145,7 +145,7 @@ def ready(job: Job) -> Ready:
 
 
 def _posed(read: dict[int, Ready], settings: dict[str, Any]) -> dict[int, _Posed]:
-    """Those that are one problem on all vertices of their mesh."""
+    """Return the problems of the meshes that form a single problem on all their vertices."""
     plain = [k for k, one in read.items() if settings["to"] is None and _plain(one, settings)]
     with _shared([read[k].record for k in plain], "setup"):
         problems = posed_each([_arrays(read[k]) for k in plain]) if plain else None
@@ -162,7 +162,7 @@ def _posed(read: dict[int, Ready], settings: dict[str, Any]) -> dict[int, _Posed
 
 
 def _plain(one: Ready, settings: dict[str, Any]) -> bool:
-    """Whether vertices have their places by their own numbers, and files say which are held."""
+    """Whether texture coordinates and vertices have the same indices, and the files list the fixed vertices."""
     mesh = one.mesh
     if settings["reference"] is not None or one.fixed is None or mesh.FT is None or mesh.vt is None:
         return False
@@ -170,7 +170,7 @@ def _plain(one: Ready, settings: dict[str, Any]) -> bool:
 
 
 def _arrays(one: Ready) -> Given:
-    """What `Problem` is made of."""
+    """Return the arguments of `Problem`."""
     assert one.fixed is not None
     assert one.mesh.vt is not None
     held = np.unique(one.fixed)
@@ -182,7 +182,7 @@ def _with_map(mesh: io.MeshData, surface: SeamedMesh, uv: FloatArray) -> io.Mesh
 
 
 def _solved(problems: dict[int, Problem], settings: dict[str, Any]) -> Iterator[tuple[int, MapResult]]:
-    """Those that the first stage of their search solves."""
+    """Yield the problems that the first stage of their search solves, with their results."""
     for descent, some in beginning_alike(problems, settings["strategy"]).items():
         patterns = Patterns(solver_for(problems[some[0]], settings["linear_solver"]))
         found = first_stage([problems[k] for k in some], descent, patterns, settings["max_iterations"], lambda: None)
@@ -192,7 +192,7 @@ def _solved(problems: dict[int, Problem], settings: dict[str, Any]) -> Iterator[
 
 
 def _mapped(mesh: io.MeshData) -> _Read:
-    """The mesh and the map of a file."""
+    """Return the mesh and the map of a file."""
     if mesh.vt is not None and len(mesh.vt) == len(mesh.V) and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
         return _Read(mesh.V, mesh.F, mesh.vt)
     return _Read(*io.cut_at_seams(mesh))
@@ -200,7 +200,7 @@ def _mapped(mesh: io.MeshData) -> _Read:
 
 @contextmanager
 def _shared(some: Sequence[Record], phase: str) -> Iterator[None]:
-    """Add an equal share of the time that something takes to that of a phase of each."""
+    """Measure the time of a block and add an equal share to the given phase of each record."""
     whole: Record = {}
     with account.timed(whole, phase):
         yield

@@ -1,4 +1,4 @@
-"""Problems solved by the workers of a Dask cluster, each in a process that the worker keeps for that."""
+"""Solve problems on the workers of a Dask cluster, each in a separate process that the worker reuses."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.supervisor import Finished, Supervisor, lost
 
-# Problems given out for every thread of the cluster: enough that none waits for the next, few to be lost with a driver.
+# Problems submitted per thread of the cluster: enough to keep threads busy, few to lose if the driver dies.
 _AHEAD = 3
 _TICK = 0.2
-# Seconds between two looks at how large the cluster is, which may change.
+# Seconds between two queries of the cluster's size, which may change.
 _LOOK = 2.0
 
 _GONE = (
@@ -26,11 +26,11 @@ _mine = threading.local()
 
 
 def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> Generator[Finished | None]:
-    """Solve problems on a cluster; yields None now and then while nothing is finished.
+    """Solve problems on a cluster; yield None regularly while no problem is finished.
 
-    A problem whose worker is lost goes to another one. What has been on so many lost workers that the scheduler gives
-    it up (``distributed.scheduler.allowed-failures``) is tried once more by itself when all else is done; if workers
-    die of it again, it is recorded as a crash.
+    If a worker is lost, its problem goes to another worker. The scheduler gives a problem up after several lost workers
+    (``distributed.scheduler.allowed-failures``). Such problems are tried once more, one at a time, after all others. If
+    workers die again, the problem is recorded as a crash.
 
     Parameters
     ----------
@@ -42,13 +42,13 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
     Raises
     ------
     ImportError
-        When ``distributed`` is not installed.
+        If ``distributed`` is not installed.
     ValueError
-        When an address is none.
+        If the address is malformed.
     ConnectionError
-        When the scheduler is not there or not there any more.
+        If the scheduler cannot be reached or the connection is lost.
     OutputError, WorkerError
-        As a `Supervisor` on a worker raised it.
+        As raised by a `Supervisor` on a worker.
     """
     try:
         from distributed import Client
@@ -60,7 +60,7 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
         return
     try:
         if isinstance(scheduler, str):
-            # A client that is given a wrong one hangs for a minute when it is disposed of.
+            # A client with a malformed address blocks for a minute when it is closed.
             resolve_address(scheduler)
         client = Client(scheduler, set_as_default=False)
     except ValueError as error:
@@ -117,17 +117,17 @@ def _through(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Gener
             elif files is alone:
                 yield lost(files, orders, f"the cluster's workers that it was given to died: {error}")
             else:
-                # Several workers have died while they had this problem, and others. Which one was it?
+                # Several workers died with this problem, but they had others too. Try it alone later.
                 suspects.append(files)
     finally:
-        # Those that run go on to their end; the others are not started.
+        # Running problems continue to their end; the others are not started.
         client.cancel([future for _, future in pending.values()])
 
 
 def attend(files: ProblemFiles, orders: Orders) -> Finished | Exception:
-    """Solve a problem on a worker of the cluster; what must end the run is returned, for it may be hard to raise there.
+    """Solve a problem on a worker of the cluster; errors that must end the run are returned, not raised.
 
-    An exception that is raised travels with its traceback, and is not heard of any more if that cannot be pickled.
+    A raised exception travels with its traceback, and is lost if the traceback cannot be pickled.
     """
     if not (orders.output / MARKER).exists():
         return OSError(

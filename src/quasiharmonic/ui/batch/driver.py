@@ -1,4 +1,4 @@
-"""Run all problems of a data set: on this machine's cores, or through a Dask cluster."""
+"""Run all problems of a data set on this machine's cores or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ _TICK = 0.2
 
 @dataclass
 class Progress:
-    """How far a run is.
+    """Progress of a run.
 
     Attributes
     ----------
     total : int
-        Problems of the data set.
+        Number of problems in the data set.
     outcomes : dict of str to int
-        How many of those done ended how; see `quasiharmonic.ui.batch.records.OUTCOMES`.
+        Number of finished problems per outcome; see `quasiharmonic.ui.batch.records.OUTCOMES`.
     resumed : int
-        Of those, how many an earlier run had done.
+        Number of finished problems that an earlier run had finished.
     seconds : float
-        Since the start of the run.
+        Wall time since the start of the run.
     """
 
     total: int
@@ -51,27 +51,27 @@ class Progress:
 
     @property
     def done(self) -> int:
-        """Problems with a record."""
+        """Number of problems with a record."""
         return sum(self.outcomes.values())
 
     @property
     def solved(self) -> int:
-        """Problems with a map certified to be what was asked for."""
+        """Number of problems with a map certified as requested."""
         return sum(self.outcomes.get(outcome, 0) for outcome in records.SOLVED)
 
     @property
     def failed(self) -> int:
-        """Problems done without one."""
+        """Number of finished problems without a certified map."""
         return self.done - self.solved
 
     @property
     def rate(self) -> float:
-        """Problems a second, those that an earlier run had done excepted."""
+        """Problems per second, without those of earlier runs."""
         return (self.done - self.resumed) / self.seconds if self.seconds > 0 else 0.0
 
     @property
     def seconds_left(self) -> float | None:
-        """Time until the end at the present rate; None while nobody can tell."""
+        """Estimated seconds until the end at the present rate; None if the rate is 0."""
         return (self.total - self.done) / self.rate if self.rate > 0 else None
 
 
@@ -89,57 +89,57 @@ def run(
     scheduler: Any = None,
     callback: Callable[[Progress], object] | None = None,
 ) -> Progress:
-    """Solve every problem of a data set, each in a process that may fail without harm to the others.
+    """Solve every problem of a data set in separate processes; a failure does not affect other problems.
 
-    Every problem gets a folder of its own in ``output/results`` with its map, ``map.obj``, and its record,
-    ``record.json``, both written whole as soon as it is finished. The same call again goes on where the last one
-    ended, however it ended: a problem whose record is of the same input and settings is not solved anew. In the
-    end all records are put together in ``output/records.csv`` or ``.parquet``.
+    Every problem gets a folder in ``output/results`` with its map, ``map.obj``, and its record, ``record.json``. Both
+    are written completely when the problem is finished. The same call resumes an interrupted run: a problem is skipped
+    if its record has the same input and settings. At the end all records are collected in ``output/records.csv`` or
+    ``.parquet``.
 
     Parameters
     ----------
     source : path
-        What `quasiharmonic.batch.find_problems` takes: a folder with problems at any depth, or a list.
+        As for `quasiharmonic.batch.find_problems`: a folder with problems at any depth, or a list.
     output : path
-        The run's folder; made if need be.
+        The run's folder; created if necessary.
     settings : Settings, optional
         How problems are solved.
     jobs : int, optional
-        Problems solved at a time, each in a process of its own; one a core by default. Not with a scheduler.
+        Number of problems solved at a time, each in its own process; one per core by default. Not with a scheduler.
     threads : int
-        Threads of the linear solver in each.
+        Threads of the linear solver in each process.
     time_limit : float or None
-        Seconds for one problem, all included. Whoever takes longer is ended and recorded.
+        Seconds of wall time per problem, including reading and writing. A process that takes longer is killed, and the
+        problem is recorded.
     memory_limit : int or None
-        Bytes of resident memory that a process that solves a problem may have. Whichever has more is ended and
-        recorded.
+        Bytes of resident memory per process. A process that uses more is killed, and the problem is recorded.
     retry : bool
-        Try again what an earlier run has recorded as an error, a crash, or beyond a limit. (Beyond a limit lower than
-        the present one it is tried again anyway.)
+        Try problems again that an earlier run recorded as an error, a crash, or over a limit. Problems over a lower
+        limit than the present one are always tried again.
     table : {"csv", "parquet"}
-        Form of the table of records.
+        Format of the table of records.
     scheduler : str, distributed.Client or cluster, optional
-        Address of a Dask scheduler, or what stands for one: its workers solve the problems, as many at a time as they
-        have threads. They must see ``source`` and ``output`` under the same paths.
+        Address of a Dask scheduler, or a client or cluster. Its workers solve as many problems at a time as they have
+        threads. They must see ``source`` and ``output`` under the same paths.
     callback : callable, optional
-        Called with the `Progress` whenever a problem is done, and a few times a second besides.
+        Called with the `Progress` whenever a problem is finished, and a few times per second.
 
     Returns
     -------
     Progress
-        How the problems ended.
+        Final counts.
 
     Raises
     ------
     ValueError
-        When there are no problems, some lie in ``output``, or an argument makes no sense.
+        If there are no problems, some lie in ``output``, or an argument is invalid.
     OutputError
-        When results cannot be written, as on a full disk, or while another run is writing to ``output``. What is
-        finished stays.
+        If results cannot be written, for example on a full disk, or another run is writing to ``output``. Finished
+        results are kept.
     ImportError
-        When a package that was asked for is not installed.
+        If a requested package is not installed.
     WorkerError
-        When processes cannot be started.
+        If processes cannot be started.
     """
     check_callback(callback)
     settings = _checked(settings or Settings())
@@ -148,7 +148,7 @@ def run(
     table_path = folder / f"records.{table}"
     records.check_table(table_path)
     began = time.perf_counter()
-    # Counted first and found once more while they are solved, so that no list of them is kept.
+    # The problems are enumerated twice, for counting and for solving, so that memory does not grow with their number.
     progress = Progress(_count(source, settings, folder))
     _check_folder(folder)
     with new_folder(folder, leftovers=frozenset({LOCK})), alone(folder):
@@ -174,7 +174,7 @@ def run(
 
 
 def _checked(settings: Settings) -> Settings:
-    """Settings that no problem will stumble over, with files named such that they are found from anywhere."""
+    """Validate settings; return them with absolute paths of files."""
     from quasiharmonic.energies.polishing import ENERGIES
     from quasiharmonic.geometry.mesh.reference import Reference
     from quasiharmonic.linsolve import available
@@ -210,12 +210,12 @@ def _checked(settings: Settings) -> Settings:
 
 
 def _anywhere(name: str | None) -> str | None:
-    """What names a file from anywhere, if it names one."""
+    """Return the absolute path if the name is that of a file, else the name."""
     return os.path.abspath(name) if name is not None and os.path.isfile(name) else name
 
 
 def _check_flatten(settings: Settings) -> None:
-    """Refuse settings of maps onto given boundaries where boundaries are free, and the other way round."""
+    """Raise ValueError if fixed-boundary settings are combined with ``flatten``, or ``energy`` is given without it."""
     if not settings.flatten:
         if settings.energy is not None:
             raise ValueError(
@@ -244,7 +244,7 @@ def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limi
 
 
 def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> int:
-    """How many problems there are, none of which would be passed over as the output of a run."""
+    """Return the number of problems; raise ValueError if there are none or if one lies in the output folder."""
     count, inside = 0, folder.is_relative_to(os.path.abspath(source))
     for files in find_problems(source, plain=settings.plain):
         if inside and files.mesh.is_relative_to(folder):
@@ -259,7 +259,7 @@ def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> 
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse what stands where the run's folder is to be, if it is no such folder."""
+    """Raise OutputError if the path exists but is not a run's folder."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise OutputError(f"cannot write to {folder}: it is no folder")
     try:
@@ -271,10 +271,10 @@ def _check_folder(folder: Path) -> None:
 
 
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -> None:
-    """Say in the run's folder what it is."""
+    """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
     try:
         for name in records.TABLES:
-            # Not that of the last run until there is that of this one.
+            # The table of the last run must not be taken for that of this run.
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
@@ -290,7 +290,7 @@ def _records(source: str | os.PathLike[str], orders: Orders) -> Iterator[records
 
 
 def _cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:
@@ -298,7 +298,7 @@ def _cores() -> int:
 
 
 def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator[Finished | None]:
-    """Solve problems in processes of this machine; yields None now and then while nothing is finished."""
+    """Solve problems in processes of this machine; yield None regularly while no problem is finished."""
     supervisors = [Supervisor(orders) for _ in range(jobs)]
     groups = small_together(todo) if orders.settings.together else ([files] for files in todo)
     lock, finished = threading.Lock(), SimpleQueue[Finished | BaseException | None]()

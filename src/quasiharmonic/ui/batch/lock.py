@@ -1,4 +1,4 @@
-"""One run at a time in a folder."""
+"""Lock an output folder so that only one run writes to it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from pathlib import Path
 
 from quasiharmonic.io.errors import OutputError
 
-#: The file that a run holds locked in its folder; it stays, and means nothing when nobody holds it.
+#: The lock file in the output folder. It is not deleted after the run; only the system's lock on it counts.
 FILE = "qhm-batch.lock"
 
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a folder; the system lets them in again when this one ends, however that is.
+    """Lock a folder against other runs; the system releases the lock when this process ends for any reason.
 
-    Where the system (Windows) or the file system knows no such locks, nobody is kept out.
+    If the system (Windows) or the file system has no such locks, the folder is not locked.
 
     Raises
     ------
     OutputError
-        When another run is there, or the folder cannot be written to.
+        If another run has locked the folder, or the folder cannot be written to.
     """
     try:
         import fcntl

@@ -1,4 +1,4 @@
-"""What a record says of a problem, beside what became of it: how it was found, how long that took, what with."""
+"""Metadata of a record: sizes, stages, distortion, times, memory and versions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def sizes(problems: list[Problem]) -> Record:
-    """How large the problems of a mesh's islands are, together."""
+    """Return the total sizes of the problems of a mesh's islands."""
     return {
         "vertices": sum(problem.n for problem in problems),
         "triangles": sum(len(problem.F) for problem in problems),
@@ -34,7 +34,7 @@ def sizes(problems: list[Problem]) -> Record:
 
 
 def told(results: Sequence[MapResult], status: Status) -> Record:
-    """How the maps of a mesh's islands were found, and how that ended."""
+    """Return status, stages and linear solver of the maps of a mesh's islands."""
     stages = [stage for result in results for stage in result.stages]
     return {
         "status": status.name.lower(),
@@ -45,7 +45,7 @@ def told(results: Sequence[MapResult], status: Status) -> Record:
 
 
 def measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
-    """How a map distorts a surface; nothing where no triangle has an area at rest."""
+    """Return the distortion of a map; empty if no triangle has an area in the rest mesh."""
     found = distortion(V, F, uv)
     if len(found.flat) == len(F):
         return {}
@@ -55,7 +55,7 @@ def measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
 
 @contextmanager
 def timed(record: Record, phase: str) -> Iterator[None]:
-    """Add the time that something takes to that of a phase."""
+    """Add the wall time of a block to the given phase of a record."""
     began = time.perf_counter()
     try:
         yield
@@ -66,19 +66,19 @@ def timed(record: Record, phase: str) -> Iterator[None]:
 
 @cache
 def versions() -> str:
-    """Of Python and packages, as JSON."""
+    """Return the versions of Python and packages as JSON."""
     packages = {name: version(name) for name in ("numpy", "scipy")}
     return json.dumps({"quasiharmonic": __version__, "python": platform.python_version(), **packages})
 
 
 def forget_peak() -> None:
-    """Let the highest memory use be counted anew, where the system can do that (Linux)."""
+    """Reset the peak memory of this process, where the system supports it (Linux)."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
 def peak() -> int | None:
-    """Highest resident memory, bytes: since `forget_peak` on Linux, of the process elsewhere; None if nobody knows."""
+    """Return the peak resident memory in bytes: since `forget_peak` on Linux, of the process elsewhere; else None."""
     with suppress(OSError, IndexError):
         return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
     try:

@@ -1,4 +1,4 @@
-"""The problems of a data set: which there are, what they are called, which files they are made of."""
+"""Enumerate the problems of a data set: their names and files."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from pathlib import Path
 
 from quasiharmonic.io import READERS, problem_files
 
-#: A file that marks a folder as the output of a run; nothing in there is a problem.
+#: A file that marks a folder as the output of a run; problems are not searched there.
 MARKER = "qhm-batch.json"
-#: Bytes of a mesh that is small, some 1,500 triangles, beyond which most searches begin in another way, and of those
-#: that are solved together, some 28,000.
+#: Bytes of a small mesh file (about 1,500 triangles), and of the files of one group (about 28,000 triangles). For
+#: larger meshes most searches start differently.
 SMALL_FILE, GROUP_OF_FILES = 100_000, 1_500_000
-# Problems that are solved together, at most: what happens to one of them has all solved by themselves.
+# Largest number of problems in a group. If one of them fails, the rest of the group is solved one by one.
 _MOST = 64
 
-# In a list; a name may have the sign inside.
+# Start of a comment in a list; file names may contain "#" too.
 _COMMENT = re.compile(r"(?:^|\s)#")
 
 
 @dataclass(frozen=True)
 class ProblemFiles:
-    """One problem, as files.
+    """Files of one problem.
 
     Attributes
     ----------
     name : str
-        Its place in the data set, parts separated by ``/``: unique, and stable from run to run.
+        Path in the data set, parts separated by ``/``: unique, and equal in every run.
     mesh : Path
         Absolute path of the mesh.
     fixed : Path or None
-        Absolute path of the list of vertices to hold, where there is one.
+        Absolute path of the list of fixed vertices, if there is one.
     """
 
     name: str
@@ -48,23 +48,24 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
     Parameters
     ----------
     source : path
-        A folder, searched at any depth, links followed; a mesh; or a text file that lists folders and meshes,
-        one a line, relative to its own folder, with blank lines and comments: ``#`` at the start or after a space.
+        A folder, a mesh, or a list. Folders are searched at any depth, including symbolic links. A list is a text file
+        with one folder or mesh per line, relative to the list's folder; blank lines and comments are skipped. A comment
+        begins with ``#`` at the start of a line or after a space.
     plain : bool
-        Take every mesh for a problem. Otherwise a problem is a folder with ``input.obj`` and, usually,
+        Take every mesh as a problem. Otherwise a problem is a folder with ``input.obj`` and, usually,
         ``handles.txt``, or an OBJ file that is named itself.
 
     Yields
     ------
     ProblemFiles
-        Folders that hold the output of a run are passed over.
+        Folders with the output of a run are skipped.
 
     Raises
     ------
     ValueError
-        When nothing is there, or a line of a list names nothing, or a folder without problems.
+        If the source does not exist, or a line of a list names a missing path or a folder without problems.
     OSError
-        When a folder or the list cannot be read.
+        If a folder or the list cannot be read.
     """
     path = Path(os.path.abspath(source))
     if path.is_dir():
@@ -78,12 +79,12 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
 
 
 def small_together(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFiles]]:
-    """Problems in their order, small ones several at a time, by the sizes of their meshes' files.
+    """Group small problems, by the sizes of their mesh files, in order.
 
     Yields
     ------
     list of ProblemFiles
-        Those that are not small, or cannot be looked at, by themselves.
+        Large problems, and those whose files cannot be read, are alone in their list.
     """
     group: list[ProblemFiles] = []
     size = 0
@@ -105,7 +106,7 @@ def small_together(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFil
 
 
 def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int]]) -> Iterator[ProblemFiles]:
-    """Problems in a folder and below; ``above`` are the folders it lies in, for links that lead back."""
+    """Yield the problems in a folder and below; ``above`` are the enclosing folders, to detect cyclic links."""
     try:
         status = folder.stat()
         here = (status.st_dev, status.st_ino)
@@ -114,7 +115,7 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
         with os.scandir(folder) as entries:
             kinds = sorted((entry.name, _is_folder(entry)) for entry in entries)
     except OSError as error:
-        # Passing it over would lose the problems in it, and nobody would know.
+        # Skipping the folder would silently lose its problems.
         raise OSError(f"{folder}: the folder cannot be read: {error.strerror or error}") from error
     files = {entry for entry, is_folder in kinds if not is_folder}
     if MARKER in files:
@@ -131,7 +132,7 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
-    """Whether an entry of a folder is one; links that lead in a circle lead to none."""
+    """Whether a directory entry is a folder; cyclic links are not."""
     try:
         return entry.is_dir()
     except OSError as error:

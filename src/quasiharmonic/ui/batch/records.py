@@ -1,7 +1,6 @@
-"""Records: what became of every problem, one JSON file each, and all of them as a table.
+"""Records of the outcome of every problem: one JSON file each, and all of them as a table.
 
-A record's file is written when its problem is finished and is the sign that it is. Tables are made of
-these files, a batch of rows at a time.
+A problem is finished when its record's file exists. Tables are written from these files in batches of rows.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from quasiharmonic.io.errors import MeshFileError, OutputError
 
 Record = dict[str, Any]
 
-#: What can become of a problem.
+#: Outcomes of a problem, with descriptions.
 OUTCOMES: dict[str, str] = {
     "injective": "certified injective",
     "not injective": "no injective map found",
@@ -33,41 +32,40 @@ OUTCOMES: dict[str, str] = {
     "crash": "process died",
 }
 
-#: Of these, those that a problem is solved by, and those that its written map decides.
+#: Outcomes of solved problems, and outcomes determined by certifying the written map.
 SOLVED = "injective", "bijective"
 JUDGED = *SOLVED, "not injective", "not bijective"
 
-#: Columns of a table, in order, and the types of what is in them; every one may be empty.
+#: Columns of a table, in order, with their types; every value may be empty.
 COLUMNS: dict[str, type] = {
     "problem": str,
     "source": str,
     # One of `OUTCOMES`.
     "outcome": str,
-    # Whether the written map is what was asked for, injective or, where the boundary is free, bijective, and whether it
-    # is bijective in either case; decided exactly.
+    # Exact results for the written map. `certified`: injective, or bijective if the boundary is free, as requested.
+    # `bijective`: whether it is bijective in either case.
     "certified": bool,
     "bijective": bool,
-    # Why it ended: the name of a `quasiharmonic.Status`.
+    # The name of a `quasiharmonic.Status`.
     "status": str,
     "vertices": int,
     "triangles": int,
     "fixed": int,
     "pins": int,
     "loops": int,
-    # Parts between seams, each mapped on its own; edges that were cut to make them, and vertices that were added for
-    # room.
+    # Number of islands, which are mapped separately, of edges cut to create them, and of vertices added by refinement.
     "islands": int,
     "cut_edges": int,
     "added_vertices": int,
-    # The rung of the ladder that was climbed to, where edges might be split.
+    # The refinement stage that was reached, if refinement was allowed.
     "rung": str,
-    # Triangles not positive: in the first map of the search, and in the one written.
+    # Inverted or degenerate triangles in the initial map of the search, and in the written map.
     "flips_before": int,
     "flips_after": int,
     "iterations": int,
-    # Of the stages that ran, as JSON: see `quasiharmonic.Stage`.
+    # The stages that ran, as JSON: see `quasiharmonic.Stage`.
     "stages": str,
-    # Wall time from the file to the record, and of its parts.
+    # Wall time from reading the file to writing the record, and of its phases.
     "seconds": float,
     "seconds_read": float,
     "seconds_setup": float,
@@ -78,15 +76,15 @@ COLUMNS: dict[str, type] = {
     # Mean of σ₁/σ₂ + σ₂/σ₁ − 2 (§10), and the largest max(σ₁, 1/σ₂) after scaling to the surface's area.
     "mips": float,
     "isometric": float,
-    # Mean energy that the flattening of a connected surface has come to.
+    # Final mean energy of the flattening of a connected surface.
     "energy": float,
-    # Resident memory of the process at its most, bytes.
+    # Peak resident memory of the process, bytes.
     "peak_memory": int,
     "linear_solver": str,
     "threads": int,
     "time_limit": float,
     "memory_limit": int,
-    # Of Python and packages, as JSON.
+    # Versions of Python and packages, as JSON.
     "versions": str,
     "error": str,
     # Digest of the input and the settings.
@@ -94,16 +92,16 @@ COLUMNS: dict[str, type] = {
     "map_bytes": int,
 }
 
-#: What tables of a run are called.
+#: File names of the tables of a run.
 TABLES = "records.csv", "records.parquet"
-#: What the record of a problem is called in the folder of its results.
+#: File name of the record in the folder of a problem's results.
 FILE = "record.json"
 _MAP = "map.obj"
 _ROWS = 1000
 
 
 def map_path(folder: Path) -> Path:
-    """Where the map of a problem is written, given the problem's results."""
+    """Return the path of a problem's map in the folder of its results."""
     return folder / _MAP
 
 
@@ -113,13 +111,13 @@ def write_record(folder: Path, record: Record) -> None:
     Raises
     ------
     OutputError
-        When it cannot be written.
+        If it cannot be written.
     """
     write_whole(folder / FILE, json.dumps(record, allow_nan=False).encode() + b"\n", durable=False)
 
 
 def read_record(folder: Path) -> Record | None:
-    """Read the record of a problem; None where there is none, or not a whole one."""
+    """Read the record of a problem; return None if it is missing or incomplete."""
     try:
         record = json.loads((folder / FILE).read_bytes())
     except (OSError, ValueError):
@@ -128,7 +126,7 @@ def read_record(folder: Path) -> Record | None:
 
 
 def _is_whole(record: Record) -> bool:
-    """Whether a record says what it is about, and all else in it is of its column's type."""
+    """Whether a record names its problem and outcome, and all values have the types of their columns."""
 
     def fits(value: Any, kind: type) -> bool:
         return value is None or isinstance(value, kind) or (kind is float and isinstance(value, int))
@@ -138,12 +136,12 @@ def _is_whole(record: Record) -> bool:
 
 
 def clear(folder: Path) -> None:
-    """Make room for a problem's results: what an earlier try left goes, its record first.
+    """Create the folder of a problem's results, and delete results of an earlier attempt, the record first.
 
     Raises
     ------
     OutputError
-        When the folder cannot be made or emptied.
+        If the folder cannot be created or emptied.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -154,7 +152,7 @@ def clear(folder: Path) -> None:
 
 
 def is_complete(folder: Path, record: Record) -> bool:
-    """Whether the map that a record tells of is there with its whole length."""
+    """Whether the map of a record exists and has the recorded length."""
     if record.get("map_bytes") is None:
         return True
     try:
@@ -164,23 +162,23 @@ def is_complete(folder: Path, record: Record) -> bool:
 
 
 def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None:
-    """Write records as one table, whole or not at all; memory does not grow with their number.
+    """Write records as one table; the file is replaced only when complete, and memory use is constant.
 
     Parameters
     ----------
     path : path
         ``.csv`` or ``.parquet``.
     records : iterable of dict
-        Values by the names of `COLUMNS`; what is missing is left empty.
+        Values by the names of `COLUMNS`; missing values are left empty.
 
     Raises
     ------
     ValueError
-        When the suffix is another.
+        If the suffix is not supported.
     ImportError
-        When Parquet is asked for and pyarrow is not installed.
+        If the suffix is ``.parquet`` and pyarrow is not installed.
     OutputError
-        When it cannot be written.
+        If it cannot be written.
     """
     if _suffix(path) == ".csv":
         write_whole(path, lambda file: _write_csv(file, records))
@@ -190,32 +188,32 @@ def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None
 
 
 def check_table(path: str | os.PathLike[str]) -> None:
-    """Say early whether a table of this name can be made; raises what `write_table` would."""
+    """Check whether a table of this name can be written; raise the errors of `write_table`."""
     if _suffix(path) == ".parquet":
         _pyarrow()
 
 
 def read_table(path: str | os.PathLike[str]) -> Iterator[Record]:
-    """Read a table, a record at a time.
+    """Read a table, one record at a time.
 
     Parameters
     ----------
     path : path
-        ``.csv`` or ``.parquet``, from `write_table` or of one's own making.
+        ``.csv`` or ``.parquet``, from `write_table` or from another program.
 
     Yields
     ------
     dict
-        Values by column, None where empty. Columns not known here stay as they are.
+        Values by column, None where empty. Values of unknown columns are not converted.
 
     Raises
     ------
     MeshFileError
-        When the file cannot be read as a table, has no column ``problem``, or a value is not of its column's type.
+        If the file cannot be read as a table, has no column ``problem``, or a value does not have its column's type.
     ValueError
-        When the suffix is another.
+        If the suffix is not supported.
     ImportError
-        When Parquet is to be read and pyarrow is not installed.
+        If the suffix is ``.parquet`` and pyarrow is not installed.
     """
     rows = _csv_rows(path) if _suffix(path) == ".csv" else _parquet_rows(path)
     for number, row in enumerate(rows, 1):
@@ -240,7 +238,7 @@ def _pyarrow() -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A value as tables have it: names that are no valid Unicode are made so."""
+    """Return a value for a table; strings that are not valid Unicode are escaped."""
     return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
@@ -267,7 +265,7 @@ def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
             for row in csv.DictReader(file):
-                row.pop(None, None)  # what stands behind the last column
+                row.pop(None, None)  # values after the last column
                 yield row
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MeshFileError(path, f"cannot be read as a table: {error}") from error
@@ -286,7 +284,7 @@ def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
 
 
 def _typed(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:
-    """A value of a table in the type of its column; CSV knows text only, and other programs may number problems."""
+    """Convert a table value to its column's type; CSV has only text, and other programs may use numbers as names."""
     if value is None or value == "":
         return None
     kind = COLUMNS.get(column)

@@ -1,4 +1,4 @@
-"""How the problems of a data set are solved, and the key by which a finished one is known again."""
+"""Settings of a batch run, and the key that identifies a finished problem."""
 
 from __future__ import annotations
 
@@ -18,37 +18,38 @@ from quasiharmonic.ui.batch.problems import ProblemFiles
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result of a problem, beside its files.
+    """Settings that determine the result of a problem, together with its files.
 
     Attributes
     ----------
     to : str or None
-        Problems are plain meshes, and their boundaries go to this outline, as `quasiharmonic.targets.outline` reads
-        it; its holes are filled for a surface that has none. None where problems say themselves where fixed vertices
-        go.
+        If given, problems are plain meshes, and their boundaries are mapped to this outline, as
+        `quasiharmonic.targets.outline` reads it. The outline's holes are filled for a surface without holes. If None,
+        the problems contain the target positions of their fixed vertices.
     flatten : bool
-        Problems are plain meshes whose boundaries are free: `quasiharmonic.flatten` lays them flat, and what it makes
-        must be bijective. Then of what follows only ``cut``, ``max_iterations`` and ``linear_solver`` are read.
+        If True, problems are plain meshes with free boundaries. `quasiharmonic.flatten` maps them, and the result must
+        be bijective. Of the following settings only ``energy``, ``cut``, ``max_iterations`` and ``linear_solver``
+        apply.
     energy : str or None
-        What a flattening lowers; see `quasiharmonic.flatten` for the names. ``"symmetric-dirichlet"`` where None.
+        Energy of a flattening; see `quasiharmonic.flatten` for the names. None means ``"symmetric-dirichlet"``.
     cut : bool
-        Whether plain meshes, or what of them lies between the seams of their files, are cut along further seams until
-        they lie flat.
+        Whether plain meshes, or the islands between the seams of their files, are cut along further seams so that they
+        can be mapped.
     corners : str or None
-        Which boundary vertices go to the corners of ``to``: ``"auto"``, ``"near:x,y,z,…"``, or whatever else
+        The boundary vertices that go to the corners of ``to``: ``"auto"``, ``"near:x,y,z,…"``, or any other form that
         `quasiharmonic.targets.boundary.corner_spec.read_corners` reads.
     refine : bool
-        Whether edges that leave the target no room are split, which adds vertices at the end.
+        Whether edges may be split if the target has no map without; new vertices are appended.
     strategy : {"speed", "paper"}
     polish : str or None
         Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
     slide : bool
-        Whether boundary vertices glide along the outline meanwhile, its corners held: along the curves of ``to``, or,
-        where problems say themselves where the boundary goes, along the polygon that it is.
+        Whether boundary vertices slide during the polish, with fixed corners. They slide along the curves of ``to``, or
+        along the polygon of their target positions if ``to`` is None.
     reference : {"equilateral", "rest", "corrected"} or None
     max_iterations : int
     linear_solver : str
-        All as `quasiharmonic.injective_map` takes them.
+        As for `quasiharmonic.injective_map`, like ``strategy``, ``reference`` and ``max_iterations``.
     """
 
     to: str | None = None
@@ -71,19 +72,19 @@ class Settings:
 
     @property
     def together(self) -> bool:
-        """Whether small problems may be solved several at a time, as `quasiharmonic.ui.batch.batched` does.
+        """Whether small problems may be solved in groups by `quasiharmonic.ui.batch.batched`.
 
-        By QDLDL only: what it computes for a mesh does not depend on what lies beside it.
+        This requires QDLDL, whose result for a mesh does not depend on the other meshes of the group.
         """
         alone = self.flatten or self.cut or self.refine or self.slide or self.polish is not None
         by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
         return by_qdldl and not alone and self.reference in (None, "equilateral")
 
     def key(self, files: ProblemFiles) -> str:
-        """Digest of a problem's contents and of how it is solved: a record with the same key need not be made again.
+        """Return a digest of a problem's contents, these settings, the version, and the package's sources.
 
-        How it is solved are these settings, the version, and the package's sources, which change without a new version
-        while somebody works on them. Other packages do not count.
+        A record with the same key is still valid. The sources count because they may change without a new version
+        during development. Other packages do not count.
 
         Parameters
         ----------
@@ -97,7 +98,7 @@ class Settings:
         Raises
         ------
         OSError
-            When a file cannot be read; the message names it.
+            If a file cannot be read; the message names it.
         """
         digest = blake2b(digest_size=16)
         named = [Path(name) if name is not None and os.path.isfile(name) else None for name in (self.to, self.corners)]
@@ -109,12 +110,12 @@ class Settings:
         return digest.hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the settings as a dict for JSON."""
         return dict(vars(self))
 
 
 def _contents(path: Path) -> bytes:
-    """All of a file; a pipe, at which one might wait for ever, is none."""
+    """Return the contents of a regular file; pipes are rejected because reading them could block forever."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise OSError("it is not a regular file")
@@ -125,7 +126,7 @@ def _contents(path: Path) -> bytes:
 
 @cache
 def sources_digest() -> str:
-    """Digest of the package's sources, as they were when first asked, but for those that only show what came out."""
+    """Return a digest of the sources, without those that only present results; computed once per process."""
     package = Path(__file__).parent.parent
     digest = blake2b(digest_size=16)
     for path in sorted([*package.rglob("*.py"), *package.rglob("*.[ch]")]):
@@ -139,21 +140,21 @@ def sources_digest() -> str:
 
 @dataclass(frozen=True)
 class Orders:
-    """What everyone who works on a run has to know.
+    """Parameters of a run that all its workers need.
 
     Attributes
     ----------
     output : Path
-        Absolute path of the run's folder, the same wherever the work is done.
+        Absolute path of the run's folder, the same on all machines.
     settings : Settings
     threads : int
         Threads of the linear solver.
     time_limit : float or None
-        Seconds for one problem.
+        Seconds of wall time per problem.
     memory_limit : int or None
-        Bytes of resident memory for the process that solves a problem.
+        Bytes of resident memory of the process that solves a problem.
     retry : bool
-        Whether to try again what failed for other reasons than the input.
+        Whether to try again problems that failed for other reasons than their input.
     """
 
     output: Path
@@ -164,5 +165,5 @@ class Orders:
     retry: bool = False
 
     def folder(self, name: str) -> Path:
-        """Where the map and the record of a problem are."""
+        """Return the folder of a problem's map and record."""
         return self.output / "results" / name

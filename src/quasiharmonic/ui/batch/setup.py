@@ -1,4 +1,4 @@
-"""What is asked of a problem's files: a surface with its seams, and where the boundary of each island goes."""
+"""Set up the problems of a file: its surface with seams, and the target of each island's boundary."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from quasiharmonic.targets.boundary.corner_spec import AskedCorners, read_corner
 
 
 class Posed(NamedTuple):
-    """The problem of one island.
+    """Problem of one island.
 
     Attributes
     ----------
     fitted : Fitted
     slide : bool or BoundaryCurves
-        Whether its boundary slides, and along what.
+        Whether its boundary slides, and along which curves.
     """
 
     fitted: Fitted
@@ -35,18 +35,18 @@ class Posed(NamedTuple):
 
 
 def surface_of(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
-    """The surface of a file with the seams that its map has, and with those that are cut if that is asked for.
+    """Return the surface of a file with the seams of its map, and with additional cuts if requested.
 
     Parameters
     ----------
     mesh : MeshData
     settings : dict
-        As `Settings.to_dict` has them.
+        As returned by `Settings.to_dict`.
 
     Raises
     ------
     ValueError, ModuleNotFoundError
-        As `quasiharmonic.io.seams` and `cut_apart`.
+        As for `quasiharmonic.io.seams` and `cut_apart`.
     """
     surface = io.seamed(mesh)
     if settings["cut"]:
@@ -56,20 +56,20 @@ def surface_of(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
 
 
 def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings: dict[str, Any]) -> list[Posed]:
-    """The problem of every island, in order.
+    """Return the problem of every island, in order.
 
     Parameters
     ----------
     surface : SeamedMesh
     fixed : (k,) int or None
-        The mesh's vertices that are held where the file's map has them; boundaries, if None.
+        The mesh's vertices that are fixed at their positions in the file's map; the boundaries if None.
     settings : dict
-        As `Settings.to_dict` has them.
+        As returned by `Settings.to_dict`.
 
     Raises
     ------
     ValueError
-        When something about the input makes a problem impossible to pose; it says what.
+        If the input does not define a problem; the message names the cause.
     """
     to, reference = settings["to"], settings["reference"]
     islands = faced(surface, reflect=to is None)
@@ -91,14 +91,14 @@ def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings
 
 
 def _onto(island: Island, k: int, asked: AskedCorners | None, settings: dict[str, Any]) -> Fitted:
-    """An island laid along the outline; the ``k``-th one has it further to the right, for itself."""
+    """Map an island's boundary to the outline; island ``k`` gets a copy of the outline shifted to the right."""
     contours = _outline(settings["to"], _changed(settings["to"]))
     corners = None if asked is None else asked.within(island.vertices)
     return laid_along(island.V, island.F, contours, corners=corners, reference=settings["reference"], beside=k)
 
 
 def _changed(to: str) -> int:
-    """When an outline was changed; files are read anew when they have."""
+    """Return the modification time of an outline's file, so that changed files are read again."""
     return os.stat(to).st_mtime_ns if os.path.isfile(to) else 0
 
 

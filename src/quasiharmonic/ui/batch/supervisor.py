@@ -1,4 +1,4 @@
-"""A process that solves problems, kept alive and within its limits, and replaced when it dies."""
+"""Supervise a worker process: enforce its limits, and replace it when it dies."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import Orders
 
-# What runs in the process; -P keeps modules that happen to lie in the working directory out of it.
+# Command of the worker process; -P prevents imports from the working directory.
 COMMAND = [sys.executable, "-P", "-c", "from quasiharmonic.ui.batch.worker import serve; serve()"]
-# Of OpenMP, MKL, OpenBLAS, BLIS and Apple's Accelerate.
+# Thread counts of OpenMP, MKL, OpenBLAS, BLIS and Apple's Accelerate.
 _THREADS = "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"
-# Seconds between two looks at time and memory, and those that a process may take to import its libraries.
+# Seconds between two checks of time and memory, and seconds that a process may take to import its libraries.
 _LOOK = 0.05
 _START = 120.0
-#: Seconds that several small problems may take together; some hundredths each are usual.
+#: Time limit in seconds for a group of small problems; each usually takes some hundredths.
 TOGETHER = 5.0
 
 
 class Finished(NamedTuple):
-    """What a run is told of a problem that is done.
+    """Report of a finished problem.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Finished(NamedTuple):
     seconds : float
         As in the record.
     resumed : bool
-        Whether an earlier run had done it.
+        Whether an earlier run had finished it.
     """
 
     name: str
@@ -55,15 +55,15 @@ class Finished(NamedTuple):
 
 
 class ClosedError(Exception):
-    """The supervisor was closed while a problem was being solved."""
+    """The supervisor was closed while it solved a problem."""
 
 
 class WorkerError(OSError):
-    """A process that solves problems could not be started."""
+    """A worker process could not be started."""
 
 
 class Supervisor:
-    """Solves one problem at a time in a process of its own.
+    """Solve one problem at a time in a separate process.
 
     Parameters
     ----------
@@ -78,30 +78,30 @@ class Supervisor:
         self._lock = threading.Lock()
 
     def attend(self, files: ProblemFiles) -> Finished:
-        """See to it that a problem has a record of this input and these settings.
+        """Ensure that a problem has a record of this input and these settings; solve it if necessary.
 
         Raises
         ------
         OutputError
-            When results cannot be written, for instance on a full disk.
+            If results cannot be written, for instance on a full disk.
         WorkerError
-            When no process can be started.
+            If no process can be started.
         ClosedError
-            When `close` was called meanwhile.
+            If `close` was called in the meantime.
         """
         job = self._job(files)
         return job if isinstance(job, Finished) else self._solved(job)
 
     def attend_all(self, some: Sequence[ProblemFiles]) -> Iterator[Finished]:
-        """As `attend`, of problems that are small: solved together as far as they can be, and the others one by one.
+        """Like `attend` for small problems: solve them together where possible, and the rest one by one.
 
-        Whatever happens to a process that solves several, and however long it takes, is recorded of none of them: those
-        that have no record yet are solved one by one.
+        A crash or timeout of a process that solves several problems is not recorded. Problems without a record are then
+        solved one by one.
 
         Yields
         ------
         Finished
-            In no particular order.
+            In any order.
         """
         jobs: list[dict[str, Any]] = []
         for files in some:
@@ -120,7 +120,7 @@ class Supervisor:
             yield self._solved(job)
 
     def _job(self, files: ProblemFiles) -> dict[str, Any] | Finished:
-        """What the process is told of a problem; or how it ended, if nothing has to be done."""
+        """Return the job for the process, or the outcome if there is nothing to do."""
         folder, orders = self.orders.folder(files.name), self.orders
         known = _known(files, orders)
         try:
@@ -140,14 +140,14 @@ class Supervisor:
         }
 
     def close(self) -> None:
-        """End the process, whatever it is doing; may be called from another thread."""
+        """Kill the process in any state; may be called from another thread."""
         with self._lock:
             self._closed = True
             if self._process is not None:
                 self._process.end()
 
     def _begun(self, job: dict[str, Any]) -> _Process:
-        """Give a job to the process, which is started if need be."""
+        """Send a job to the process, and start the process if necessary."""
         with self._lock:
             if self._closed:
                 raise ClosedError
@@ -165,7 +165,7 @@ class Supervisor:
         return process
 
     def _solved_together(self, jobs: list[dict[str, Any]]) -> Iterator[tuple[int, Finished]]:
-        """Solve some small problems at once, and tell of those that have been by their number."""
+        """Solve small problems together; yield the index and the outcome of each finished one."""
         limit = min(self.orders.time_limit or TOGETHER, TOGETHER)
         orders = replace(self.orders, time_limit=limit)
         process = self._begun({"together": jobs, "time_limit": limit})
@@ -195,7 +195,7 @@ class Supervisor:
                 raise OutputError(answer["stop"])
             if "outcome" in answer:
                 if answer["outcome"] == "memory":
-                    # What could not be allocated may have left the process crippled.
+                    # A failed allocation may leave the process in a bad state.
                     self._replace()
                 return Finished(record["problem"], answer["outcome"], answer["seconds"])
             record = answer["facts"]
@@ -205,7 +205,7 @@ class Supervisor:
         return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)
 
     def _replace(self) -> None:
-        """Make room for another process, which is started when there is something to do."""
+        """Kill the process; the next job starts another one."""
         with self._lock:
             if self._process is not None:
                 self._process.end()
@@ -213,12 +213,12 @@ class Supervisor:
 
 
 def lost(files: ProblemFiles, orders: Orders, why: str) -> Finished:
-    """Record a problem as a crash that has taken its supervisor along.
+    """Record a crash for a problem whose supervisor died too.
 
     Raises
     ------
     OutputError
-        When the record cannot be written.
+        If the record cannot be written.
     """
     record = _known(files, orders) | {"outcome": "crash", "error": why}
     with suppress(OSError):
@@ -227,7 +227,7 @@ def lost(files: ProblemFiles, orders: Orders, why: str) -> Finished:
 
 
 def _known(files: ProblemFiles, orders: Orders) -> Record:
-    """What can be said of a problem before it is looked at."""
+    """Return the part of a record that is known before the problem is read."""
     return {
         "problem": files.name,
         "source": str(files.mesh),
@@ -239,14 +239,14 @@ def _known(files: ProblemFiles, orders: Orders) -> Record:
 
 
 def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
-    """Write the record of a problem that could not do so itself."""
+    """Write the record of a problem whose process could not write it."""
     records.clear(folder)
     records.write_record(folder, record | {"seconds": seconds})
     return Finished(record["problem"], record["outcome"], seconds)
 
 
 def _settled(folder: Path, record: Record, orders: Orders) -> bool:
-    """Whether a record of the same input and settings stands under these orders."""
+    """Whether an existing record of the same input and settings is valid for these orders."""
     outcome = record["outcome"]
     if outcome in records.JUDGED:
         return records.is_complete(folder, record)
@@ -262,10 +262,10 @@ def _settled(folder: Path, record: Record, orders: Orders) -> bool:
 
 
 class _Process:
-    """A process with a line of jobs to it and a line of answers from it."""
+    """Worker process with a pipe for jobs and a pipe for answers."""
 
     def __init__(self, threads: int) -> None:
-        # Its position is shared with the process, which writes where `send` has put it.
+        # The file position is shared with the process, which writes at the position that `send` sets.
         self._errors = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
         environment = {**os.environ, **dict.fromkeys(_THREADS, str(threads))}
         try:
@@ -293,14 +293,14 @@ class _Process:
             raise WorkerError(f"the process that solves problems did not start: {words}")
 
     def lives(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process is running."""
         return self._process.poll() is None
 
     def send(self, job: dict[str, Any]) -> None:
-        """Give a job."""
+        """Send a job."""
         self._began, self._peak = time.monotonic(), 0
         assert self._process.stdin is not None
-        # If it has died meanwhile, the end of its answers tells.
+        # If the process has died, the end of its answers shows it.
         with suppress(OSError):
             self._errors.truncate(0)
             self._errors.seek(0)
@@ -308,7 +308,7 @@ class _Process:
             self._process.stdin.flush()
 
     def answer(self, orders: Orders) -> tuple[dict[str, Any] | None, Record]:
-        """Wait for the next answer; without one, what ended the process."""
+        """Wait for the next answer; return None and the cause if the process was ended instead."""
         while True:
             try:
                 line = self._answers.get(timeout=_LOOK)
@@ -324,7 +324,7 @@ class _Process:
             return None, {"outcome": "crash", "error": self._cause()} | self._seen()
 
     def end(self) -> None:
-        """Kill it; nothing is lost by that but the problem at hand."""
+        """Kill the process; only the current problem is lost."""
         self._process.kill()
         self._process.wait()
         assert self._process.stdin is not None
@@ -355,7 +355,7 @@ class _Process:
         return f"{text}: {words}" if words else text
 
     def _last_words(self) -> str:
-        """What the process has written to standard error that may tell why it ended, in one line."""
+        """Return the end of standard error, which may contain the cause of death, in one line."""
         if self._errors.closed:
             return ""
         self._errors.seek(0, os.SEEK_END)
@@ -373,7 +373,7 @@ def _pump(source: BinaryIO, answers: SimpleQueue[bytes | None]) -> None:
 
 
 def resident(pid: int) -> int | None:
-    """Resident memory of a process in bytes; None where it cannot be told."""
+    """Return the resident memory of a process in bytes, or None if it is not available."""
     with suppress(OSError, IndexError, ValueError, AttributeError):
         return int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     try:

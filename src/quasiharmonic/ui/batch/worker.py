@@ -1,7 +1,8 @@
-"""One process that solves problems one after another: jobs come on standard input, answers go to standard output.
+"""Worker process that solves problems one after another.
 
-Both are lines of JSON. Nothing a problem does is let out: it ends in a record, which is written next to the
-map before the answer is given, or in the death of this process, which `quasiharmonic.ui.batch.supervisor` records.
+It reads jobs from standard input and writes answers to standard output, both as lines of JSON. A problem ends either
+with a record, written next to the map before the answer is sent, or with the death of this process.
+`quasiharmonic.ui.batch.supervisor` records the death.
 """
 
 from __future__ import annotations
@@ -41,18 +42,18 @@ from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch import setup as posing
 from quasiharmonic.ui.batch.records import Record
 
-#: What a process says when it has imported what it needs.
+#: Key of the message that a process sends after its imports.
 READY = "ready"
-# Seconds beyond the time limit after which the system ends this process, should nobody be left to do so.
+# Seconds after the time limit at which the system ends this process, in case the supervisor is gone.
 GRACE = 10.0
 
 
 def serve() -> None:
-    """Solve what comes on standard input until that ends, whatever is going on then."""
-    # Ctrl-C reaches the whole group; the parent decides what becomes of this process.
+    """Solve the jobs from standard input until it is closed; then exit at once."""
+    # Ctrl-C reaches the whole process group; the parent decides when this process ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
-    # What libraries print must not come between the answers.
+    # Redirect standard output to standard error, so that output of libraries does not mix with the answers.
     answers = os.fdopen(os.dup(1), "w", encoding="ascii")
     os.dup2(2, 1)
 
@@ -61,7 +62,7 @@ def serve() -> None:
             answers.write(json.dumps(message, allow_nan=False) + "\n")
             answers.flush()
         except OSError:
-            # Whoever listened has gone, which is no fault of the problem and must not get into its record.
+            # The supervisor is gone. This is not an error of the problem and must not get into its record.
             os._exit(0)
 
     jobs: SimpleQueue[bytes] = SimpleQueue()
@@ -84,16 +85,16 @@ def serve() -> None:
 
 
 def _listen(jobs: SimpleQueue[bytes]) -> None:
-    # Not sys.stdin, which the interpreter cannot close at its end while it is being waited at.
+    # Not sys.stdin, because the interpreter cannot close it at exit while a thread reads it.
     with os.fdopen(os.dup(0), "rb") as source:
         for line in source:
             jobs.put(line)
-    # Whoever gave the jobs has gone, and nobody waits for the one at hand.
+    # The supervisor is gone, so the current job is not needed.
     os._exit(0)
 
 
 def _alarm(limit: float | None) -> None:
-    """Have the system end this process some time after the limit: also if it hangs where no thread can see its end."""
+    """Let the system end this process some time after the limit, even if it hangs in native code."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, 0.0 if limit is None else limit + GRACE)
 
@@ -104,10 +105,10 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     Parameters
     ----------
     job : dict
-        ``mesh`` and ``fixed``, paths; ``folder``, where results go; ``settings``, as `Settings.to_dict` has them;
-        ``record``, what is known of the record beforehand.
+        ``mesh`` and ``fixed``, paths; ``folder``, the folder for results; ``settings``, as returned by
+        `Settings.to_dict`; ``record``, the initial record.
     tell : callable
-        Called with ``{"facts": …}`` once it is known how large the problem is.
+        Called with ``{"facts": …}`` when the size of the problem is known.
 
     Returns
     -------
@@ -117,7 +118,7 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     Raises
     ------
     OutputError
-        When map or record cannot be written, which is no fault of the problem.
+        If the map or the record cannot be written.
     """
     folder = Path(job["folder"])
     records.clear(folder)
@@ -131,7 +132,7 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     except MemoryError as error:
         record |= {"outcome": "memory", "certified": False, "error": str(error) or "out of memory"}
     except Exception as error:
-        # What is wrong with the input shows before its sizes are known.
+        # Errors of the input are raised before the sizes are recorded.
         wrong_input = isinstance(error, ValueError) and "vertices" not in record
         record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _unexpected(error)
     record["peak_memory"] = account.peak()
@@ -141,14 +142,14 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
 
 
 def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
-    """Read, solve, write, judge, measure; what is found goes into the record as soon as it is known."""
+    """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
     with account.timed(record, "read"):
         mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
     with account.timed(record, "setup"):
         if not settings["flatten"] and settings["to"] is None and mesh.FT is None:
-            # It says what is missing.
+            # Raises an error that names the missing data.
             io.problem_arrays(mesh, fixed)
         surface = posing.surface_of(mesh, settings)
     if settings["cut"]:
@@ -174,14 +175,14 @@ def _mapped(
     record: Record,
     tell: Callable[[dict[str, Any]], None],
 ) -> tuple[MappedAtlas, list[Refined | None]]:
-    """Map a surface onto a given boundary, island by island; and what became of the meshes of these."""
+    """Map a surface onto a given boundary, island by island; return the maps and the refined meshes."""
     with account.timed(record, "setup"):
         posed = posing.posed(surface, fixed, settings)
     problems = [one.fitted.problem for one in posed]
     record |= account.sizes(problems)
     tell({"facts": record})
     todo = iter(posed)
-    # Each is posed as it is to be solved.
+    # The problems are in the order in which islands are solved.
     found = each_island(surface, lambda island: _solved(*next(todo), settings, record), reflect=settings["to"] is None)
     results = [island.result for island in found.islands]
     record |= account.told(results, found.status)
@@ -200,7 +201,7 @@ def _mapped(
 
 
 def _solved(fitted: Fitted, slide: bool | BoundaryCurves, settings: dict[str, Any], record: Record) -> MapResult:
-    """Map one island, and lower its distortion if that is asked for."""
+    """Map one island, and lower its distortion if requested."""
     with account.timed(record, "map"):
         way = solve_refining if settings["refine"] else solve
         result = way(
@@ -219,7 +220,7 @@ def _solved(fitted: Fitted, slide: bool | BoundaryCurves, settings: dict[str, An
 def _flattened(
     surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
 ) -> MappedAtlas:
-    """Lay a surface flat, its boundary free, island by island."""
+    """Flatten a surface with free boundary, island by island."""
     with account.timed(record, "setup"):
         pieces = [piece for island, _ in faced(surface, reflect=False) for piece in flattenable(island.V, island.F)]
     record |= {"vertices": len(surface.V), "triangles": len(surface.F), "fixed": 0, "pins": 0}
@@ -243,8 +244,8 @@ def _flattened(
 
 
 def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
-    """Write a map, and judge the file as a reader gets it: whether it is what is wanted, injective or bijective."""
-    # Waiting for the disk would take longer than most problems. What a power failure takes is found by its length.
+    """Write a map, read it back, and certify that it is injective or bijective, as wanted."""
+    # Waiting for the disk would take longer than most problems. `is_complete` detects truncated files.
     io.write_obj(path, mesh, durable=False)
     V, F, uv = io.cut_at_seams(io.read_mesh(path))
     verdict = atlas.certify(SeamedMesh(V, F, F, uv))
@@ -260,7 +261,7 @@ def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
 
 
 def _unexpected(error: Exception) -> Record:
-    """An exception that no input should raise, with its place."""
+    """Return the record of an unexpected exception, with its source location."""
     at = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{Path(at.filename).name}, line {at.lineno}, in {at.name}"
     return {"outcome": "error", "certified": False, "error": f"{type(error).__name__}: {error} ({place})"}

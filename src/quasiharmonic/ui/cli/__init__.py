@@ -1,11 +1,15 @@
 """The command ``qhm``.
 
-Exit status 0: what was asked for holds, and a written file is certified injective. 1: a map was written
-or judged that is not injective. 2: the input or the call is wrong, and nothing was written. 3: a map was
-written, but what should be told about it could not be, the verdict perhaps included. 141: nothing was to be written,
-and nobody reads standard output any more.
+Exit status:
 
-The subcommands are in `commands`. The package builds on everything below it. Start reading here, then `commands.check`.
+- 0: the request succeeded, and a written file is certified injective.
+- 1: a written or checked map is not injective.
+- 2: the input or the call is wrong, and nothing was written.
+- 3: a map was written, but the report failed, possibly before the verdict.
+- 141: standard output was closed by its reader, and no file was to be written.
+
+The subcommands are in `commands`. The package builds on all packages below it. Start reading here, then
+`commands.check`.
 """
 
 from __future__ import annotations
@@ -54,15 +58,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv : sequence of str, optional
-        Arguments after the command's name; those of the process by default.
+        Arguments after the command's name; by default those of the process.
     """
     for stream in (sys.stdout, sys.stderr):
-        # A terminal that cannot show a sign gets another; a report must not fail for that.
+        # Escape characters that the terminal cannot encode, so that a report does not fail.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     with Interrupts() as interrupts:
         words = sys.argv[1:] if argv is None else list(argv)
-        # Those of other commands would have to be imported and declared for nothing.
+        # Import and declare only the requested command, to save time.
         parser = parser_of([words[0]] if words and words[0] in COMMANDS else COMMANDS)
         try:
             options = parser.parse_args(words)
@@ -75,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except ReportError as error:
             return _fail(options.command, error, 3)
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
-            # Wrong input of any kind: the library's messages name the elements and what to do.
+            # Wrong input: the library's messages name the elements and the remedy.
             return _fail(options.command, error, 2)
         except KeyboardInterrupt:
             return _fail(options.command, _INTERRUPTED, 2)
@@ -88,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(command: str, why: str | Exception, status: int) -> int:
-    """Say why a command fails, unless it is that nobody listens; the exit status."""
+    """Print why a command failed, unless standard output has no reader; return the exit status."""
     if isinstance(why, BrokenPipeError):
         return NO_READER
     tell(f"qhm {command}: {why if isinstance(why, str) else in_words(why)}")
@@ -108,7 +112,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
-    """The command's parser, with some of its subcommands."""
+    """Return the parser of the command, with the given subcommands."""
     parser = _Parser(
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",

@@ -7,8 +7,8 @@ from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-# Those of quasiharmonic.energies.polishing, .harmonising, .measures, .strategy and .linsolve, which are not imported to
-# say them.
+# Copies of the names in quasiharmonic.energies.polishing, .harmonising, .measures, .strategy and .linsolve, so that the
+# parser need not import these modules.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 FLATTENED = *ENERGIES, "distances"
 HARMONISED = "arap", "arap-unsigned", "area", "springs", "mips", "symmetric-dirichlet"
@@ -28,17 +28,17 @@ LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
-    """``--json``."""
+    """Add ``--json``."""
     parser.add_argument("--json", metavar="FILE", help="write the report as JSON; - for standard output")
 
 
 def add_linear_solver(parser: argparse._ActionsContainer) -> None:
-    """``--linear-solver``."""
+    """Add ``--linear-solver``."""
     parser.add_argument("--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the best present)")
 
 
 def add_strategy(parser: argparse._ActionsContainer) -> None:
-    """``--strategy``."""
+    """Add ``--strategy``."""
     parser.add_argument(
         "--strategy",
         choices=STRATEGIES,
@@ -47,7 +47,7 @@ def add_strategy(parser: argparse._ActionsContainer) -> None:
 
 
 def add_rings(parser: argparse._ActionsContainer) -> None:
-    """``--rings``."""
+    """Add ``--rings``."""
     parser.add_argument(
         "--rings",
         type=count,
@@ -57,25 +57,25 @@ def add_rings(parser: argparse._ActionsContainer) -> None:
 
 
 def settle(options: argparse.Namespace, name: str, default: object, *, asked: bool, belongs: str) -> None:
-    """Put in what an option is that was not given; refuse one that was, where nothing asks for it.
+    """Set the default of an option that was not given; raise ValueError if it was given without effect.
 
     Parameters
     ----------
     options : argparse.Namespace
-        Has None for what was not given. Changed.
+        Contains None for options that were not given. Modified in place.
     name : str
-        Of its value among the options.
+        Name of the attribute.
     default : object
-        What it is where it was not given.
+        Value to set if the option was not given.
     asked : bool
-        Whether it has any effect in this call.
+        Whether the option has an effect in this call.
     belongs : str
-        What it belongs to, as one would write it.
+        The option that it requires, as users write it.
 
     Raises
     ------
     ValueError
-        When it was given without effect.
+        If the option was given without effect.
     """
     if getattr(options, name) is None:
         setattr(options, name, default)
@@ -85,7 +85,7 @@ def settle(options: argparse.Namespace, name: str, default: object, *, asked: bo
 
 
 def steps(text: str) -> int:
-    """Read a whole number, 0 included; for argparse."""
+    """Convert text to a nonnegative integer; for argparse."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
@@ -93,7 +93,7 @@ def steps(text: str) -> int:
 
 
 def count(text: str) -> int:
-    """Read a whole number of at least 1; for argparse."""
+    """Convert text to a positive integer; for argparse."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")

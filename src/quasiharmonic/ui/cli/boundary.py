@@ -1,4 +1,4 @@
-"""``qhm check --boundary``: the boundary of a surface in numbers and as a picture."""
+"""``qhm check --boundary``: list and draw the boundary of a surface with vertex numbers."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
 
     from quasiharmonic.targets import BoundaryLoop
 
-# Corners that are looked for on each loop, and degrees by which it turns at one, as at those of outlines.
+# Maximum number of corners per loop, and minimum turning angle of a corner in degrees, as for outlines.
 _MOST, _LEAST = 12, 20.0
-# Vertices of a loop that the sentences list.
+# Maximum number of vertices per loop in the text report.
 _LISTED = 100
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read the surface, number its boundary, draw it, report."""
+    """Read the surface, find its boundary loops, draw them and report."""
     from dataclasses import replace
 
     import numpy as np
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(options.input)
     with report.about(options.input):
         opened = io.seamed(mesh).opened()
-        # Of a vertex that has several places, each is on the boundary by itself and by the vertex's number.
+        # A seam vertex has several copies; each boundary copy is listed with the vertex's number.
         origin = np.arange(len(opened.V))
         origin[opened.F] = mesh.F
         turning = boundary_turning(opened.V, opened.F)
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _told(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]:
-    """A loop in plain Python types; its corners by how far it turns there."""
+    """Return a loop in plain Python types; its corners sorted by decreasing turning angle."""
     import numpy as np
 
     positions, turning = loop.corners(min(_MOST, len(loop.vertices)))

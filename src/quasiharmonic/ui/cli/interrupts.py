@@ -1,7 +1,7 @@
-"""Ctrl-C that is never lost.
+"""Handle Ctrl-C reliably.
 
-Python raises `KeyboardInterrupt` wherever the main thread happens to be. In a finaliser it is reported and forgotten;
-out of the initialisation of an extension module it comes as some other error.
+Python raises `KeyboardInterrupt` at any point of the main thread. In a finaliser Python reports it and drops it.
+During the initialisation of an extension module it can turn into another exception.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING, Self
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-# Seconds after which an interrupt that was lost comes again.
+# Seconds after which a lost interrupt is repeated.
 _AGAIN = 0.01
 
 
 class Interrupts:
-    """While this is entered, interrupts are noted, and come again where they were lost.
+    """Context manager that records interrupts and repeats those that Python lost.
 
-    Where somebody else minds them, or they are ignored, this does nothing.
+    It does nothing if another handler is installed, interrupts are ignored, or this is not the main thread.
 
     Attributes
     ----------
     happened : bool
-        Whether there was one.
+        Whether an interrupt occurred.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class Interrupts:
 
 
 def _interrupt_main() -> None:
-    """Interrupt the main thread, even if it waits for something, where the system knows how."""
+    """Interrupt the main thread; where the system supports it, also while it waits."""
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
     else:

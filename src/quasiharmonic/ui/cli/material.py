@@ -1,4 +1,4 @@
-"""Options that put a picture on the surface that is written."""
+"""Options that add a texture to the written surface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse._ActionsContainer) -> None:
-    """``--material`` and ``--picture``."""
+    """Add ``--material`` and ``--picture``."""
     parser.add_argument(
         "--material",
         action="store_true",
@@ -21,12 +21,12 @@ def add_options(parser: argparse._ActionsContainer) -> None:
 
 
 def read_mesh(options: argparse.Namespace, path: Path) -> MeshData:
-    """Read a mesh, and have it written with the picture that the options ask for.
+    """Read a mesh and attach the texture that the options request.
 
     Raises
     ------
     ValueError, OSError
-        When the output cannot have a picture, a file beside it cannot be written, the picture is missing or none.
+        If the output format has no textures, a companion file cannot be written, or the image is missing or invalid.
     """
     from dataclasses import replace
 
@@ -44,7 +44,7 @@ def read_mesh(options: argparse.Namespace, path: Path) -> MeshData:
 
 
 def _check_companions(options: argparse.Namespace, companions: tuple[Path, Path]) -> None:
-    """Refuse to write over what the user handed in, or asked for otherwise."""
+    """Raise ValueError if a companion file of the output would replace an input or another output."""
     from quasiharmonic import io
 
     taken = (getattr(options, name, None) for name in ("input", "picture", "plot", "json"))

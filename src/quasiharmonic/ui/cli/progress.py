@@ -1,4 +1,4 @@
-"""One line on the terminal that is written over while the solver works; silent when piped."""
+"""Show progress on one terminal line that is overwritten; silent if standard error is not a terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _of_search(step: Step) -> str:
 
 @contextmanager
 def line(words: Callable[[Any], str] = _of_search) -> Iterator[Callable[[Any], None] | None]:
-    """Give a callback that shows steps in words, or none where standard error is not a terminal."""
+    """Yield a callback that shows steps, or None if standard error is not a terminal."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield None
         return

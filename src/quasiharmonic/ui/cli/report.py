@@ -1,4 +1,4 @@
-"""What a command says at its end: a few sentences, or JSON."""
+"""Final report of a command, as text or JSON, and checks of output paths."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 def sizes(domain: Domain) -> dict[str, Any]:
-    """How large a mesh is, and how much of it is held."""
+    """Return the numbers of vertices, triangles and fixed vertices."""
     return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
 
 
 def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
-    """Sentences about a map that was searched for and written, island by island."""
+    """Return the text report of a map that was computed and written."""
     from quasiharmonic.problem.result import Status
     from quasiharmonic.util.arrays import counted
 
@@ -32,7 +32,7 @@ def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
     results = [island.result for island in mapped.islands]
     if not judged.injective:
         lines.append(mapped.status.value)
-    # Surfaces may each be injective where pins forbid that they keep apart.
+    # Each surface may be injective although pins make an overlap between surfaces unavoidable.
     if not judged.injective or mapped.status is Status.IMPOSSIBLE:
         lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
     iterations = sum(result.iterations for result in results)
@@ -42,7 +42,7 @@ def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
 
 
 def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
-    """Print the sentences, write the JSON; with ``--json -`` standard output holds the JSON alone."""
+    """Print the text and write the JSON; with ``--json -`` standard output contains only the JSON."""
     if destination == "-":
         if sys.stdout is None:
             raise OSError("standard output is closed")
@@ -77,13 +77,13 @@ def check_outputs(
     *,
     pattern: Path | None = None,
 ) -> None:
-    """Say before any work that something could not be written, or would be written over something else.
+    """Check before any work that outputs can be written and do not replace other files.
 
     Raises
     ------
     ValueError, OSError
-        When a path cannot be written, two outputs are the same file, or a picture or a report would replace
-        an input. (The map may: reading is done by then.)
+        If a path cannot be written, two outputs are the same file, or a picture or a report would replace
+        an input. The map may replace an input, because it is written after reading.
     """
     from quasiharmonic import io
 
@@ -102,19 +102,19 @@ def check_outputs(
 
 
 def check_json(json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """`check_outputs` for a command that writes a report alone."""
+    """Like `check_outputs`, for a command that writes only a report."""
     if json_path not in (None, "-"):
         _check_replaces_nothing("--json", Path(str(json_path)), inputs)
 
 
 def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """`check_outputs` for a mesh in a format whose suffix its own library judges."""
+    """Like `check_outputs`, for a mesh in a format whose suffix another library checks."""
     _check_replaces_nothing("-o", output, inputs)
     check_json(json_path, (*inputs, output))
 
 
 def check_new(outputs: Mapping[str, Path], json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """`check_outputs` for files none of which may replace an input; what each is, and where."""
+    """Like `check_outputs`, for files that must not replace any input; ``outputs`` maps descriptions to paths."""
     taken: list[Path] = []
     for what, path in {**outputs, **({} if json_path in (None, "-") else {"--json": Path(str(json_path))})}.items():
         _check_replaces_nothing(what, path, inputs)
@@ -126,14 +126,14 @@ def check_new(outputs: Mapping[str, Path], json_path: str | None, inputs: Sequen
 def check_picture(
     option: str, path: Path, inputs: Sequence[Path | None], endings: Sequence[str] = (".png", ".svg", ".pdf")
 ) -> None:
-    """`check_outputs` for a picture."""
+    """Like `check_outputs`, for a picture."""
     if path.suffix.lower() not in endings:
         raise ValueError(f"{option} {path}: pictures are written as {', '.join(endings)}")
     _check_replaces_nothing(option, path, inputs)
 
 
 def check_export(path: Path, inputs: Sequence[Path | None]) -> None:
-    """`check_outputs` for values per triangle."""
+    """Like `check_outputs`, for values per triangle."""
     from quasiharmonic import io
 
     if path.suffix.lower() not in io.PER_TRIANGLE_FORMATS:
@@ -150,12 +150,12 @@ def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | Non
 
 
 def _same(path: Path, other: Path) -> bool:
-    """Whether two paths lead to one file, be it by links, symbolic or hard."""
+    """Whether two paths are the same file, also through symbolic or hard links."""
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
 
 
 _COUNTING = "(indices count from 0)"
-# What a message that names elements by their numbers has in it.
+# Matches messages that name elements by their numbers.
 _NUMBERED = re.compile(
     r"\b(vertex|vertices|nodes?|triangles?|quadrilaterals?|edges?|corners?|loops?|islands?|rows?|between) [-(]?\d"
 )
@@ -165,9 +165,9 @@ _NEEDS_NO_NOTE = re.compile(r"\b0 … \d|\bnamed? .*\bmore than once")
 
 @contextmanager
 def about(source: Path | str) -> Iterator[None]:
-    """Tell of which file a message about a mesh speaks, and how it counts where it names elements by numbers.
+    """Prefix error messages about a mesh with its file, and state that indices count from 0 where it matters.
 
-    Messages about files say themselves of which they speak.
+    A `MeshFileError` already names its file and is not changed.
     """
     from quasiharmonic.io.errors import MeshFileError
 
@@ -177,7 +177,7 @@ def about(source: Path | str) -> Iterator[None]:
         raise
     except ValueError as error:
         if str(error).endswith(_COUNTING):
-            # Said already, of something more particular.
+            # An inner block has already added the prefix.
             raise
         numbered = _NUMBERED.search(str(error)) and not _NEEDS_NO_NOTE.search(str(error))
         counting = f" {_COUNTING}" if numbered else ""
@@ -185,7 +185,7 @@ def about(source: Path | str) -> Iterator[None]:
 
 
 def in_words(error: Exception) -> str:
-    """The message of an error, an error of the system without its number."""
+    """Return the message of an error; system errors without their number."""
     from quasiharmonic.io.errors import printable
 
     if not isinstance(error, OSError) or error.strerror is None:
@@ -195,12 +195,12 @@ def in_words(error: Exception) -> str:
 
 
 class ReportError(Exception):
-    """The map is written, but what should be told about it could not be."""
+    """The map was written, but the report failed."""
 
 
 @contextmanager
 def after_writing(output: Path) -> Iterator[None]:
-    """Keep what goes wrong from here on from claiming that nothing was written."""
+    """Convert errors after writing to `ReportError`, so that the message says that the output was written."""
     try:
         yield
     except (ValueError, OSError, ArithmeticError, ImportError) as error:

@@ -1,4 +1,4 @@
-"""Options that say where the seams of a surface are, and the surface with them."""
+"""Options for seams, and the surface with its seams."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 @dataclass
 class Seamed:
-    """The surface of a file with its seams.
+    """Surface of a file with its seams.
 
     Attributes
     ----------
     mesh : SeamedMesh
     facts : dict
-        What was done, for the report.
+        Entries for the JSON report.
     notes : list of str
-        The same in sentences.
+        Sentences for the text report.
     """
 
     mesh: SeamedMesh
@@ -34,7 +34,7 @@ class Seamed:
 
 
 def add_options(parser: argparse._ActionsContainer) -> None:
-    """``--cut`` and ``--seams``."""
+    """Add ``--cut`` and ``--seams``."""
     parser.add_argument(
         "--cut",
         action="store_true",
@@ -50,7 +50,7 @@ def add_options(parser: argparse._ActionsContainer) -> None:
 
 
 def add_packing(parser: argparse._ActionsContainer) -> None:
-    """``--pack`` and ``--margin``."""
+    """Add ``--pack`` and ``--margin``."""
     parser.add_argument(
         "--pack", action="store_true", help="lay the islands into the unit square, all at one texel density"
     )
@@ -63,33 +63,33 @@ def add_packing(parser: argparse._ActionsContainer) -> None:
 
 
 def laid_out(options: argparse.Namespace, mesh: SeamedMesh) -> SeamedMesh:
-    """The map packed, if that is asked for."""
+    """Return the map, packed if requested."""
     from quasiharmonic.apps import atlas
 
     return atlas.pack(mesh, margin=options.margin) if options.pack else mesh
 
 
 def check_packing(options: argparse.Namespace) -> None:
-    """Raise a ValueError for a margin of what is not packed."""
+    """Raise ValueError if ``--margin`` is given without ``--pack``."""
     from quasiharmonic.ui.cli import arguments
 
     arguments.settle(options, "margin", 1 / 256, asked=options.pack, belongs="--pack")
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """Raise a ValueError for a file of edges that is not there."""
+    """Raise ValueError if the file of edges does not exist."""
     if options.seams not in ("file", "none") and not Path(options.seams).is_file():
         raise ValueError(f"--seams {options.seams}: neither 'file' nor 'none', and no file of that name")
 
 
 def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> Seamed:
-    """The surface of a file with the seams that the options ask for.
+    """Return the surface of a file with the seams that the options request.
 
     Raises
     ------
     ValueError, OSError
-        When some faces have places and others none, although there are seams; when a line of the list of edges is
-        wrong; as `find_cuts`.
+        If only some faces have texture coordinates although there are seams, a line of the list of edges is wrong, or
+        as for `find_cuts`.
     """
     from quasiharmonic import io
     from quasiharmonic.geometry.mesh.seams import SeamedMesh
@@ -99,7 +99,7 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
     with report.about(mesh.source):
         if options.seams == "file":
             if mesh.FT is not None and getattr(options, "to", "") is not None:
-                # Only where the map says where boundaries go, part of it may do.
+                # A partial map is sufficient only if the map defines the target of the boundary.
                 io.check_mapped(mesh)
             found = Seamed(io.seamed(mesh))
         elif options.seams == "none":
@@ -110,7 +110,7 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
             edges = read_edges(Path(options.seams), len(mesh.V))
             found = Seamed(cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
         if options.cut:
-            # What finds cuts takes longer to import than all that a small mesh needs.
+            # Imported here because the import takes longer than the work for a small mesh.
             from quasiharmonic.apps.atlas.seaming import cut_apart
 
             before = found.mesh
@@ -131,7 +131,10 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
 
 
 def read_edges(path: Path, n: int) -> NDArray[np.int64]:
-    """Read edges, two vertices of ``n`` on each line; blanks, commas or colons between, ``#`` before comments."""
+    """Read edges, two vertex indices below ``n`` per line; (k, 2) int64.
+
+    Blanks, commas or colons separate the indices; ``#`` starts a comment.
+    """
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError

@@ -1,4 +1,4 @@
-"""Options of boundaries that slide, and the curves that they slide along."""
+"""Options for sliding boundaries, and the curves that they slide along."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """``--slide`` and ``--pieces``."""
+    """Add ``--slide`` and ``--pieces``."""
     parser.add_argument(
         "--slide",
         action="store_true",
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """Raise a ValueError where an option has nothing to say something about."""
+    """Raise ValueError if ``--pieces`` is given without ``--slide`` and ``--to``."""
     if options.pieces is not None and not (options.slide and options.to is not None):
         raise ValueError("--pieces tells vertices their side of the outline to slide along: add --slide and --to")
 
@@ -42,21 +42,21 @@ def along(
     held: Sequence[int] = (),
     pieces: Path | None = None,
 ) -> BoundaryCurves:
-    """The curves of an outline for a boundary to slide along.
+    """Return the curves of an outline for a sliding boundary.
 
     Parameters
     ----------
     to, font
-        As `quasiharmonic.targets.outline_curves` takes them.
+        As for `quasiharmonic.targets.outline_curves`.
     corner_angle, held
-        As `BoundaryCurves` has them.
+        As for `BoundaryCurves`; ``held`` are the fixed vertices.
     pieces : Path, optional
-        A file that tells vertices their sides of the outline.
+        A file that assigns vertices to sides of the outline.
 
     Raises
     ------
     ValueError, OSError, ModuleNotFoundError
-        As `outline_curves`; when a line of the file is wrong, or there is no such side.
+        If a line of the file is wrong or names a missing side, or as for `outline_curves`.
     """
     from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.targets import outline_curves
@@ -69,7 +69,7 @@ def along(
 
 
 def told_off(rails: BoundaryCurves, island: Island) -> list[str]:
-    """A sentence about the boundary vertices of a map that are on none of the curves, if there are such."""
+    """Return a sentence about the boundary vertices that are not on the curves, if there are any."""
     from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.util.arrays import named
 
@@ -82,7 +82,10 @@ def told_off(rails: BoundaryCurves, island: Island) -> list[str]:
 
 
 def read_pieces(path: Path, sides: int) -> dict[int, int]:
-    """Read lines of a vertex and its side, one of so many; blanks, commas or colons between, ``#`` before comments."""
+    """Read lines of a vertex and its side; side indices must be below ``sides``.
+
+    Blanks, commas or colons separate the indices; ``#`` starts a comment.
+    """
     from quasiharmonic.io.errors import MeshFileError
 
     told: dict[int, int] = {}

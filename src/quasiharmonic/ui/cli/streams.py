@@ -1,4 +1,4 @@
-"""Standard output and standard error, whose readers may have gone."""
+"""Write to standard output and standard error, also after their readers have closed them."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import os
 import sys
 from contextlib import suppress
 
-#: What a shell shows of a process that wrote to a pipe without a reader: 128 and the number of SIGPIPE.
+#: Exit status of a process that wrote to a pipe without a reader: 128 plus the number of SIGPIPE.
 NO_READER = 141
 
 
 def tell(text: str) -> None:
-    """Print on standard error, if somebody reads it; what is said there decides nothing."""
+    """Print to standard error; errors of the stream are ignored."""
     if sys.stderr is not None:
         with suppress(OSError):
             print(text, file=sys.stderr, flush=True)
 
 
 def finish(status: int) -> int:
-    """Write out what the two streams still hold, so that Python has nothing left to stumble over at its end.
+    """Flush standard output and standard error, so that Python's own flush at exit cannot fail.
 
     Parameters
     ----------
@@ -28,8 +28,8 @@ def finish(status: int) -> int:
     Returns
     -------
     int
-        The same; `NO_READER` where it was 0 and nobody reads standard output, 2 where it was 0 and standard output
-        cannot be written.
+        The same status if it is not 0. Otherwise `NO_READER` if standard output has no reader, 2 if it cannot be
+        written, and 0 without an error.
     """
     error = _flush(1)
     _flush(2)

@@ -1,4 +1,4 @@
-"""Options that say where the boundary goes, and the problem they make of a mesh."""
+"""Options for the target of the boundary, and the problem that they define."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets.boundary.corner_spec import AskedCorners
 
-# That of quasiharmonic.targets.specification, which is not imported to say it.
+# A copy of the text in quasiharmonic.targets.specification, so that the parser need not import that module.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 
 
 @dataclass
 class Posed:
-    """The problem that the options make of an island.
+    """Problem of an island as defined by the options.
 
     Attributes
     ----------
     fitted : Fitted
-        Its boundary on the curves it is to slide along, if it is to.
+        If the boundary slides, its target positions lie on the curves.
     facts : dict of str to int
-        What was done, for the report; of several islands they add up.
+        Entries for the JSON report; those of several islands are added.
     notes : list of str
-        The same in sentences.
+        Sentences for the text report.
     slide : bool or BoundaryCurves
-        Whether the boundary slides, and along what.
+        Whether the boundary slides, and along which curves.
     """
 
     fitted: Fitted
@@ -48,7 +48,7 @@ class Posed:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """``--fixed``, ``--to`` and what belongs to it."""
+    """Add ``--fixed``, ``--to`` and the related options."""
     group = parser.add_argument_group(
         "where the boundary goes", "By default to where the texture coordinates (vt) of the input have it."
     )
@@ -81,13 +81,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def files(options: argparse.Namespace) -> tuple[Path | None, ...]:
-    """The files that the options name, if that is what they name; no output may replace them."""
+    """Return the paths of the options that name existing files; outputs must not replace them."""
     names = options.to, options.font, options.corners
     return tuple(Path(name) if name is not None and os.path.isfile(name) else None for name in names)
 
 
 def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] | None) -> None:
-    """Raise a ValueError where options contradict each other, or the mesh does not say where its boundary goes."""
+    """Raise ValueError if options contradict each other, or the mesh defines no target for its boundary."""
     seams.check_options(options)
     if options.to is not None:
         return
@@ -111,21 +111,21 @@ def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np
 
 
 def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None, beside: int) -> Posed:
-    """Make the problem that the options ask for of an island.
+    """Return the problem of an island as defined by the options.
 
     Parameters
     ----------
     options : Namespace
     island : Island
     fixed : (k,) int64 or None
-        The mesh's vertices to hold where their vt are; boundaries, if None.
+        The mesh's vertices that are fixed at their texture coordinates; the boundaries if None.
     beside : int
-        Which copy of the outline is its own, from the left.
+        Index of the island's own copy of the outline, from the left.
 
     Raises
     ------
     ValueError, OSError, ModuleNotFoundError
-        When options contradict each other, the mesh or the outline is wrong, or they do not fit together.
+        If options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
     from quasiharmonic.apps.repair.fitting import held_in_place
     from quasiharmonic.ui.cli import report
@@ -143,7 +143,7 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
 
 
 def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> Posed:
-    """Lay the boundary along an outline."""
+    """Map the boundary to an outline."""
     from quasiharmonic.apps.repair.fitting import laid_along
     from quasiharmonic.targets import outline
     from quasiharmonic.ui.cli import report
@@ -179,7 +179,7 @@ def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> P
 
 
 def _slide(options: argparse.Namespace, posed: Posed) -> None:
-    """Put the boundary onto the outline's curves; what ``--corners`` sends somewhere stays there."""
+    """Move the boundary onto the outline's curves; vertices from ``--corners`` stay fixed."""
     from dataclasses import replace
 
     from quasiharmonic.energies.newton.sliding import moved_onto
@@ -199,7 +199,7 @@ def _slide(options: argparse.Namespace, posed: Posed) -> None:
 
 
 def _check_room(problem: Problem, to: str) -> None:
-    """Refuse at once what cannot end well, before a search that may take long."""
+    """Raise ValueError for edges that the target flattens, before a search that may take long."""
     from quasiharmonic.targets import flattened_edges
     from quasiharmonic.util.arrays import named_edges
 
@@ -213,12 +213,12 @@ def _check_room(problem: Problem, to: str) -> None:
 
 
 def read_corners(text: str) -> AskedCorners:
-    """Read what ``--corners`` says, or the file that it names.
+    """Read the value of ``--corners``, or the file that it names.
 
     Raises
     ------
     ValueError
-        When that is not what stands there.
+        If the value or the file is malformed.
     """
     from quasiharmonic.targets.boundary import corner_spec as asked_corners
 
@@ -229,7 +229,7 @@ def read_corners(text: str) -> AskedCorners:
 
 
 def _degrees(text: str) -> float:
-    """For argparse."""
+    """Convert text to an angle in degrees, 0 to 180; for argparse."""
     angle = float(text)
     if not 0 <= angle <= 180:
         raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")

@@ -1,4 +1,4 @@
-"""A file as a reader gets it: written, read back, judged."""
+"""Write a map, read it back, and certify the file as a reader gets it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """What a file's map is, exactly.
+    """Exact certificate of a file's map.
 
     Attributes
     ----------
     V : (m, 3) float64
     F : (f, 3) int64
     uv : (m, 2) float64
-        The mesh and its map, with a vertex for each of a vertex's places.
+        The mesh and its map, cut at seams: one vertex per texture coordinate of a vertex.
     certificate : Certificate
-        Of all of it as it lies in the plane.
+        Certificate of the whole map in the plane.
     verdict : AtlasVerdict or None
-        Island by island; None of a single one, of which the certificate says it all.
+        Certificates of the islands; None for a single island.
     faces : int
-        How many faces the file has.
+        Number of faces in the file.
     """
 
     V: NDArray[np.float64]
@@ -42,7 +42,7 @@ class Judged:
 
     @property
     def injective(self) -> bool:
-        """Whether every island is injective, or mirrored and injective."""
+        """Whether every island is injective, possibly mirrored."""
         return self.certificate.injective if self.verdict is None else self.verdict.injective
 
     @property
@@ -52,7 +52,7 @@ class Judged:
 
     @property
     def apart(self) -> bool:
-        """Whether every island is bijective, and none lies on another."""
+        """Whether every island is bijective, and no two islands overlap."""
         return self.bijective and (self.verdict is None or not len(self.verdict.overlapping))
 
     @property
@@ -62,7 +62,7 @@ class Judged:
 
     @property
     def inverted(self) -> NDArray[np.int64]:
-        """Triangles that are not as their island is wound."""
+        """Triangles whose orientation differs from that of their island, and degenerate triangles."""
         import numpy as np
 
         if self.verdict is not None:
@@ -70,14 +70,14 @@ class Judged:
         return np.concatenate([self.certificate.inverted, self.certificate.degenerate])
 
     def summary(self) -> str:
-        """Say what is certified, and of what."""
+        """Return the verdict in sentences."""
         said = self.certificate.summary() if self.verdict is None else self.verdict.summary()
         if self.faces < len(self.F):
             said += f"\nThe verdict is on the {len(self.F)} triangles that stand for its {self.faces} faces."
         return said
 
     def to_dict(self) -> dict[str, Any]:
-        """The verdict in the report's first keys."""
+        """Return the verdict as the first entries of the JSON report."""
         apart = {} if self.verdict is None else {k: self.verdict.to_dict()[k] for k in ("islands", "overlapping")}
         return {
             "injective": self.injective,
@@ -91,7 +91,7 @@ class Judged:
 
 
 def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
-    """Judge the map that a file holds, as a reader in some precision sees it."""
+    """Certify the map of a file, optionally rounded to ``precision`` "float32"."""
     import numpy as np
 
     from quasiharmonic import io
@@ -104,7 +104,7 @@ def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
     if precision == "float32":
         with np.errstate(over="ignore"):
             uv = uv.astype(np.float32).astype(np.float64)
-    # The parts of what has been opened at its seams are its islands.
+    # The components of the mesh cut at its seams are the islands.
     part = components(F, len(V))[F[:, 0]]
     alone = bool((part == part[:1]).all())
     verdict = None if alone else certify_islands(SeamedMesh(V, F, F, uv))
@@ -112,7 +112,7 @@ def judge(mesh: MeshData, *, precision: str = "float64") -> Judged:
 
 
 def tell_losses(output: Path, mesh: MeshData) -> None:
-    """Say, before it is written, what a file will not have of a mesh."""
+    """Report on standard error which data of a mesh the output format cannot store."""
     from quasiharmonic import io
     from quasiharmonic.ui.cli.streams import tell
 
@@ -121,7 +121,7 @@ def tell_losses(output: Path, mesh: MeshData) -> None:
 
 
 def write(output: Path, mesh: MeshData) -> Judged:
-    """Write a mesh with its map, and judge the file as a reader gets it."""
+    """Write a mesh with its map, read the file back, and certify it."""
     from quasiharmonic import io
     from quasiharmonic.ui.cli import report
 

@@ -1,4 +1,4 @@
-"""``qhm --version``: the version, and what a report of an error should say of what it runs on."""
+"""``qhm --version``: print the version and the environment, for error reports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from quasiharmonic.ui.cli.streams import require_output
 
 
 class Version(argparse.Action):
-    """Print what `told` says, and end."""
+    """Print the text of `told` and exit."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help="show version and surroundings, and exit")
@@ -22,7 +22,7 @@ class Version(argparse.Action):
 
 
 def told() -> str:
-    """Version, Python, system, packages, whether loops are compiled, and linear solvers, a line each."""
+    """Return version, Python, system, packages, whether loops are compiled, and linear solvers; one line each."""
     import os
     import platform
     from importlib.metadata import version

@@ -1,4 +1,4 @@
-"""A result as a notebook shows it: what it is, in words that nothing can break out of, and its picture."""
+"""HTML of a result for notebooks: an escaped summary and its picture."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from quasiharmonic.util.display import Displayable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Drawing takes a second for half as many triangles; more are drawn when somebody asks for it.
+# Maximum number of triangles drawn automatically; drawing half as many takes about one second.
 MOST_TRIANGLES = 200_000
 _COLORS = 128
 _STYLE = "white-space: pre-wrap; margin: 0 0 0.5em; font-size: 90%"
 
 
 def html(shown: Displayable) -> str:
-    """A few lines of HTML, with the picture in them; never raises for what cannot be drawn."""
+    """Return a few lines of HTML with the picture; errors of drawing become part of the text."""
     lines = [f"<strong>{escape(type(shown).__name__)}</strong>: {escape(shown.short_repr())}"]
     lines.append(f'<pre style="{_STYLE}">{escape(shown.summary())}</pre>')
     lines.append(_picture(shown))
@@ -33,7 +33,7 @@ def html(shown: Displayable) -> str:
 
 
 def _picture(shown: Displayable) -> str:
-    """The picture as an image in the page itself, or why there is none."""
+    """Return the picture as an inline image, or the reason why there is none."""
     count = _triangles(shown)
     if count == 0:
         return ""
@@ -48,7 +48,7 @@ def _picture(shown: Displayable) -> str:
 
 
 def _png(figure: Figure) -> bytes:
-    """A picture of few colours, a third of the size: a notebook keeps every one that it has shown."""
+    """Return a PNG with few colours, a third of the size, because notebooks store every picture."""
     from PIL import Image
 
     file = BytesIO()
@@ -58,7 +58,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def _triangles(shown: Displayable) -> int:
-    """How many triangles there are to draw; none where the surface is not known."""
+    """Return the number of triangles to draw; 0 if the surface is not known."""
     match shown:
         case MapResult():
             return 0 if shown.V is None else len(shown.F)

@@ -1,4 +1,4 @@
-"""The figures of what can show itself, by kind."""
+"""Figures of displayable objects, by type."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ KINDS = ("map", "distortion", "texture", "convergence")
 
 
 def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure:
-    """Draw what a result, a problem, a certificate, a diagnosis or a measurement looks like.
+    """Draw a result, a problem, a certificate, a diagnosis or a distortion measurement.
 
     Parameters
     ----------
     shown : Displayable
     kind : str
-        One of `KINDS` for a `MapResult`; the others have one each.
+        One of `KINDS` for a `MapResult`; ignored for other types.
     measure : str
-        Of distortion.
+        Measure of distortion.
 
     Raises
     ------
     ValueError
-        When there is no such kind, or what would be drawn is not known.
+        If the kind is unknown, or the object lacks the data to draw.
     """
     match shown:
         case MapResult():
@@ -85,7 +85,7 @@ def _diagnosis(diagnosis: Diagnosis) -> Figure:
     problem = diagnosis.problem
     if problem is None:
         raise ValueError("the diagnosis does not know its problem")
-    # Of whole loops nothing is marked: there is no part of them that would be to blame.
+    # Obstructions of whole loops are not marked, because no part of a loop is the cause.
     vertices = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *(o.vertices for o in diagnosis.obstructions)]))
     triangles = [problem.F[o.triangles][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2) for o in diagnosis.obstructions]
     edges = np.concatenate([np.empty((0, 2), dtype=np.int64), *(o.edges for o in diagnosis.obstructions), *triangles])
@@ -93,5 +93,5 @@ def _diagnosis(diagnosis: Diagnosis) -> Figure:
 
 
 def _bad(certificate: Certificate) -> np.ndarray:
-    """The triangles that are not positive."""
+    """Return the triangles that are not positive."""
     return np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])

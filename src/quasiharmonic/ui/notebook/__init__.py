@@ -1,11 +1,11 @@
-"""The view of ``qhm studio`` in a notebook's cell: `MapWidget`. It needs the extra ``notebook``.
+"""The view of ``qhm studio`` in a notebook cell: `MapWidget`. It needs the extra ``notebook``.
 
 The package builds on `ui.studio`. Start reading in `widget`.
 """
 
 from __future__ import annotations
 
-# As of `typing`.
+# Same meaning as in `typing`, without the import.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""A surface beside its map in a notebook's cell, to be taken hold of; what the hand does, the kernel computes."""
+"""Interactive view of a surface and its map in a notebook cell; the kernel computes the maps."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ try:
 except ImportError as error:
     raise ImportError(f"the widget needs anywidget ({error}): pip install 'quasiharmonic[notebook]'") from error
 
-# What a view that comes later, or again, has to be told, in this order.
+# Messages to repeat to a new view, in this order.
 _KEPT = "surface", "map", "obstructions"
 
 
 class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
-    """A surface beside its map, as ``qhm studio`` shows them: drag the outline, corners and pins, and the map follows.
+    """View of a surface and its map, as in ``qhm studio``: drag the outline, corners and pins, and the map follows.
 
     Parameters
     ----------
     surface : Problem, MapResult, (n, 2) or (n, 3) array, mesh or path
-        What is mapped: a problem; a result, whose boundary stays where its map has it; or a surface, whose boundary
-        goes to a square until something else is asked for, or where a file's own map has it.
+        A problem, a result, or a surface. A result keeps its boundary. A surface without a map starts with its boundary
+        on a square; a file with a map keeps its boundary.
     F : (f, 3) array of int, optional
-        Triangles, where ``surface`` is an array of positions.
+        Triangles, if ``surface`` is an array of positions.
     height : int
-        Of the view, in pixels.
+        Height of the view in pixels.
 
     Attributes
     ----------
     result : MapResult
-        The map at rest that is shown, certified; while a hand moves, the last one.
+        The last certified final map; it does not change during a drag.
     problem : Problem
-        What it is the map of.
+        The problem of that map.
     vertices : (n,) int64
-        For each of their vertices, which of the surface's it is. A closed surface is cut open, and has further copies.
+        Indices of the problem's vertices in the surface. A closed surface is cut open, so some vertices have copies.
 
     Raises
     ------
     ValueError
-        When the surface is none that can be mapped.
+        If the surface cannot be mapped.
     ImportError
-        When anywidget is not installed.
+        If anywidget is not installed.
     """
 
     _esm = f"{bundle('widget')}\nexport default {{ render }};\n"
@@ -86,30 +86,30 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         return self._session.moment.problem
 
     def outline(self, to: str) -> None:
-        """Lay the boundary along an outline named in words, as ``"letter:R"``; ValueError where that cannot be."""
+        """Map the boundary to a named outline, such as ``"letter:R"``; raise ValueError if that is not possible."""
         self._ask({"do": "outline", "to": to})
 
     def polish(self, energy: str = "symmetric-dirichlet", *, slide: bool = False) -> None:
-        """Lower the distortion, as `quasiharmonic.polish` does; ValueError where that cannot be."""
+        """Lower the distortion, as `quasiharmonic.polish` does; raise ValueError if that is not possible."""
         self._ask({"do": "polish", "energy": energy, "slide": slide})
 
     def undo(self) -> None:
-        """Go back to the map before."""
+        """Return to the previous map."""
         self._ask({"do": "undo"})
 
     def redo(self) -> None:
-        """Go forward again."""
+        """Revert the last undo."""
         self._ask({"do": "redo"})
 
     def _ask(self, header: dict[str, Any]) -> None:
-        """Do what a message of the view would ask for; raise what it would be told."""
+        """Handle a message as if from the view; raise ValueError with the message that the view would show."""
         self._note = ""
         self._session.handle(Frame(header, {}))
         if self._note:
             raise ValueError(self._note)
 
     def _heard(self, _: object, content: object, buffers: list[Any]) -> None:
-        """A message from a view in the notebook."""
+        """Handle a message from a view in the notebook."""
         try:
             frame = decode(bytes(buffers[0]) if buffers else b"")
         except ProtocolError as error:
@@ -123,25 +123,25 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
                 self.send({"kind": kind, "first": True}, [self._told[kind]])
 
     def _tell(self, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-        """Tell all views, and keep what one that comes later has to know."""
+        """Send to all views, and store the messages that later views need."""
         kind = header["kind"]
-        if kind == "progress":  # which no cell shows
+        if kind == "progress":  # cells do not show progress
             return
         data = encode(header, arrays)
         if kind == "note":
             self._note = header["text"]
-        # A map without places says where the boundary is wanted only, and stands for no other.
+        # A map message without positions contains only the target of the boundary and must not replace a full one.
         if kind in _KEPT and (kind != "map" or "places" in arrays):
             self._told[kind] = data
         self.send({"kind": kind}, [data])
 
 
 def _sheet(surface: Any, F: ArrayLike | None) -> Sheet:
-    """The surface that a session opens."""
+    """Return the sheet that a session opens."""
     if F is not None:
         return sheet_of(MeshData(np.asarray(surface), np.asarray(F)), "mesh")
     if isinstance(surface, Problem):
-        # Of its map only the places of fixed vertices are looked at.
+        # Only the positions of fixed vertices are used.
         uv = np.zeros((surface.n, 2))
         uv[surface.fixed] = surface.target
         return sheet_of(MeshData(surface.V, surface.F).with_map(uv), "problem", surface.fixed)

@@ -1,4 +1,4 @@
-"""Figures of surfaces and maps, drawn with matplotlib, without its global state and without a display.
+"""Draw figures of surfaces and maps with matplotlib, without its global state and without a display.
 
 The package builds on `geometry` and `problem`. Start reading in `canvas`, then `maps`.
 """

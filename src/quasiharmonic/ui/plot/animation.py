@@ -1,4 +1,4 @@
-"""Moving pictures of maps: how a search comes by one, or how a map follows its boundary."""
+"""Write animations of maps, for example of the iterations of a search or of a moving boundary."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-# A GIF tells how long a picture stays in hundredths of a second, and viewers take one for a mistake.
+# A GIF stores frame durations in hundredths of a second. Viewers do not respect a duration of 1/100 s.
 _HUNDREDTHS, _SHORTEST = 100, 2
-# The palette of a GIF: how many colours, and of how many bits of each channel what is the same colour to it.
+# The palette of a GIF: number of colours, and bits per channel used to count colours.
 _COLOURS, _BITS = 255, 5
 _NONE = "there are no frames"
 
@@ -49,17 +49,17 @@ def save_animation(
     path, frames_per_second
         As for `save_figures`.
     V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
-        The rest surface, whose look colours the triangles.
+        The rest surface, whose shading colours the triangles.
     F : (f, 3) int
     frames : iterable of (str, (n, 2) float)
-        What each frame is called, and its map. All are shown in one window, with room for each.
+        Name and map of each frame. All frames share one window that contains all maps.
     fixed : (k,) int, optional
-        Vertices held in place; those not on the boundary are marked.
+        Fixed vertices; those in the interior are marked.
 
     Raises
     ------
     ValueError
-        When a vertex is not finite, and what `save_figures` raises.
+        If a vertex is not finite, or as for `save_figures`.
     ImportError, quasiharmonic.io.errors.OutputError
         As for `save_figures`.
     """
@@ -72,21 +72,21 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
     Parameters
     ----------
     path : path
-        Ends in ``.gif``, or in ``.mp4`` where the program ffmpeg or the extra ``video`` is installed. Replaced as a
-        whole once the animation is complete.
+        Ends in ``.gif`` or ``.mp4``. An ``.mp4`` needs the program ffmpeg or the extra ``video``. The file is replaced
+        only when the animation is complete.
     figures : iterable of matplotlib Figure
-        Of one size. They are drawn one after another, so a generator will do.
+        All of one size. They are drawn one after another, so a generator is accepted.
     frames_per_second : int
-        At most 50 of a GIF, whose last frame stays for a second more.
+        At most 50 for a GIF. The last frame of a GIF lasts one second longer.
 
     Raises
     ------
     ValueError
-        When there are no figures, the suffix is another, or there is no such rate.
+        If there are no figures, the suffix is not supported, or the frame rate is out of range.
     ImportError
-        When the suffix is ``.mp4`` and neither is there.
+        If the suffix is ``.mp4`` and neither ffmpeg nor the extra ``video`` is installed.
     quasiharmonic.io.errors.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     from quasiharmonic.io.atomic import write_whole
 
@@ -96,12 +96,12 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
 
 
 def check_animation(path: str | PathLike[str], frames_per_second: int) -> str:
-    """Say early what `save_figures` would say of where to write, and how fast; the suffix in small letters.
+    """Check the path and the frame rate before `save_figures`; return the suffix in lower case.
 
     Raises
     ------
     ValueError, ImportError, quasiharmonic.io.errors.OutputError
-        As `save_figures`.
+        As for `save_figures`.
     """
     from quasiharmonic.io.atomic import check_writable
 
@@ -121,7 +121,7 @@ def check_animation(path: str | PathLike[str], frames_per_second: int) -> str:
 def _figures(
     V: ArrayLike, F: ArrayLike, frames: list[tuple[str, ArrayLike]], fixed: ArrayLike | None
 ) -> Iterable[Figure]:
-    """Yield a figure of every frame."""
+    """Yield one figure per frame."""
     rest, F = as_mesh(V, F)
     color = view(rest, F).color
     corners = [_extent(map_array(name, uv, len(rest))) for name, uv in frames]
@@ -137,12 +137,12 @@ def _figures(
 
 
 def _extent(points: FloatArray) -> FloatArray:
-    """The lower left and the upper right corner of the box around points."""
+    """Return the lower left and the upper right corner of the bounding box of points; (2, 2)."""
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _picture(figure: Figure) -> NDArray[np.uint8]:
-    """A figure's pixels, (height, width, 3)."""
+    """Return the pixels of a figure, (height, width, 3) uint8."""
     file = BytesIO()
     figure.savefig(file, format="rgba")
     width, height = (int(side) for side in figure.bbox.size)
@@ -153,7 +153,7 @@ def _gif(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     from PIL import Image
 
     palette = _Palette()
-    # All are looked at for their colours before the first is written, and take little room until then.
+    # The palette needs the colours of all frames, so the frames are kept compressed until the first is written.
     packed = []
     shape: tuple[int, ...] = ()
     for picture in pictures:
@@ -168,7 +168,7 @@ def _gif(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
         picture = np.frombuffer(zlib.decompress(data), dtype=np.uint8).reshape(shape)
         return Image.fromarray(picture).quantize(palette=colours, dither=Image.Dither.NONE)
 
-    # What a frame is late in whole hundredths the next one makes up for.
+    # Round the end times, not the durations, so that rounding errors do not add up.
     ends = [round(_HUNDREDTHS * (k + 1) / rate) for k in range(len(packed))]
     times = [1000 // _HUNDREDTHS * (end - begin) for begin, end in zip([0, *ends], ends, strict=False)]
     times[-1] += 1000
@@ -179,14 +179,14 @@ def _gif(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
 
 
 class _Palette:
-    """One palette for all frames, so that colours do not flicker, with what is in few of them too."""
+    """One palette for all frames, so that colours do not flicker; it includes colours that only few frames use."""
 
     def __init__(self) -> None:
         self._count = np.zeros(1 << 3 * _BITS)
         self._sum = np.zeros((1 << 3 * _BITS, 3))
 
     def look_at(self, picture: NDArray[np.uint8]) -> None:
-        """Take down the colours of every other pixel of every other row."""
+        """Count the colours of every second pixel of every second row."""
         pixels = picture[::2, ::2].reshape(-1, 3)
         red, green, blue = (pixels >> (8 - _BITS)).astype(np.intp).T
         cell = (red << 2 * _BITS) | (green << _BITS) | blue
@@ -195,18 +195,18 @@ class _Palette:
             self._sum[:, channel] += np.bincount(cell, weights=pixels[:, channel], minlength=self._count.size)
 
     def picture(self) -> Image.Image:
-        """A picture that has the palette."""
+        """Return an image that carries the palette."""
         from PIL import Image
 
         there = np.flatnonzero(self._count)
         colours = np.rint(self._sum[there] / self._count[there, None]).astype(np.uint8)
-        # By the root of its area, a colour that is rare counts too.
+        # Weighting a colour by the square root of its area keeps rare colours.
         often = np.ceil(np.sqrt(self._count[there] / self._count.max()) * _COLOURS).astype(np.intp)
         return Image.fromarray(np.repeat(colours, often, axis=0)[None]).quantize(_COLOURS, dither=Image.Dither.NONE)
 
 
 def _ffmpeg() -> str:
-    """Where the program ffmpeg is, on the path or in the extra ``video``."""
+    """Return the path of the program ffmpeg, from PATH or from the extra ``video``."""
     if (found := shutil.which("ffmpeg")) is not None:
         return found
     try:
@@ -226,14 +226,14 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     first = next(pictures, None)
     if first is None:
         raise ValueError(_NONE)
-    height, width = (side - side % 2 for side in first.shape[:2])  # of which the codec wants even ones
+    height, width = (side - side % 2 for side in first.shape[:2])  # the codec needs even sizes
     figure = new_figure((width / 100, height / 100))
     image = figure.add_axes((0, 0, 1, 1))
     image.set_axis_off()
     shown = image.imshow(first, interpolation="none")
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "animation.mp4"
-        # yuv420p is what browsers and phones play.
+        # Browsers and phones play yuv420p.
         writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p"])
         with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, str(target), dpi=100):
             for picture in chain([first], pictures):

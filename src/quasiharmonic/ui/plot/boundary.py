@@ -1,4 +1,4 @@
-"""Figures of a surface whose boundary vertices are numbered, as many of them as can be read."""
+"""Figures of a surface with numbered boundary vertices; numbers that would overlap are omitted."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from quasiharmonic.ui.plot.canvas import (
 from quasiharmonic.ui.plot.shading import view
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Of a figure's side and of the numbers in it: inches, points.
+# Side of the figure in inches, and size of the numbers in points.
 _INCHES, _SIZE = 10.0, 7.5
-# Room that a number takes, in shares of its size: each digit across, and up; and how far off its vertex it is.
+# In units of the font size: width of a digit, height of a number, and distance of a number from its vertex.
 _DIGIT, _HEIGHT, _OFF = 0.68, 1.25, 0.3
 
 
@@ -35,32 +35,32 @@ def save_boundary_figure(
 ) -> None:
     """Write a picture of a surface with its boundary vertices numbered, 1000 × 1000 pixels.
 
-    A number that would lie over another one is left out; corners have theirs first. Boundaries that the surface hides
-    are drawn too.
+    A number that would overlap another one is omitted; the numbers of corners are placed first. Boundaries behind the
+    surface are drawn too.
 
     Parameters
     ----------
     path : path
-        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. The file is replaced only when the picture is complete.
     V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     loops : sequence of (l,) int64
         Boundary vertices in order.
     corners : (k,) int
-        Boundary vertices that are marked, in the order in which they are to have their numbers.
+        Boundary vertices to mark, in the order in which their numbers are placed.
 
     Raises
     ------
     ValueError
-        When a vertex of the surface is not finite.
+        If a vertex of the surface is not finite.
     quasiharmonic.io.errors.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     rest, F = as_mesh(V, F)
     seen, marked = view(rest, F), np.asarray(corners, dtype=np.int64)
     figure = new_figure((_INCHES, _INCHES))
     ax = figure.add_axes((0.04, 0.02, 0.92, 0.9))
-    # Pale, so that what is written over it can be read.
+    # Pale colours keep the numbers readable.
     paint_surface(ax, seen, F, 0.4 * seen.color + 0.6)
     scale = fit(ax, seen.points)
     for loop in loops:
@@ -81,7 +81,7 @@ def save_boundary_figure(
 
 
 def _outward(points: FloatArray, F: IntArray, border: IntArray) -> FloatArray:
-    """Directions away from the triangles around some vertices of the boundary; (k, 2)."""
+    """Return unit vectors from the surrounding triangles towards some boundary vertices; (k, 2)."""
     middles, count = np.zeros_like(points), np.zeros(len(points))
     for corner in F.T:
         np.add.at(middles, corner, points[F].mean(axis=1))
@@ -91,7 +91,10 @@ def _outward(points: FloatArray, F: IntArray, border: IntArray) -> FloatArray:
 
 
 def _readable(places: FloatArray, half: FloatArray) -> list[int]:
-    """Which boxes, of half such sizes (k, 2) around places (k, 2), lie over no earlier one that is chosen."""
+    """Return the indices of a greedy choice of boxes that do not overlap.
+
+    The boxes have centres ``places`` (k, 2) and half sizes ``half`` (k, 2). Earlier boxes take precedence.
+    """
     chosen: list[int] = []
     for k in range(len(places)):
         apart = np.abs(places[chosen] - places[k]) >= half[chosen] + half[k]

@@ -1,4 +1,4 @@
-"""What all figures are drawn with: figures without global state, triangles painted in order, captions."""
+"""Drawing primitives of all figures: figures without global state, triangles painted in order, captions."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Endings of pictures: pixels, and two in which lines stay lines.
+#: Suffixes of pictures: one raster format and two vector formats.
 PICTURES = (".png", ".svg", ".pdf")
-# So many triangles and more are pixels in these too: as shapes they would fill megabytes.
+# Above this number of triangles vector formats get pixels too, because shapes would take megabytes.
 _MOST_SHAPES = 10_000
 
 RED = (0.89, 0.07, 0.17)
@@ -32,7 +32,7 @@ _INSIDE = np.array((0.80, 0.82, 0.86))
 
 
 def new_figure(inches: tuple[float, float]) -> Figure:
-    """A white figure of 100 pixels an inch, known to nobody but its owner; a notebook shows it."""
+    """Return a white figure of 100 pixels per inch that is not registered with pyplot; notebooks display it."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -46,28 +46,28 @@ def new_figure(inches: tuple[float, float]) -> Figure:
 
 
 def save_picture(path: str | PathLike[str], figure: Figure) -> None:
-    """Write a figure in the format that the file's ending says, replacing the file as a whole.
+    """Write a figure in the format of the path's suffix; the file is replaced only when it is complete.
 
     Raises
     ------
     ValueError
-        When the ending is none of `PICTURES`.
+        If the suffix is not one of `PICTURES`.
     quasiharmonic.io.errors.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     from matplotlib import rc_context
 
     from quasiharmonic.io.atomic import write_whole
 
     suffix = check_ending(path)
-    # The same figure is the same file: no date, and no name drawn by lot.
+    # Equal figures give equal files: no date and no random identifiers.
     metadata: dict[str, dict[str, Any]] = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
     with rc_context({"svg.hashsalt": "quasiharmonic"}):
         write_whole(path, lambda file: figure.savefig(file, format=suffix[1:], metadata=metadata[suffix]))
 
 
 def check_ending(path: str | PathLike[str]) -> str:
-    """The ending of a picture's name in small letters, or a ValueError where it is none of `PICTURES`."""
+    """Return the suffix of a picture's path in lower case; raise ValueError if it is not one of `PICTURES`."""
     suffix = Path(path).suffix.lower()
     if suffix not in PICTURES:
         raise ValueError(f"{path}: pictures are written as {', '.join(PICTURES)}")
@@ -75,25 +75,25 @@ def check_ending(path: str | PathLike[str]) -> str:
 
 
 def panels(figure: Figure, count: int) -> list[Axes]:
-    """Axes side by side, with room for a caption above each."""
+    """Return ``count`` axes side by side, with space for a caption above each."""
     width = 1 / count
     return [figure.add_axes((i * width + 0.005, 0.02, width - 0.01, 0.88)) for i in range(count)]
 
 
 def caption(ax: Axes, text: str, color: tuple[float, float, float] = INK) -> None:
-    """Write above a panel, at the same height in all."""
+    """Write a caption above a panel, at the same height for all panels."""
     left, right = ax.get_position(original=True).intervalx
     ax.figure.text((left + right) / 2, 0.93, text, ha="center", size=12.5, color=color)
 
 
 def verdict(ax: Axes, name: str, inverted: int) -> None:
-    """Write above a panel what map it shows and how many triangles of it are inverted."""
+    """Write the name of a map and the number of its inverted triangles above a panel."""
     text = f"{name}: {inverted:,} inverted" if inverted else f"{name}: no triangle inverted"
     caption(ax, text, RED if inverted else INK)
 
 
 def fit(ax: Axes, points: FloatArray) -> float:
-    """Fit the view to the points, without frame; return how many points of print a unit has."""
+    """Fit the view to the points and hide the frame; return the number of printer's points per unit."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.03 * (float((high - low).max()) or 1.0)
     low, high = low - margin, high + margin
@@ -106,11 +106,11 @@ def fit(ax: Axes, points: FloatArray) -> float:
 
 
 def paint_surface(ax: Axes, seen: View, F: IntArray, color: FloatArray) -> None:
-    """Paint a surface as it is seen, its outer side in the given colours (f, 3), its inner side greyed."""
+    """Paint a projected surface, its outer side in the given colours (f, 3), its inner side greyed."""
     color = np.where(seen.inside[:, None], _INSIDE * (0.5 + 0.5 * color), color)
     scale = fit(ax, seen.points)
     edges, width = edge_style(color, scale * least_heights(seen.points[F]))
-    # What is nearer is painted later. The boundary takes part, each edge just after its triangle.
+    # Nearer triangles are painted later. Each boundary edge is painted just after its triangle.
     border = boundary_edges(F, len(seen.points))[:, [0, 1, 1]]
     ink = np.broadcast_to(INK, (len(border), 3))
     corners = np.concatenate([F, border])
@@ -134,9 +134,9 @@ def paint_map(
     fixed: ArrayLike | None = None,
     window: FloatArray | None = None,
 ) -> None:
-    """Paint a map in the given colours (f, 3), inverted triangles in red over all others.
+    """Paint a map in the given colours (f, 3), inverted triangles in red on top.
 
-    All of it is in view, or what lies about the points of a ``window``.
+    The view contains the whole map, or the points of ``window`` if given.
     """
     window = uv if window is None else window
     uv = drawable(uv, window)
@@ -145,7 +145,7 @@ def paint_map(
     color[inverted] = RED
     height = scale * least_heights(uv[F])
     edges, width = edge_style(color, height)
-    # The inverted ones come last, over whatever they overlap.
+    # Inverted triangles are painted last, on top of the triangles they overlap.
     order = np.concatenate([np.delete(np.arange(len(F)), inverted), inverted])
     _fill(ax, uv[F[order]], color[order], edges[order], width[order])
     tiny = inverted[height[inverted] < 0.7]
@@ -168,21 +168,24 @@ def outline(ax: Axes, F: IntArray, uv: FloatArray) -> None:
 
 
 def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
-    """Triangles whose area, in floating point, is not positive."""
+    """Return the indices of triangles whose signed area, in floating point, is not positive."""
     uv = drawable(uv)
     a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
     return np.flatnonzero(~(a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0]))
 
 
 def as_mesh(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
-    """Positions, checked to be finite, and triangles, be it none, checked to refer to them, as arrays."""
+    """Return vertices and triangles as arrays, after checking finiteness and the range of indices.
+
+    A mesh without triangles is allowed.
+    """
     rest, triangles = vertex_array(V), triangle_rows(F)
     check_range("F", triangles, len(rest))
     return rest, triangles
 
 
 def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, width: FloatArray) -> None:
-    """Paint triangles in their order; corners (f, 3, 2), colours (f, 3)."""
+    """Paint triangles in the given order; corners (f, 3, 2), colours (f, 3)."""
     from matplotlib.collections import PolyCollection
 
     triangles = PolyCollection(
@@ -193,5 +196,5 @@ def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, w
 
 
 def _polygons(corners: FloatArray) -> Sequence[ArrayLike]:
-    """Corners as matplotlib's annotations want them; it is fastest with the array as it is."""
+    """Cast corners to the type that matplotlib's annotations require; passing the array itself is fastest."""
     return cast("Sequence[ArrayLike]", corners)

@@ -1,4 +1,4 @@
-"""How a search went: energy and inverted triangles, iteration by iteration."""
+"""Plot the convergence of a search: energy and inverted triangles over iterations."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _COLORS = ((0.16, 0.38, 0.75), (0.06, 0.55, 0.50), (0.80, 0.50, 0.05), (0.45, 0.
 
 
 def plot_convergence(result: MapResult) -> Figure:
-    """Draw the energy of a result's history above its inverted triangles, over iterations.
+    """Draw the energy of a result's history above its number of inverted triangles, over iterations.
 
-    Each run has a line of its own, for what it lowers is its own: the search an energy in excess of the target's area,
-    a polish the mean distortion. What is not finite, or is zero where the axis is logarithmic, is left out.
+    Each run has its own line because runs lower different objectives. A search lowers an energy in excess of the
+    target's area; a polish lowers the mean distortion. Values that are not finite or not positive are omitted.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def plot_convergence(result: MapResult) -> Figure:
     Raises
     ------
     ValueError
-        When the result has no history.
+        If the result has no history.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -50,7 +50,7 @@ def plot_convergence(result: MapResult) -> Figure:
         color = _COLORS[number % len(_COLORS)]
         energy.plot(at, values, ".-", color=color, markersize=4, linewidth=1.4, label=name)
         flips.plot(at, [step.inverted for step in steps], ".-", color=RED, markersize=4, linewidth=1.2)
-        # The next run begins with the map that this one ended with.
+        # The next run starts from the last map of this run.
         begin += len(steps) - 1
     if np.isfinite(np.concatenate([line.get_ydata() for line in energy.lines])).any():
         energy.set_yscale("log")
@@ -68,7 +68,7 @@ def plot_convergence(result: MapResult) -> Figure:
 
 
 def _runs(result: MapResult) -> list[tuple[str, Sequence[Step]]]:
-    """The history run by run, each of which counts from 0, with the names of the stages that ran in it."""
+    """Return the runs of the history with the names of their stages; iterations count from 0 in each run."""
     starts = [k for k, step in enumerate(result.history) if k == 0 or step.iteration == 0]
     runs: list[tuple[str, Sequence[Step]]] = []
     stages = list(result.stages)

@@ -1,4 +1,4 @@
-"""Pictures of distortion: a surface and its map coloured by a measure, and how much area has how much of it."""
+"""Figures of distortion: a surface and its map coloured by a measure, and an area-weighted histogram."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_GREY = (0.6, 0.6, 0.6)  # of triangles on which nothing can be measured
+_GREY = (0.6, 0.6, 0.6)  # triangles without a value
 
-#: The measures that can be drawn: what their axis says, the value of a perfect map, and their scale.
+#: The measures that can be drawn: axis label, value of a perfect map, and scale.
 LABELS = {
     "sigma1": ("σ₁", None, "log"),
     "sigma2": ("σ₂", None, "log"),
@@ -39,15 +39,15 @@ LABELS = {
 
 @dataclass(frozen=True, eq=False)
 class _Scale:
-    """Colours for the values of one measure.
+    """Colour scale of one measure.
 
     Attributes
     ----------
     label : str
     norm : matplotlib Normalize
-        Its ends are where all but a hundredth of the area lies between.
+        Limits from the 1st and 99th percentiles by area, or from the value of a perfect map.
     colormap : str
-        Diverging where a perfect map lies in the middle; none has red, which is for inverted triangles.
+        Diverging if a perfect map lies in the middle. No colormap contains red, which marks inverted triangles.
     beyond : {"max", "both"}
         The ends beyond which there may be values.
     """
@@ -58,17 +58,17 @@ class _Scale:
     beyond: str = "max"
 
     def place(self, values: FloatArray) -> FloatArray:
-        """Where values (k,) stand between the ends, 0 to 1."""
+        """Return the positions of values (k,) between the limits, 0 to 1."""
         return np.asarray(self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))).clip(0, 1)
 
     @property
     def ticks(self) -> tuple[FloatArray, list[str]]:
-        """Values at even steps of the colours, (5,) float64, and how they read."""
+        """Values at even steps of the colours, (5,) float64, and their labels."""
         values = np.asarray(self.norm.inverse(np.linspace(0, 1, 5)))
         return values, [f"{value:.3g}" for value in values]
 
     def colors(self, values: FloatArray) -> FloatArray:
-        """Colours (f, 3) of values (f,), grey where there is no value."""
+        """Return colours (f, 3) of values (f,), grey where the value is NaN."""
         import matplotlib
 
         colors = np.asarray(matplotlib.colormaps[self.colormap](self.place(np.nan_to_num(values, nan=1.0))))[:, :3]
@@ -80,8 +80,8 @@ class _Scale:
 def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric") -> Figure:
     """Draw a surface and its map coloured by a measure of distortion, and the measure's histogram.
 
-    Triangles that the map inverts are red, those without area in the rest mesh grey. The colours reach from
-    the best value to the one that a hundredth of the area exceeds.
+    Inverted triangles are red; triangles without area in the rest mesh are grey. The colours range from the best value
+    to the 99th percentile by area.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     uv : (n, 2) float
         The map.
     measure : str
-        One of `quasiharmonic.energies.measures.MEASURES`; `quasiharmonic.Distortion` says what each is.
+        One of `quasiharmonic.energies.measures.MEASURES`, which `quasiharmonic.Distortion` describes.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     Raises
     ------
     ValueError
-        When there is no such measure, what `quasiharmonic.distortion` raises, or no triangle has a finite value.
+        If the measure is unknown, if no triangle has a finite value, or as for `quasiharmonic.distortion`.
     """
     check_choice("measure", measure, LABELS)
     rest, F = as_mesh(V, F)
@@ -130,21 +130,21 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
 def save_distortion_figure(
     path: str | PathLike[str], V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "isometric"
 ) -> None:
-    """Write `plot_distortion`'s figure, a picture of 1350 × 450 pixels.
+    """Write the figure of `plot_distortion`, 1350 × 450 pixels.
 
     Parameters
     ----------
     path : path
-        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. The file is replaced only when the picture is complete.
     V, F, uv, measure
         As for `plot_distortion`.
 
     Raises
     ------
     ValueError
-        What `plot_distortion` raises.
+        As for `plot_distortion`.
     quasiharmonic.io.errors.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     save_picture(path, plot_distortion(V, F, uv, measure))
 
@@ -153,7 +153,7 @@ _LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.2
 
 
 def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
-    """Choose the colours for a measure by what values of it there are."""
+    """Choose the colour scale of a measure for the given values; raise ValueError if no value is usable."""
     from matplotlib.colors import AsinhNorm, LogNorm, Normalize
 
     label, perfect, kind = LABELS[measure]
@@ -175,7 +175,7 @@ def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
 
 
 def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> tuple[float, float]:
-    """Quantiles by area."""
+    """Return two quantiles of the values, weighted by area."""
     order = np.argsort(values)
     below = np.cumsum(share[order])
     at = np.searchsorted(below, np.array([low, high]) * below[-1]).clip(max=len(order) - 1)
@@ -184,18 +184,18 @@ def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> 
 
 
 def _bar(figure: Figure, scale: _Scale) -> None:
-    """The colours' meaning, between the map and the histogram."""
+    """Draw the colour bar between the map and the histogram."""
     from matplotlib.cm import ScalarMappable
 
     drawn = ScalarMappable(scale.norm, scale.colormap)
     bar = figure.colorbar(drawn, cax=figure.add_axes((0.605, 0.14, 0.012, 0.74)), extend=scale.beyond)
-    # The histogram's ticks: a logarithmic bar over less than a decade would have one of its own, or none.
+    # Use the histogram's ticks, because a logarithmic bar over less than a decade has at most one tick.
     bar.ax.set_yticks(*scale.ticks, size=9)
     bar.ax.minorticks_off()
 
 
 def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, scale: _Scale) -> None:
-    """How much of the surface has how much of the measure, in equal steps of the colours."""
+    """Draw the histogram of the measure over the surface's area, in equal steps of the colours."""
     import matplotlib
 
     known = np.isfinite(values)

@@ -1,4 +1,4 @@
-"""Figures and axes that a notebook shows by themselves, whether or not it was told how to show matplotlib's."""
+"""Figures and axes that notebooks display even without matplotlib's notebook integration."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 
 class ShownFigure(Figure):
-    """A figure whose picture is what a notebook shows."""
+    """Figure that a notebook displays as a PNG image."""
 
     def _repr_png_(self) -> bytes:
         file = BytesIO()
@@ -18,7 +18,7 @@ class ShownFigure(Figure):
 
 
 class ShownAxes(Axes):
-    """Axes that are shown as the figure that they fill."""
+    """Axes that a notebook displays as their figure."""
 
     def _repr_png_(self) -> bytes | None:
         return self.figure._repr_png_() if isinstance(self.figure, ShownFigure) else None

@@ -1,4 +1,4 @@
-"""A window with a surface, its map, and what the map does to it; drawn by polyscope."""
+"""Show a surface, its map and the distortion in a polyscope window."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _CHECKERS = (0.93, 0.93, 0.90), (0.16, 0.38, 0.75)
 def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLike[str] | None = None) -> None:
     """Open a window on a surface and its map, and return when it is closed.
 
-    The surface carries a checkerboard that the map puts on it; the map lies beside it. Inverted triangles are red in
-    both, and measures of distortion can be switched on as colours of the others.
+    The surface is textured with a checkerboard through the map; the map lies beside it. Inverted triangles are red in
+    both. Measures of distortion can be switched on as colours of the other triangles.
 
     Parameters
     ----------
@@ -35,16 +35,16 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
     uv : (n, 2) float
         The map.
     screenshot : path, optional
-        Write what the window would show as a PNG instead of opening it; no display is needed.
+        Write the view as a PNG instead of opening a window; no display is needed.
 
     Raises
     ------
     ImportError
-        When polyscope is not installed.
+        If polyscope is not installed.
     ValueError
-        What `quasiharmonic.distortion` raises.
+        As for `quasiharmonic.distortion`.
     RuntimeError
-        When no window can be opened.
+        If no window can be opened.
     """
     polyscope = _polyscope()
     polyscope.set_verbosity(0)
@@ -64,7 +64,7 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
 
 
 def _photograph(polyscope: Any, path: str | PathLike[str]) -> None:
-    """Write the view as a PNG, whole or not at all."""
+    """Write the view as a PNG; the file is replaced only when it is complete."""
     from quasiharmonic.io.atomic import write_whole
 
     with tempfile.TemporaryDirectory() as folder:
@@ -74,13 +74,13 @@ def _photograph(polyscope: Any, path: str | PathLike[str]) -> None:
 
 
 def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
-    """Add a surface and its map to polyscope, which has been initialised, for pictures of one's own.
+    """Add a surface and its map to an initialised polyscope, for custom views.
 
     Parameters
     ----------
     V, F, uv
-        As for `show`. What is added is called "surface" and "map", and the inverted triangles of each, if there are
-        any, "surface: inverted" and "map: inverted".
+        As for `show`. The structures are named "surface" and "map". Inverted triangles, if there are any, are separate
+        structures named "surface: inverted" and "map: inverted".
     """
     polyscope = _polyscope()
     rest, F = as_mesh(V, F)
@@ -109,7 +109,7 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
             for measure in SHOWN:
                 _colour_by(drawn, measure, found.per_triangle()[measure][~inverted])
         if inverted.any():
-            # In the map they lie among the others: a little above, to be seen.
+            # In the map, inverted triangles overlap the others, so they are lifted slightly.
             lifted = points if name == "surface" else points + np.array((0, 0, 2e-3 * size))
             polyscope.register_surface_mesh(
                 f"{name}: inverted", lifted, F[inverted], color=RED, edge_width=0.3, back_face_policy="identical"
@@ -120,7 +120,7 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
 
 
 def _colour_by(drawn: Any, measure: str, values: FloatArray) -> None:
-    """Offer a measure as the colour of a mesh."""
+    """Register a measure as a colour of a mesh."""
     known = np.isfinite(values)
     top = float(np.quantile(values[known], 0.99)) if known.any() else 1.0
     low_end = float(values[known].min()) if known.any() else 0.0
@@ -133,15 +133,15 @@ def _colour_by(drawn: Any, measure: str, values: FloatArray) -> None:
 
 
 def view_of(points: FloatArray, aspect: float, angle: float) -> tuple[FloatArray, FloatArray]:
-    """Where to look at points from the front, such that all are in the picture.
+    """Return the camera and the target of a front view that contains all points.
 
     Parameters
     ----------
     points : (n, 3) float64
     aspect : float
-        The picture's width by its height.
+        Width of the picture divided by its height.
     angle : float
-        How much is seen from its lower to its upper side, in radians.
+        Vertical field of view, in radians.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Figures of maps: the surface, the map, and what was inverted before."""
+"""Figures of maps: the surface, the map, and an earlier map for comparison."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def plot_surface(V: ArrayLike, F: ArrayLike, ax: Axes) -> None:
     V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     ax : matplotlib Axes
-        Ordinary two-dimensional ones; the surface is projected here.
+        Two-dimensional axes; the function projects the surface itself.
 
     Raises
     ------
     ValueError
-        When a vertex is not finite.
+        If a vertex is not finite.
     """
     rest, F = as_mesh(V, F)
     seen = view(rest, F)
@@ -59,12 +59,12 @@ def plot_map(
     fixed: ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map, its inverted triangles in red over all others.
+    """Draw a map, its inverted triangles in red on top.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
-        The rest surface, whose look colours the triangles.
+        The rest surface, whose shading colours the triangles.
     F : (f, 3) int
     uv : (n, 2) float
         The map.
@@ -72,9 +72,9 @@ def plot_map(
         The triangles to show as inverted, as a certificate lists them. By default those whose area
         in floating point is not positive.
     fixed : (k,) int, optional
-        Vertices held in place; those not on the boundary are marked.
+        Fixed vertices; those in the interior are marked.
     ax : matplotlib Axes, optional
-        Where to draw; the axes of a new `matplotlib.figure.Figure` by default.
+        Axes to draw into; by default the axes of a new `matplotlib.figure.Figure`.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def plot_map(
     Raises
     ------
     ValueError
-        When a vertex of the surface or the map is not finite.
+        If a vertex of the surface or the map is not finite.
     """
     rest, F = as_mesh(V, F)
     if ax is None:
@@ -120,7 +120,7 @@ def plot_before_after(
     Raises
     ------
     ValueError
-        When a vertex of the surface or a map is not finite.
+        If a vertex of the surface or a map is not finite.
     """
     rest, F = as_mesh(V, F)
     figure, seen = new_figure((9, 4.8)), view(rest, F)
@@ -140,26 +140,26 @@ def save_map_figure(
     inverted: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
 ) -> None:
-    """Write a picture of a rest surface, the first guess of its map, and the map; 1200 × 450 pixels.
+    """Write a picture of a rest surface, its initial map, and its map; 1200 × 450 pixels.
 
     Parameters
     ----------
     path : path
-        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. The file is replaced only when the picture is complete.
     V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
     F : (f, 3) int
     uv : (n, 2) float
     before : (n, 2) float, optional
-        The first guess; without it the picture has two panels and is 800 pixels wide.
+        The initial map. Without it the picture has two panels and is 800 pixels wide.
     inverted, fixed
         As for `plot_map`, of ``uv``.
 
     Raises
     ------
     ValueError
-        When a vertex of the surface or a map is not finite, or the path has another ending.
+        If a vertex of the surface or a map is not finite, or the suffix is not supported.
     quasiharmonic.io.errors.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     save_picture(path, map_figure(V, F, uv, before, inverted=inverted, fixed=fixed))
 
@@ -173,7 +173,7 @@ def map_figure(
     inverted: ArrayLike | None = None,
     fixed: ArrayLike | None = None,
 ) -> Figure:
-    """Draw what `save_map_figure` writes."""
+    """Draw the figure that `save_map_figure` writes."""
     rest, F = as_mesh(V, F)
     seen = view(rest, F)
     count = 2 if before is None else 3

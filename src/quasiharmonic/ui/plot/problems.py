@@ -1,4 +1,4 @@
-"""Figures of problems: a surface beside where its boundary and its pins go, and what stands in the way."""
+"""Figures of problems: a surface beside the target positions of its boundary and pins, and the obstructions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def plot_problem(
     vertices: ArrayLike = (),
     edges: ArrayLike = (),
 ) -> Figure:
-    """Draw a surface beside where its fixed vertices go: boundary edges as lines, pins as dots.
+    """Draw a surface beside the targets of its fixed vertices: boundary edges as lines, pins as dots.
 
     Parameters
     ----------
@@ -37,9 +37,10 @@ def plot_problem(
     fixed : (k,) array of int
         The boundary and any pins.
     target : (k, 2) array
+        Target positions of the fixed vertices.
     vertices : (a,) array of int
     edges : (b, 2) array of int
-        What is marked in red, as a diagnosis names it; beside the surface as far as its vertices are fixed.
+        Vertices and edges to mark in red, as a diagnosis lists them. In the plane only fixed ones are marked.
 
     Returns
     -------
@@ -48,7 +49,7 @@ def plot_problem(
     Raises
     ------
     ValueError
-        When an array has the wrong shape, refers to what there is not, or is not finite.
+        If an array has the wrong shape, contains an invalid index, or is not finite.
     """
     rest, F = as_mesh(V, F)
     held = held_vertices(fixed, len(rest))
@@ -71,7 +72,7 @@ def plot_problem(
 
 
 def _lines(ax: Axes, points: FloatArray, edges: IntArray, color: tuple[float, float, float], width: float) -> None:
-    """Draw edges, as far as both ends have a place."""
+    """Draw the edges whose two ends have positions."""
     ends = points[edges].reshape(-1, 2, 2)
     gap = np.full((len(ends), 1, 2), np.nan)
     x, y = np.concatenate([ends, gap], axis=1).reshape(-1, 2).T

@@ -1,7 +1,7 @@
-"""How a surface is looked at, and the colour each of its triangles has in every picture of it.
+"""Project a surface and assign a colour to each triangle, the same in every picture.
 
-A triangle keeps its colour from the surface to the map: hue by where it is seen on the surface,
-brightness by how the light falls on it there. So a reader finds in the map what was on the surface.
+A triangle has the same colour on the surface and in the map. The position in the view of the surface gives the hue, and
+the light there gives the brightness. So readers can match triangles of the map with those of the surface.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from quasiharmonic.targets.boundary.correspondence import upright
 from quasiharmonic.util.arrays import FloatArray
 
-# Colours at the left and right, bottom and top of the view, and far from the red of inversions.
+# Colours at the four corners of the view; all differ clearly from the red of inverted triangles.
 _CORNERS = np.array([[(40, 96, 190), (16, 160, 140)], [(140, 110, 230), (255, 200, 60)]]) / 255
 _LIGHT = np.array([-0.45, 0.60, 0.66])
 
 
 @dataclass(frozen=True)
 class View:
-    """A surface as it is seen.
+    """Projection of a surface onto the picture plane.
 
     Attributes
     ----------
     points : (n, 2) float64
         Vertices in the plane of the picture.
     depth : (n,) float64
-        Of the vertices, growing towards the viewer.
+        Depth of the vertices, increasing towards the viewer.
     inside : (f,) bool
         Triangles that show their inner side.
     light : (f,) float64
-        How the light falls on every triangle, -1 from behind to 1 straight.
+        Cosine between normal and light direction per triangle: -1 from behind, 1 head-on.
     color : (f, 3) float64
         Red, green and blue of every triangle's outer side, 0 to 1.
     """
@@ -45,7 +45,7 @@ class View:
 
 
 def view(V: FloatArray, F: NDArray[np.int64]) -> View:
-    """Look at a surface: a planar one from above, an open one from where it is most seen.
+    """Project a surface: a planar one from above, an open one from the direction that shows most of it.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     Raises
     ------
     ValueError
-        When there are no triangles.
+        If there are no triangles.
     """
     if not len(F):
         raise ValueError("the mesh has no triangles to draw")
@@ -91,25 +91,25 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
 
 
 def drawable(points: FloatArray, beside: FloatArray | None = None) -> FloatArray:
-    """Points in a unit in which squares of lengths neither overflow nor vanish: their own, if it will do.
+    """Return points scaled by a power of two, so that squares of lengths neither overflow nor underflow.
 
-    With others to be drawn beside it is what does for those.
+    Points of moderate size are returned unchanged. If ``beside`` is given, its size determines the factor.
     """
     exponent = int(np.frexp(np.abs(points if beside is None else beside).max(initial=0.0))[1])
     return np.ldexp(points, -exponent) if abs(exponent) > 300 else points
 
 
 def edge_style(color: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Colours of the edges, lighter than the triangles, and their widths, given heights in points.
+    """Return colours of the edges, lighter than the triangles, and their widths, given heights in points.
 
-    Those of triangles too thin to show them only close the gaps that antialiasing leaves.
+    Edges of very thin triangles have the triangle's colour and only close the gaps that antialiasing leaves.
     """
     lightness = np.clip((height - 1.3) / 10, 0, 0.45)[:, None]
     return color + (1 - color) * lightness, np.clip(0.09 * height, 0.25, 0.8)
 
 
 def least_heights(corners: FloatArray) -> FloatArray:
-    """Least height of each triangle, (f,) float64 for corners (f, 3, 2)."""
+    """Return the least height of each triangle, (f,) float64 for corners (f, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
@@ -117,10 +117,10 @@ def least_heights(corners: FloatArray) -> FloatArray:
 
 
 def _frame(area: FloatArray, total: float) -> FloatArray:
-    """Where to look from, given the vector area of a surface and the sum of its triangles' areas.
+    """Return the view frame (3, 3), given the vector area of a surface and the sum of its triangle areas.
 
-    The vector area of an open surface points where most of it can be seen from. That of an all but
-    closed one points away from its hole, and such models mostly stand on theirs.
+    The vector area of an open surface points to where most of the surface is visible. The vector area of an almost
+    closed surface points away from its hole, and such models usually stand on the hole.
     """
     openness = np.linalg.norm(area) / total if total > 0 else 0.0
     if openness > 0.999:
@@ -135,7 +135,7 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
             up[axis] = np.sign(area[axis])
         towards[1 if axis == 2 else 2] = -1.0 if axis == 2 else 1.0
         frame = np.stack([np.cross(up, towards), up, towards])
-    # A little from the side and from above shows more relief than straight from the front.
+    # A view slightly from the side and from above shows more relief than a front view.
     yaw, pitch = np.radians((-20, 12))
     from_side = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
     from_above = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
@@ -143,8 +143,8 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
 
 
 def lit(hue: FloatArray, light: FloatArray) -> FloatArray:
-    """Darken colours (k, 3) turned away from the light and whiten those that face it; light (k,) is −1 to 1."""
-    strength = ((1 + light) / 2)[:, None]  # nothing is black: a map shows what no light fell on
+    """Darken colours (k, 3) turned away from the light and whiten those that face it; ``light`` (k,) is −1 to 1."""
+    strength = ((1 + light) / 2)[:, None]  # never black, because a map also shows unlit triangles
     shade = 0.15 + 0.95 * np.minimum(strength / 0.8, 1)
     gleam = 0.42 * np.maximum(strength - 0.8, 0) / 0.2
     return np.asarray(np.clip(hue * shade + (1 - hue * shade) * gleam, 0, 1))

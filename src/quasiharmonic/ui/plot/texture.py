@@ -1,4 +1,4 @@
-"""A checkerboard of the plane, or a picture, seen on the surface: what a map does, as an artist looks at it."""
+"""Render a surface textured with a checkerboard or an image through its map."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _LIGHT, _DARK = np.array((0.93, 0.93, 0.90)), np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel
 _SAMPLES = 2  # per pixel and direction
-_CHUNK = 1 << 17  # samples looked at together: what is in work stays in the cache
+_CHUNK = 1 << 17  # samples processed together, so that they fit into the cache
 
 
 @accepts_mesh
@@ -42,7 +42,7 @@ def plot_texture(
 ) -> Figure:
     """Draw a surface with a checkerboard that a map puts on it, beside the same board in the plane.
 
-    Squares stay squares where the map keeps angles and are of one size where it keeps areas. Inverted
+    Squares stay square where the map preserves angles, and have equal sizes where it preserves areas. Inverted
     triangles are red.
 
     Parameters
@@ -53,9 +53,9 @@ def plot_texture(
     uv : (n, 2) float
         The map.
     squares : int
-        Of the board along the longer side of the map's bounding box.
+        Number of squares along the longer side of the map's bounding box.
     picture : path, optional
-        A picture, PNG or JPEG, in place of the board: the unit square, repeated beyond it, as in any viewer.
+        A PNG or JPEG image to use instead of the board. It covers the unit square and repeats beyond it.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def plot_texture(
     Raises
     ------
     ValueError
-        When there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``picture`` is none.
+        If there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``picture`` is not an image.
     """
     rest, F = as_mesh(V, F)
     uv = drawable(map_array("uv", uv, len(rest)))
@@ -100,34 +100,34 @@ def save_texture_figure(
     squares: int = 24,
     picture: str | PathLike[str] | None = None,
 ) -> None:
-    """Write `plot_texture`'s figure, a picture of 960 × 480 pixels.
+    """Write the figure of `plot_texture`, 960 × 480 pixels.
 
     Parameters
     ----------
     path : path
-        Ends in .png, .svg or .pdf. Replaced as a whole once the picture is complete.
+        Ends in .png, .svg or .pdf. The file is replaced only when the picture is complete.
     V, F, uv, squares, picture
         As for `plot_texture`.
 
     Raises
     ------
     ValueError
-        What `plot_texture` raises.
+        As for `plot_texture`.
     quasiharmonic.io.errors.OutputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     save_picture(path, plot_texture(V, F, uv, squares=squares, picture=picture))
 
 
 def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
-    """Lay a painted image under axes in the units of its points."""
+    """Show a rendered image in axes, in the coordinates of its points."""
     low, high = _window(points)
     ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
     ax.set_axis_off()
 
 
 def _window(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners of the square that a panel shows."""
+    """Return two opposite corners of the square that a panel shows."""
     low, high = points.min(axis=0), points.max(axis=0)
     reach = 0.52 * (float((high - low).max()) or 1.0)
     return (low + high) / 2 - reach, (low + high) / 2 + reach
@@ -142,10 +142,10 @@ def _painted(
     inverted: IntArray,
     light: FloatArray,
 ) -> FloatArray:
-    """An image (side, side, 4) of triangles seen in the plane, the nearest of them at each pixel.
+    """Return an image (side, side, 4) of projected triangles, the nearest triangle at each pixel.
 
-    ``points`` (n, 2) and ``depth`` (n,) are where vertices are seen, ``board`` (n, 2) their places on what
-    ``color_at`` gives colours (k, 3) for places (k, 2), and ``light`` (f,) falls on the triangles.
+    ``points`` (n, 2) and ``depth`` (n,) are the projected vertices. ``board`` (n, 2) are their texture coordinates, and
+    ``color_at`` returns colours (k, 3) for texture coordinates (k, 2). ``light`` (f,) is the light on the triangles.
     """
     side = _SIDE * _SAMPLES
     low, high = _window(points)
@@ -157,7 +157,7 @@ def _painted(
     nearest = np.full(side * side, -np.inf)
     for triangle, pixel, weights in _samples(place[F], side):
         z = np.einsum("kc,kc->k", weights, depth[F[triangle]])
-        # The last of repeated indices stays: sorted by depth, the nearest one.
+        # Of repeated indices the last assignment counts, so sort by depth: the nearest is last.
         order = np.argsort(z, kind="stable")
         order = order[z[order] >= nearest[pixel[order]]]
         triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
@@ -173,12 +173,12 @@ def _painted(
 
 
 def _checkered(places: FloatArray) -> FloatArray:
-    """Colours (k, 3) of a checkerboard whose squares have side 1."""
+    """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
     return np.where(np.floor(places).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
 
 
 def _pictured(path: str | PathLike[str]) -> Callable[[FloatArray], FloatArray]:
-    """What gives the colours (k, 3) of a picture that is the unit square, and is repeated beyond it."""
+    """Return a function from texture coordinates (k, 2) to colours (k, 3) of an image that repeats with period 1."""
     try:
         from PIL import Image
     except ImportError as error:
@@ -189,13 +189,13 @@ def _pictured(path: str | PathLike[str]) -> Callable[[FloatArray], FloatArray]:
     data = read_texture(path).data
     try:
         with Image.open(BytesIO(data)) as image:
-            # What is finer than the panel's samples would only glitter.
+            # Details finer than the panel's samples would alias.
             image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
             glass = image.convert("RGBA")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise MeshFileError(path, f"is a damaged picture: {error}") from error
     white = Image.new("RGBA", glass.size, "white")
-    # Lines from below, as v counts.
+    # Rows from bottom to top, as v increases.
     pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
     size = np.array(pixels.shape[1::-1])
 
@@ -211,7 +211,7 @@ def _pictured(path: str | PathLike[str]) -> Callable[[FloatArray], FloatArray]:
 
 
 def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
-    """Yield, in chunks, triangles (k,), the samples (k,) that lie in them, and their barycentric coordinates (k, 3)."""
+    """Yield, in chunks, triangles (k,), the samples (k,) inside them, and barycentric coordinates (k, 3)."""
     first = np.maximum(np.ceil(corners.min(axis=1) - 0.5), 0).astype(np.int64)
     last = np.minimum(np.floor(corners.max(axis=1) - 0.5), side - 1).astype(np.int64)
     extent = np.maximum(last - first + 1, 0)

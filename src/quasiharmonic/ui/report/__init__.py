@@ -1,4 +1,4 @@
-"""The report of a data set: one HTML page without further files.
+"""HTML report of a batch run, in one file.
 
 The package builds on `ui.batch` and `ui.plot`. Start reading in `page`.
 """

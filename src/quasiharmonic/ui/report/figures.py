@@ -1,4 +1,4 @@
-"""Figures of a report as SVG, in the page's own colours: logarithmic histograms and scatter plots."""
+"""Figures of a report as SVG with CSS colours: logarithmic histograms and scatter plots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.util.arrays import FloatArray
 
 _WIDTH, _HEIGHT = 640, 400
-# Room for labels: left, top, right, bottom.
+# Margins for labels: left, top, right, bottom.
 _LEFT, _TOP, _RIGHT, _BOTTOM = 62, 16, 16, 50
 _BINS_A_DECADE = 6
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -25,33 +25,34 @@ class _Axis:
     end: float
 
     def place(self, values: FloatArray) -> FloatArray:
-        """Where values are drawn; what is beyond an end is drawn there."""
+        """Return the pixel positions of values; values beyond an end are clipped."""
         with np.errstate(divide="ignore"):
             share = (np.log10(values) - self.low) / (self.high - self.low)
         return self.begin + np.clip(share, 0, 1) * (self.end - self.begin)
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Place and label of the powers of ten, not more than nine of them."""
+        """Return positions and labels of at most nine powers of ten."""
         step = -(-(self.high - self.low) // 8)
         exponents = range(self.low, self.high + 1, step)
         return [(float(self.place(np.array(10.0**k))), power(k)) for k in exponents]
 
 
 def power(exponent: int) -> str:
-    """A power of ten as people write it."""
+    """Return a power of ten as text."""
     plain = {-3: "0.001", -2: "0.01", -1: "0.1", 0: "1", 1: "10", 2: "100", 3: "1000"}
     return plain.get(exponent, "10" + str(exponent).translate(_SUPERSCRIPTS))
 
 
 def histogram(series: list[tuple[str, FloatArray]], label: str) -> str:
-    """Distributions over a logarithmic axis: the first as bars, the others as lines.
+    """Return histograms over a logarithmic axis: the first series as bars, the others as lines.
 
     Parameters
     ----------
     series : list of (str, (n,) float)
-        CSS class and values; those not finite are left out, those not positive are drawn in the first bar.
+        CSS class and values. Values that are not finite are omitted; values that are not positive count in the first
+        bar.
     label : str
-        Of the axis of values.
+        Label of the value axis.
 
     Returns
     -------
@@ -84,20 +85,20 @@ def histogram(series: list[tuple[str, FloatArray]], label: str) -> str:
 
 
 def scatter(series: list[tuple[str, FloatArray, FloatArray]], x_label: str, y_label: str, *, same: bool = False) -> str:
-    """Dots over two logarithmic axes.
+    """Return a scatter plot over two logarithmic axes.
 
     Parameters
     ----------
     series : list of (str, (n,) float, (n,) float)
-        CSS class, and the coordinates; pairs that are not positive and finite are left out.
+        CSS class and coordinates; pairs that are not positive and finite are omitted.
     x_label, y_label : str
     same : bool
-        Give both axes the same range, and draw where the second is 1, 10, 100 times smaller than the first.
+        Give both axes the same range, and draw lines where y is 1, 10 and 100 times smaller than x.
 
     Returns
     -------
     str
-        An SVG element; its size is bounded however many dots there are.
+        An SVG element; its size is bounded for any number of dots.
     """
     shown = []
     for css, x, y in series:
@@ -116,7 +117,7 @@ def scatter(series: list[tuple[str, FloatArray, FloatArray]], x_label: str, y_la
     count = sum(len(x) for _, x, _ in shown)
     width = 7 if count <= 200 else 5 if count <= 2000 else 3
     for css, x, y in shown:
-        # Dots on one pixel are one.
+        # Draw one dot per pixel.
         pixels = np.unique(np.round(np.column_stack([x_axis.place(x), y_axis.place(y)])).astype(np.int64), axis=0)
         path = "".join(f"M{a} {b}h0" for a, b in pixels.tolist())
         parts.append(f'<path class="{css} dots" stroke-width="{width}" d="{path}"/>')
@@ -124,7 +125,7 @@ def scatter(series: list[tuple[str, FloatArray, FloatArray]], x_label: str, y_la
 
 
 def _axis(values: list[FloatArray], begin: float, end: float, least: float = 1e-300) -> _Axis:
-    """An axis of whole decades around all values, none of which is below ``least``."""
+    """Return an axis of whole decades that contains all values, after raising them to at least ``least``."""
     every = np.concatenate([np.maximum(v, least) for v in values] or [np.empty(0)])
     if not every.size:
         return _Axis(0, 1, begin, end)
@@ -133,7 +134,7 @@ def _axis(values: list[FloatArray], begin: float, end: float, least: float = 1e-
 
 
 def _round_steps(top: float) -> list[float]:
-    """Round numbers from a step above 0 to ``top``, three to six of them."""
+    """Return multiples of a round step up to ``top``, three to six of them."""
     step = 10.0 ** np.floor(np.log10(top))
     step = next(s for s in (step / 5, step / 4, step / 2, step, 2 * step) if top / s < 6.5)
     return [step * k for k in range(1, int(top / step) + 1)]
@@ -158,7 +159,7 @@ def _grid_line(y: float) -> str:
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
-    """Text of our own, in which nothing needs escaping."""
+    """Return an SVG text element; the text is not escaped."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{text}</text>'
 
 

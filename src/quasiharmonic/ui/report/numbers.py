@@ -1,4 +1,4 @@
-"""What a report says in numbers: records as arrays, and what is counted of them."""
+"""Numbers of a report: records as arrays, and their statistics."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ PHASES = "read", "setup", "map", "polish", "write", "measure"
 
 @dataclass(frozen=True)
 class Run:
-    """The records of a run, or of another program on the same problems.
+    """Records of a run, or of another program on the same problems.
 
     Attributes
     ----------
     name : str
-        How the page calls it.
+        Name on the page.
     rows : list of dict
         The records.
     results : Path or None
-        Where the maps are, if they are at hand.
+        Folder of the maps, if it exists.
     about : dict
-        What the run's own folder says of it; empty elsewhere.
+        Contents of the run's marker file; empty if there is none.
     """
 
     name: str
@@ -43,18 +43,18 @@ class Run:
 
     @property
     def wanted(self) -> str:
-        """What maps were asked to be: ``"bijective"`` where boundaries were free, else ``"injective"``."""
+        """Requested property of the maps: ``"bijective"`` if boundaries were free, else ``"injective"``."""
         free = any(row.get("outcome") in ("bijective", "not bijective") for row in self.rows)
         return "bijective" if free or self.about.get("settings", {}).get("flatten") is True else "injective"
 
     def column(self, name: str) -> FloatArray:
-        """A column of numbers, NaN where there is none; (records,)."""
+        """Return a column of numbers, NaN where there is none; (records,)."""
         values = (row.get(name) for row in self.rows)
         return np.array([np.nan if not _is_number(v) else v for v in values], dtype=np.float64)
 
     @property
     def certified(self) -> NDArray[np.bool_]:
-        """Which records have a map certified to be what was asked for."""
+        """Mask of the records whose map is certified as requested."""
         return np.array([row.get("certified") is True for row in self.rows], dtype=np.bool_)
 
 
@@ -64,12 +64,12 @@ def load(source: str | os.PathLike[str]) -> Run:
     Parameters
     ----------
     source : path
-        The folder of a run, finished or going on, or a table of records.
+        The folder of a finished or running run, or a table of records.
 
     Raises
     ------
     ValueError
-        When there are no records, or they cannot be read.
+        If there are no records, or they cannot be read.
     """
     path = Path(source)
     if not path.exists():
@@ -88,7 +88,7 @@ def load(source: str | os.PathLike[str]) -> Run:
 
 
 def _about(folder: Path) -> Record:
-    """What a run's folder says of it; nothing where it is none, or spoilt."""
+    """Return the contents of a run's marker file; empty if it is missing or invalid."""
     try:
         about = json.loads((folder / MARKER).read_bytes())
     except (OSError, ValueError):
@@ -97,7 +97,7 @@ def _about(folder: Path) -> Record:
 
 
 def _single(results: Path) -> Iterable[Record]:
-    """Records of a run without a table: those that there are so far."""
+    """Yield the existing records of a run without a table."""
     for path in sorted(results.rglob(records.FILE)):
         record = records.read_record(path.parent)
         if record is not None:
@@ -110,16 +110,16 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True)
 class Group:
-    """What is counted of some records.
+    """Statistics of a group of records.
 
     Attributes
     ----------
     name : str
     problems, certified : int
     seconds : tuple of float
-        Median, 95 % and maximum of the time of those certified; NaN where there are none.
+        Median, 95 % quantile and maximum of the times of certified problems; NaN if there are none.
     stretch, mips : tuple of float
-        Worst and median of the worst stretch of those certified, and of their MIPS; NaN where there are none.
+        Maximum and median of the worst stretch and of the MIPS distortion of certified problems; NaN if there are none.
     triangles : int
     """
 
@@ -133,11 +133,11 @@ class Group:
 
 
 def groups(run: Run) -> list[Group]:
-    """Count by the first part of the problems' names, and all together."""
+    """Return the statistics by the first part of the problems' names, and of all problems."""
     first = np.array([row["problem"].partition("/")[0] if "/" in row["problem"] else "" for row in run.rows])
     parts = [_group(run, str(name), first == name) for name in np.unique(first)]
     everything = _group(run, "all", np.ones(len(run.rows), dtype=np.bool_))
-    # A folder for each problem, say, is no grouping.
+    # More than 40 groups, for example one per problem, are not useful.
     return [*(parts if 1 < len(parts) <= 40 else []), everything]
 
 
@@ -156,19 +156,19 @@ def _group(run: Run, name: str, chosen: NDArray[np.bool_]) -> Group:
 
 
 def quantile(values: FloatArray, share: float) -> float:
-    """A quantile of the values that are finite, NaN where there are none."""
+    """Return a quantile of the finite values, NaN if there are none."""
     finite = values[np.isfinite(values)]
     return float(np.quantile(finite, share)) if finite.size else float("nan")
 
 
 def worst(values: FloatArray) -> float:
-    """The largest of the values that there are, infinite ones included; NaN where there are none."""
+    """Return the largest value, including infinity; NaN if there are no values."""
     known = values[~np.isnan(values)]
     return float(known.max()) if known.size else float("nan")
 
 
 def outcomes(run: Run) -> list[tuple[str, int]]:
-    """How many records ended how, in the order of `records.OUTCOMES`; what is not known there comes last."""
+    """Return the number of records per outcome, in the order of `records.OUTCOMES`; unknown outcomes come last."""
     counted = Counter(str(row.get("outcome") or _guess(row)) for row in run.rows)
     order = [*records.OUTCOMES, *sorted(set(counted) - set(records.OUTCOMES))]
     return [(name, counted[name]) for name in order if counted[name]]
@@ -179,7 +179,7 @@ def _guess(row: Record) -> str:
 
 
 def matched(run: Run, other: Run, column: str) -> tuple[FloatArray, FloatArray]:
-    """A column of both for the problems that both have."""
+    """Return a column of both runs for the problems that both contain."""
     theirs = {row["problem"]: row.get(column) for row in other.rows}
     pairs = [
         (row[column], theirs[row["problem"]])

@@ -1,4 +1,4 @@
-"""The page: what a run came to, in one file that opens anywhere."""
+"""Write the HTML page of a report, without external resources."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quasiharmonic.ui.report.numbers import PHASES, Run
 from quasiharmonic.ui.report.style import STYLE
 from quasiharmonic.ui.report.thumbnails import thumbnail
 
-# Problems shown with a picture in each list, and failures named in all.
+# Number of problems with a picture per list, of failures with a picture, and of failures listed in total.
 _PICTURES, _FAILURES, _NAMED = 12, 24, 500
 
 
@@ -26,24 +26,24 @@ def write_report(
     source: str | os.PathLike[str],
     against: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Write a page about a run: success, distortion, times, and the problems worth a look.
+    """Write an HTML page about a run: success, distortion, times, and notable problems.
 
     Parameters
     ----------
     path : path
-        The HTML file to write. Pictures and style are in it; it refers to nothing outside.
+        The HTML file to write. It contains all pictures and styles.
     source : path
         The folder of a run, or a table of records.
     against : path, optional
-        The same of another run, or a table about another program, to compare with: columns ``problem``, named as
-        here, and ``seconds``, and ``mips`` and ``certified`` if there are any.
+        Another run or a table about another program, for comparison. Columns: ``problem``, with the same names;
+        ``seconds``; optionally ``mips`` and ``certified``.
 
     Raises
     ------
     ValueError
-        When there are no records, or they cannot be read.
+        If there are no records, or they cannot be read.
     OutputError
-        When the page cannot be written.
+        If the page cannot be written.
     """
     check_writable(path)
     run = numbers.load(source)
@@ -84,13 +84,13 @@ def _page(run: Run, other: Run | None) -> str:
 
 
 def shown(text: object) -> str:
-    """Text from elsewhere as HTML: escaped, and what would not print or turns the reading direction spelled out."""
+    """Return untrusted text as HTML; characters that do not print or change the reading direction are escaped."""
     plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
     return escape(plain)
 
 
 def number(value: float, unit: str = "") -> str:
-    """A number to three digits; a dash where there is none."""
+    """Format a number with three digits; a dash for NaN."""
     if isnan(value):
         return "–"
     text = f"{value:,.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}" if isfinite(value) else "∞"
@@ -101,7 +101,7 @@ def number(value: float, unit: str = "") -> str:
 
 
 def percent(part: int, whole: int) -> str:
-    """A share; 100 % only where it is all."""
+    """Format a share; "100 %" only if it is exact."""
     share = 100 * part / whole
     return "100 %" if part == whole else f"{min(share, 99.99):.2f} %" if share >= 99 else f"{share:.1f} %"
 
@@ -220,7 +220,7 @@ def _phases(run: Run) -> str:
 
 
 def _worst(run: Run, column: str) -> list[Record]:
-    """The certified records with the highest values in a column, the highest first."""
+    """Return the certified records with the highest values in a column, in decreasing order."""
     values = np.where(run.certified, run.column(column), np.nan)
     order = np.argsort(-values, kind="stable")
     return [run.rows[k] for k in order[:_PICTURES] if not np.isnan(values[k])]
@@ -234,7 +234,7 @@ class _Pictures:
         self._drawn: dict[str, str] = {}
 
     def of(self, row: Record) -> str:
-        """The ``data:`` address of a picture, or nothing."""
+        """Return the ``data:`` address of a picture, or an empty string."""
         name = row["problem"]
         if name not in self._drawn:
             self._drawn[name] = thumbnail(row, self._results)
@@ -294,14 +294,14 @@ def _line(row: Record) -> tuple[str, ...]:
 
 
 def _figure(title: str, drawing: str, legend: Iterable[tuple[str, str]], caption: str) -> str:
-    """A card with a figure; title and caption are HTML."""
+    """Return a card with a figure; title and caption are HTML."""
     keys = "".join(f'<span><i class="{css}"></i>{shown(name)}</span>' for css, name in legend)
     keys = f'<div class="legend">{keys}</div>' if keys else ""
     return f'<section class="card"><h2>{title}</h2>{keys}{drawing}<p class="quiet">{caption}</p></section>'
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, last_is_sum: bool = False) -> str:
-    """A table; all cells are HTML."""
+    """Return a table; all cells are HTML."""
     top = "".join(f"<th>{cell}</th>" for cell in head)
     lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
     body = "".join(

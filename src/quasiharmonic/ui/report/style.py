@@ -1,4 +1,4 @@
-"""How a report looks: by day and by night, on paper and on a small screen."""
+"""Style sheet of a report: light and dark colours, print, and small screens."""
 
 STYLE = """
 :root {

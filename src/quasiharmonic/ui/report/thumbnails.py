@@ -1,4 +1,4 @@
-"""Small pictures of problems and their maps, as they stand in files."""
+"""Thumbnails of problems and their maps, drawn from the files."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from quasiharmonic.ui.batch.records import Record
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
-# Drawing takes about a second for so many triangles.
+# Maximum number of triangles; drawing that many takes about one second.
 _MOST = 100_000
 
 
 def thumbnail(record: Record, results: Path | None) -> str:
-    """Draw the surface and, where there is one, the map of a record.
+    """Draw the surface of a record and, if it exists, its map.
 
     Parameters
     ----------
     record : dict
     results : Path or None
-        Where the run's maps are.
+        Folder of the run's maps.
 
     Returns
     -------
     str
-        A ``data:`` address of a PNG; empty where there is nothing that could be drawn.
+        A ``data:`` address of a PNG; empty if nothing can be drawn.
     """
     if (record.get("triangles") or 0) > _MOST:
         return ""
@@ -58,7 +58,7 @@ def thumbnail(record: Record, results: Path | None) -> str:
 
 
 def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
-    """The mesh to draw, and whether it has a map."""
+    """Return the mesh to draw, and whether it has a map."""
     places = [] if results is None else [(records.map_path(results / record["problem"]), True)]
     if record.get("source"):
         places.append((Path(record["source"]), False))
@@ -72,7 +72,7 @@ def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
 
 
 def _framed(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points moved and scaled by powers of two into a box around the origin, where nothing overflows."""
+    """Return points translated and scaled by powers of two into a box around the origin, which prevents overflow."""
     points = np.ldexp(points, -int(np.frexp(np.abs(points).max())[1]))
     points = points - points.mean(axis=0)
     return np.ldexp(points, -int(np.frexp(np.abs(points).max() or 1.0)[1]))

@@ -1,4 +1,4 @@
-"""The page's files, which are read from the package and from nowhere else."""
+"""Static files of the page, read only from the package."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", r
 
 
 class Asset(NamedTuple):
-    """A file of the page: its bytes, and what they are."""
+    """File of the page: its bytes and its content type."""
 
     content: bytes
     kind: str
@@ -26,7 +26,7 @@ class Asset(NamedTuple):
 
 @cache
 def assets() -> dict[str, Asset]:
-    """All of the page's files by their names."""
+    """Return all files of the page by name."""
     found = {}
     for entry in files(__package__).joinpath("static").iterdir():
         kind = _KINDS.get(entry.name.rpartition(".")[2])
@@ -36,22 +36,22 @@ def assets() -> dict[str, Asset]:
 
 
 def bundle(name: str) -> str:
-    """One module with all that a module of the page imports in it, for what has room for one file, as a widget has.
+    """Return a module of the page together with all modules that it imports, as one JavaScript module; for widgets.
 
     Parameters
     ----------
     name : str
-        Without its ending: ``"view"``.
+        Name without suffix, such as ``"view"``.
 
     Returns
     -------
     str
-        JavaScript that exports what the module does.
+        JavaScript with the exports of the module.
 
     Raises
     ------
     KeyError
-        When there is no such module.
+        If there is no such module.
     """
     wrapped: dict[str, str] = {}
 

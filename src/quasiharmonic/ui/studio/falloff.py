@@ -1,4 +1,4 @@
-"""What moves with the hand: how far the boundary around a vertex goes along with it."""
+"""Falloff of a drag: the share of the motion for the boundary vertices around the dragged vertex."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ import numpy as np
 
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: How far along its loop a vertex that is no corner takes the boundary with it, as a share of the loop's length.
+#: Reach of the falloff around a vertex that is not a corner, as a share of the loop's length.
 REACH = 0.08
 
 
 def grip(
     vertex: int, fixed: IntArray, target: FloatArray, loops: Sequence[IntArray], corners: Sequence[int]
 ) -> FloatArray:
-    """Say by which share of the hand's way every held vertex moves.
+    """Return the share of the pointer's motion for every fixed vertex.
 
-    A pin moves alone. A corner takes the sides beside it along, so that they stay as straight as they are; any other
-    boundary vertex bends its side, smoothly, and no farther than the side's ends.
+    A pin moves alone. A corner moves its two adjacent sides linearly, so that straight sides stay straight. Any other
+    boundary vertex bends its side smoothly, at most up to the ends of the side.
 
     Parameters
     ----------
     vertex : int
-        The vertex that is held by the hand.
+        The dragged vertex.
     fixed : (k,) int64
     target : (k, 2) float64
-        Where they are.
+        Their positions.
     loops : list of (l,) int64
         Boundary loops.
     corners : sequence of int
@@ -35,12 +35,12 @@ def grip(
     Returns
     -------
     (k,) float64
-        From 0 to 1, and 1 at the vertex.
+        Shares from 0 to 1; 1 at the dragged vertex.
 
     Raises
     ------
     ValueError
-        When the vertex is not among those held.
+        If the vertex is not fixed.
     """
     row = np.flatnonzero(fixed == vertex)
     if not row.size:

@@ -1,4 +1,7 @@
-"""The map at rest: the one that the command makes, found from nothing and smoothed, so that all can make it again."""
+"""Compute the final map after a drag: solve from scratch, then smooth.
+
+The command does the same, so the map can be reproduced.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,18 @@ from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.solving import solve
 
-#: Seconds for a search from nothing, where a map is at hand that has followed a hand there.
+#: Time limit in seconds for a search from scratch if an injective map from the drag exists.
 PATIENCE = 10.0
 
 
 class Settled(NamedTuple):
-    """A map at rest.
+    """Final map.
 
     Attributes
     ----------
     result : MapResult
     anew : bool
-        Whether it is the one that is found from nothing, and so the command's; else it comes from the map before.
+        Whether it was solved from scratch, as the command does; otherwise it comes from the previous map.
     """
 
     result: MapResult
@@ -41,24 +44,24 @@ def settle(
     slide: bool | BoundaryCurves = False,
     callback: Callable[[Step], object] | None = None,
 ) -> Settled:
-    """Find the map of a problem, and take the worst distortion off it.
+    """Compute the map of a problem, and lower its worst distortion.
 
     Parameters
     ----------
     problem : Problem
     before : MapResult, optional
-        An injective map of the same problem, which is kept where nothing better is found.
+        An injective map of the same problem; used if the search from scratch fails.
     energy : str, optional
-        Lower this until it converges; a few steps of the blend otherwise.
+        Lower this energy until it converges; by default a few steps of ``"blend"``.
     slide : bool or BoundaryCurves
-        As of `solve`, for ``energy``.
+        As for `solve`, with ``energy``.
     callback : callable, optional
-        Hears every `Step`; may raise `KeyboardInterrupt`.
+        Called with every `Step`; may raise `KeyboardInterrupt`.
 
     Returns
     -------
     Settled
-        Whose result has a diagnosis where no bijective map was found.
+        Its result has a diagnosis if no bijective map was found.
     """
     until = time.monotonic() + PATIENCE
 

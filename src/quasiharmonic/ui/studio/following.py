@@ -1,9 +1,9 @@
-"""A map that follows the hand: the boundary's displacement extended harmonically in the last map's own tensors.
+"""Update the map during a drag: extend the boundary's displacement harmonically with the last map's tensors.
 
-An injective map is the harmonic map of its own tensors (`quasiharmonic.solver.field.objective`), so where the boundary
-moves by d the map of the same tensors moves by the harmonic extension of d: one solve with a factor that is at hand, a
-tenth of a search. Whether that is injective is decided exactly, every time. Where it is not, a map is searched for from
-the last one on, and if there is no time for that, part of the way is gone.
+An injective map is the harmonic map of its own tensors (`quasiharmonic.solver.field.objective`). If the boundary moves
+by d, the map of the same tensors moves by the harmonic extension of d. This takes one solve with an existing factor,
+about a tenth of the time of a search. Every map is certified exactly. If it is not injective, a search starts from the
+last map. If time runs out, the boundary moves only part of the way.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.util.arrays import FloatArray
 
-#: Seconds that may go by until a hand gets its map, or is told that it will not.
+#: Maximum seconds until a drag gets its map, or the report that there is none yet.
 PATIENCE = 0.4
-# Shares of the way that are tried where the whole of it cannot be gone at once.
+# Shares of the displacement to try if the whole displacement fails.
 _SHARES = 0.5, 0.25, 0.1
 
 
 class Followed(NamedTuple):
-    """Where the hand has led.
+    """Map of a drag.
 
     Attributes
     ----------
     uv : (n, 2) float64
         An injective map.
     certificate : Certificate
-        The exact verdict on it.
+        Its exact certificate.
     reached : bool
-        Whether its boundary is where the hand wants it; else it is as far as was got in time.
+        Whether its boundary reached the target; otherwise it went as far as time allowed.
     """
 
     uv: FloatArray
@@ -45,16 +45,16 @@ class Followed(NamedTuple):
 
 
 class Follower:
-    """Follows the target of a problem from an injective map on.
+    """Follows a moving target, starting from an injective map.
 
     Parameters
     ----------
     problem : Problem
-        Its domain is shared, its target is where the map is.
+        Its domain is shared; its target is the boundary of the map.
     uv : (n, 2) float64
         An injective map of it.
     certificate : Certificate
-        The verdict on it.
+        The certificate of the map.
     """
 
     def __init__(self, problem: Problem, uv: FloatArray, certificate: Certificate) -> None:
@@ -63,19 +63,19 @@ class Follower:
         self._take(uv)
 
     def _take(self, uv: FloatArray) -> None:
-        """Go on from an injective map."""
+        """Continue from an injective map."""
         problem = self.problem.with_target(uv[self.problem.fixed])
         self._operator = Objective(problem).of_map(problem.frame.inward(uv)).operator
         self._base = uv
 
     def to(self, target: FloatArray, waiting: Callable[[], bool] = lambda: False) -> Followed:
-        """Lead the boundary to ``target`` (k, 2), or as far as patience goes.
+        """Move the boundary to ``target``, or as far as possible within `PATIENCE`.
 
         Parameters
         ----------
         target : (k, 2) float64
         waiting : callable
-            Whether the hand is elsewhere already, so that nobody waits for this map.
+            Returns whether a newer target exists, so that this map is no longer needed.
         """
         until = time.monotonic() + PATIENCE
         if self._try(target) or self._search(target, until, waiting):
@@ -90,7 +90,7 @@ class Follower:
         return Followed(self._uv, self._certificate, False)
 
     def _try(self, target: FloatArray) -> bool:
-        """Extend the boundary's displacement; whether that is an injective map, which is then the last one."""
+        """Extend the boundary's displacement; keep the map and return True if it is injective."""
         fixed = self.problem.fixed
         way = np.zeros(self.problem.n, dtype=np.complex128)
         way[fixed] = (target - self._base[fixed]).view(np.complex128).ravel()
@@ -102,7 +102,7 @@ class Follower:
         return certificate.injective
 
     def _search(self, target: FloatArray, until: float, waiting: Callable[[], bool]) -> bool:
-        """Search for a map from the last one on, as long as there is time; whether it is found."""
+        """Search for a map from the last one until the deadline; return whether it was found."""
 
         def hurry(_: object) -> None:
             if time.monotonic() > until or waiting():

@@ -1,6 +1,6 @@
-"""What a page may ask the boundary to follow: an outline by its word, a drawing dropped on it, a polygon drawn by hand.
+"""Outlines for the boundary: a named shape, an uploaded drawing, or a polygon drawn by hand.
 
-Nothing here reads a file that a page names: the words are those of shapes, and drawings come with their bytes.
+This module never reads a file named by a page: names are those of shapes, and drawings arrive as bytes.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets import outline, outline_curves, read_svg
 from quasiharmonic.util.arrays import FloatArray
 
-# Digits and a point, of a length that no number on a page needs.
+# A decimal number of limited length.
 _NUMBER = r"\d{1,6}(?:\.\d{1,6})?"
 _WORDS = re.compile(
     rf"disk|ellipse:{_NUMBER}x{_NUMBER}|ring:{_NUMBER}|rect:{_NUMBER}x{_NUMBER}|polygon:\d{{1,4}}|star:\d{{1,4}}"
     r"|letter:\S|word:\S{1,20}"
 )
-#: Of a drawing dropped on the page, and of the points drawn by hand.
+#: Maximum size of an uploaded drawing, and maximum number of points drawn by hand.
 MOST_BYTES, MOST_POINTS = 8 << 20, 10_000
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Contours, and how they are asked for elsewhere.
+    """Contours, and the argument that reproduces them.
 
     Attributes
     ----------
     to : str
-        What ``--to`` of the command takes: a word, or the name of the file that ``content`` is to be kept in.
+        Argument of ``--to``: the name of a shape, or the file name for ``content``.
     contours : list of (k, 2) float64
     content : bytes or None
-        That file, where ``to`` is no word.
+        Contents of that file; None if ``to`` is the name of a shape.
     """
 
     to: str
@@ -44,7 +44,7 @@ class Outline:
     content: bytes | None = None
 
     def curves(self) -> list[Curve]:
-        """What a boundary slides along."""
+        """Return the curves for a sliding boundary."""
         if self.content is None:
             return outline_curves(self.to)
         with tempfile.TemporaryDirectory() as folder:
@@ -54,12 +54,12 @@ class Outline:
 
 
 def outline_named(word: object) -> Outline:
-    """The outline of a word, ``letter:R``.
+    """Return the outline of a named shape, such as ``letter:R``.
 
     Raises
     ------
     ValueError
-        When it is no such word; a file's name is none either.
+        If the name is not that of a shape; names of files are rejected too.
     """
     if not isinstance(word, str) or not _WORDS.fullmatch(word):
         raise ValueError(
@@ -70,12 +70,12 @@ def outline_named(word: object) -> Outline:
 
 
 def outline_drawn(name: str, content: bytes) -> Outline:
-    """The outline of an SVG drawing dropped on the page.
+    """Return the outline of an uploaded SVG drawing.
 
     Raises
     ------
     ValueError
-        When it is none, or too large.
+        If it is not a valid drawing, or too large.
     """
     shown = re.sub(r"[^\w.-]", "_", PurePosixPath(name.replace("\\", "/")).stem)[:60].strip(".") or "drawing"
     if len(content) > MOST_BYTES:
@@ -91,12 +91,12 @@ def outline_drawn(name: str, content: bytes) -> Outline:
 
 
 def outline_by_hand(points: FloatArray) -> Outline:
-    """The polygon (k, 2) drawn on the page.
+    """Return the outline of a polygon (k, 2) drawn on the page.
 
     Raises
     ------
     ValueError
-        When it has fewer than three corners or far too many, or one is not finite.
+        If it has fewer than three or too many corners, or a corner is not finite.
     """
     if points.ndim != 2 or points.shape[1:] != (2,) or not 3 <= len(points) <= MOST_POINTS:
         raise ValueError(f"a polygon has 3 to {MOST_POINTS:,} corners")

@@ -1,4 +1,4 @@
-"""The processes of pages from the server's side: started, fed, listened to, kept within limits, ended."""
+"""Worker processes of pages, seen from the server: start, send, receive, limit, end."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from contextlib import suppress
 
 from quasiharmonic.ui.batch.supervisor import resident
 
-# What runs in the process; -P keeps modules that happen to lie in the working directory out of it.
+# Code of the worker process; -P prevents imports from the working directory.
 _CODE = "import sys; from quasiharmonic.ui.studio.worker import serve; serve(sys.argv[1])"
-#: Bytes of memory that one page may take.
+#: Memory limit of one page, bytes.
 MOST_MEMORY = 6 << 30
-# Seconds between two looks at that, and those that a process may be deaf to "stop".
+# Seconds between two checks, and seconds until a process must react to "stop".
 _LOOK = 0.5
 _DEAF = 15.0
-# Bytes that are handed to a process at a time; no second copy of a large message is made.
+# Bytes written to a process at a time, to avoid a second copy of large messages.
 _PIECE = 1 << 18
 
 
 class Page:
-    """A page's process.
+    """Worker process of a page.
 
     Parameters
     ----------
     process : asyncio.subprocess.Process
     tell : coroutine function
-        Carries what the process tells to the page.
+        Sends a message of the process to the page.
     """
 
     def __init__(self, process: asyncio.subprocess.Process, tell: Callable[[bytes], Awaitable[None]]) -> None:
@@ -38,7 +38,7 @@ class Page:
 
     @classmethod
     async def start(cls, source: str, tell: Callable[[bytes], Awaitable[None]]) -> Page:
-        """Start a process for a page that begins with a file, or with a surface of ours."""
+        """Start a process for a page that opens ``source``, or a built-in surface if it is empty."""
         process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-P",
@@ -52,7 +52,7 @@ class Page:
         return cls(process, tell)
 
     async def send(self, message: bytes, *, stops: bool = False) -> None:
-        """Hand over a message of the page; one that ``stops`` has to be heard soon."""
+        """Send a message of the page to the process; after a message that ``stops``, the process must answer soon."""
         assert self._process.stdin is not None
         if stops and self._stop_asked is None:
             self._stop_asked = asyncio.get_running_loop().time()
@@ -63,7 +63,7 @@ class Page:
                 await self._process.stdin.drain()
 
     async def run(self) -> str:
-        """Carry on what the process tells until it ends; why it has."""
+        """Forward messages of the process until it ends; return the reason for its end."""
         watch = asyncio.ensure_future(self._watch())
         assert self._process.stdout is not None
         try:
@@ -79,7 +79,7 @@ class Page:
             watch.cancel()
 
     async def _watch(self) -> None:
-        """End the process where it takes too much memory, or cannot be stopped."""
+        """Kill the process if it uses too much memory or does not react to "stop"."""
         clock = asyncio.get_running_loop().time
         while True:
             await asyncio.sleep(_LOOK)
@@ -98,6 +98,6 @@ class Page:
             self._process.kill()
 
     async def ended(self) -> None:
-        """Kill the process and wait until it is gone."""
+        """Kill the process and wait for its end."""
         self.end()
         await self._process.wait()

@@ -1,9 +1,10 @@
-"""Messages between a page and what computes for it: a header in JSON, and arrays behind it, in one buffer.
+"""Messages between a page and its worker: a JSON header followed by arrays, in one buffer.
 
-The same both ways, whatever carries it, a socket or a notebook's widget; ``static/frames.js`` is the other end::
+The format is the same in both directions and for sockets and notebook widgets. ``static/frames.js`` implements the
+other end::
 
     bytes 0-3   length H of the header, unsigned, little-endian (as all numbers are)
-    then        H bytes of JSON in UTF-8, with spaces at its end so that what follows begins at a multiple of 8
+    then        H bytes of JSON in UTF-8, padded with spaces so that the arrays begin at a multiple of 8
     then        the arrays, each at a multiple of 8 from there: header["arrays"] = {name: [type, shape, offset]}
 """
 
@@ -19,26 +20,26 @@ from numpy.typing import NDArray
 
 Array: TypeAlias = NDArray[Any]
 
-#: What a type is called in a header.
+#: NumPy types by their names in a header.
 TYPES = {"u1": "<u1", "u4": "<u4", "i4": "<i4", "f4": "<f4", "f8": "<f8"}
 _NAMES = {np.dtype(kind): name for name, kind in TYPES.items()}
-# Of a header: a page's has a few words, and it is parsed before anything is known of it.
+# Maximum length of a header. It is parsed before any other check, and valid headers are short.
 _LONGEST = 1 << 20
 
 
 class ProtocolError(ValueError):
-    """A message is not what messages are."""
+    """A message is malformed."""
 
 
 class Frame(NamedTuple):
-    """A message.
+    """Message.
 
     Attributes
     ----------
     header : dict
-        Plain JSON; ``kind`` says what it is to the page, ``do`` what the page asks for.
+        Plain JSON; ``kind`` is the type of a message to the page, ``do`` the command of a message from the page.
     arrays : dict of str to array
-        By name; read only in what has been decoded.
+        Arrays by name; read-only in a decoded message.
     """
 
     header: dict[str, Any]
@@ -46,12 +47,12 @@ class Frame(NamedTuple):
 
 
 def encode(header: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytes:
-    """Make a buffer of a header and arrays of the types in `TYPES`.
+    """Return the buffer of a header and arrays of the types in `TYPES`.
 
     Raises
     ------
     KeyError
-        When an array has another type.
+        If an array has another type.
     """
     described, parts, offset = {}, [], 0
     for name, array in (arrays or {}).items():
@@ -66,12 +67,12 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, Array] | None = None)
 
 
 def decode(data: bytes) -> Frame:
-    """Read a buffer.
+    """Decode a buffer from an untrusted source.
 
     Raises
     ------
     ProtocolError
-        When it is not what `encode` makes: nothing in it is taken on trust.
+        If the buffer is malformed.
     """
     length = int.from_bytes(data[:4], "little")
     if len(data) < 4 or length > min(_LONGEST, len(data) - 4):

@@ -1,4 +1,4 @@
-"""How a map on the page was made, and the command line and the Python that make it again."""
+"""Commands and Python scripts that reproduce a map of the page."""
 
 from __future__ import annotations
 
@@ -9,32 +9,31 @@ from quasiharmonic.energies.smoothing import LARGEST, STEPS
 from quasiharmonic.ui.studio.outlines import Outline
 from quasiharmonic.ui.studio.surface import Sheet
 
-#: What the page calls the files that it hands over.
+#: Names of the files that the page saves.
 MAP, FIXED = "map.obj", "fixed.txt"
 
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """How a map was made.
+    """Description of how a map was computed.
 
     Attributes
     ----------
     sheet : Sheet
     outline : Outline or None
-        What the boundary was laid along, and has not been moved away from since; None where a hand, the file or a
-        free boundary has put it where it is.
+        The outline of the boundary. None if the boundary was moved since, comes from the file, or is free.
     corners : str or None
-        As ``--corners`` of the command takes them.
+        As for ``--corners`` of the command.
     pinned : bool
-        Whether vertices inside are held.
+        Whether there are pins.
     free : bool
-        Whether the boundary went where distortion is least.
+        Whether the boundary was free.
     energy : str or None
-        What was lowered until it converged.
+        The energy that was lowered until it converged.
     slide : bool
-        Whether the boundary slid meanwhile.
+        Whether the boundary slid during that.
     anew : bool
-        Whether it was found from nothing.
+        Whether the map was solved from scratch.
     """
 
     sheet: Sheet
@@ -47,13 +46,13 @@ class Recipe:
     anew: bool = True
 
     def files(self) -> list[str]:
-        """What the command and the Python read besides the surface's own file: names, in the order to be saved."""
+        """Return the names of the files that command and script need besides the surface's file, in saving order."""
         if self.outline is None and not (self.free and not self.pinned):
             return [MAP, FIXED] if self.pinned else [MAP]
         return [self.outline.to] if self.outline is not None and self.outline.content is not None else []
 
     def command(self) -> str:
-        """The line for a terminal."""
+        """Return the command line."""
         words = ["qhm"]
         if self.free:
             words += ["flatten", MAP if self.pinned else self.sheet.name]
@@ -74,7 +73,7 @@ class Recipe:
         return ["--fixed", FIXED] if self.pinned else []
 
     def python(self) -> str:
-        """A script that ends with ``result``."""
+        """Return a script that computes ``result``."""
         names, lines = {"io"}, []
         if self.outline is not None and not self.sheet.flags and self.sheet.seamed.seamless:
             lines += [
@@ -110,7 +109,7 @@ class Recipe:
     def _contours(self) -> str:
         assert self.outline is not None
         text = f"outline({self.outline.to!r})"
-        # The surface has no holes to lay along those of a letter.
+        # The surface has no holes, so those of the outline are filled.
         return f"filled({text})" if len(self.outline.contours) > 1 and not self._holes() else text
 
     def _holes(self) -> bool:
@@ -127,7 +126,7 @@ class Recipe:
         return f", corners={{{', '.join(part.replace(':', ': ') for part in self.corners.split(','))}}}"
 
     def _solved(self) -> tuple[list[str], set[str]]:
-        """The lines that solve, and the public names that they use."""
+        """Return the lines that solve, and the public names that they use."""
         if self.free:
             held = ", fixed=inside, target=uv[inside]" if self.pinned else ""
             pins = ["edge = np.concatenate(boundary_loops(F, len(V)))", "inside = np.setdiff1d(fixed, edge)"]

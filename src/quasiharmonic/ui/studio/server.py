@@ -1,8 +1,7 @@
-"""The server of the page: the page's files, and for each page that is open a process that computes for it.
+"""Web server of the application: static files, and one worker process for each open page.
 
-It listens on this machine alone. Everything it hands out asks for the token that is in the address, which a
-browser sends for no other site; a request that names another host is refused, so that no other name can be made to
-point here, and so is a socket that was opened from another origin.
+The server listens only on this machine. Every request needs the token in the address, which other sites do not know.
+Requests with another host name are refused, which prevents DNS rebinding. Sockets from other origins are refused too.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from quasiharmonic.ui.studio.pages import Page
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
 
 HOST = "127.0.0.1"
-#: Bytes of a file dropped on a page, and pages at a time.
+#: Maximum size of an uploaded file in bytes, and maximum number of open pages.
 MOST_BYTES, MOST_PAGES = 128 << 20, 8
-#: How a socket is closed while there are so many.
+#: Close code of a socket if too many pages are open.
 TRY_LATER = 1013
-# Nothing is loaded from elsewhere, nothing may frame the page, and the address with its token is told to nobody.
+# Load nothing from other sites, forbid framing, and never send the address with its token as a referrer.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -40,14 +39,14 @@ _HEADERS = {
 
 
 class Studio:
-    """The server.
+    """Web server.
 
     Parameters
     ----------
     source : str
-        The file that pages begin with; a surface of ours if it is empty.
+        The file that pages open; a built-in surface if it is empty.
     token : str, optional
-        What has to be in the address.
+        Secret part of the address; random by default.
     """
 
     def __init__(self, source: str = "", token: str | None = None) -> None:
@@ -59,7 +58,7 @@ class Studio:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
     async def run(self, port: int = 0, ready: Callable[[str], object] = lambda address: None) -> None:
@@ -68,14 +67,14 @@ class Studio:
         Parameters
         ----------
         port : int
-            Any that is free for 0.
+            0 for any free port.
         ready : callable
-            Is told the address.
+            Called with the address.
 
         Raises
         ------
         OSError
-            When the port is taken.
+            If the port is in use.
         """
         async with serve(
             self._page,
@@ -83,7 +82,7 @@ class Studio:
             port,
             process_request=self._request,
             max_size=MOST_BYTES + (1 << 20),
-            # A message is read when the one before it has been taken: no more than one waits, however large.
+            # Read a message only after the previous one was taken, so that at most one large message waits.
             max_queue=0,
             compression=None,
             logger=_logger(),
@@ -99,7 +98,7 @@ class Studio:
                 await asyncio.gather(*(page.ended() for page in list(self._pages)))
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse a request, answer it with a file, or let it become a socket."""
+        """Refuse a request, answer it with a file, or return None to open a socket."""
         hosts = request.headers.get_all("Host")
         if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
             return _answer(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
@@ -113,7 +112,7 @@ class Studio:
         if not hmac.compare_digest(token.encode(), self.token.encode()):
             return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of it")
         if not slash:
-            # What the page asks for lies beside it, behind the slash that was left out.
+            # Relative addresses of the page need the final slash.
             return _answer(HTTPStatus.PERMANENT_REDIRECT, "the address ends with a slash", location=f"/{self.token}/")
         if name == "socket":
             origins = request.headers.get_all("Origin")
@@ -126,12 +125,12 @@ class Studio:
         return _answer(HTTPStatus.OK, asset.content, asset.kind)
 
     async def _page(self, connection: ServerConnection) -> None:
-        """Connect a page with a process, if there are not too many pages."""
+        """Connect a page with a process, unless too many pages are open."""
         if self._open >= MOST_PAGES:
-            # Said here and not in the answer to the request, which a browser shows to no script.
+            # Close the socket instead of refusing the request, because scripts cannot read the answer to a refusal.
             await connection.close(TRY_LATER, f"{MOST_PAGES} pages are open")
             return
-        # Counted before anything is awaited: pages that are opened at once must not all find room.
+        # Count before the first await, so that pages opened at the same time cannot exceed the limit.
         self._open += 1
         try:
             await self._carry(connection)
@@ -141,7 +140,7 @@ class Studio:
             self._open -= 1
 
     async def _carry(self, connection: ServerConnection) -> None:
-        """Carry messages between a page and its process until one of them ends."""
+        """Forward messages between a page and its process until one of them ends."""
 
         async def tell(message: bytes) -> None:
             await connection.send(message)
@@ -166,7 +165,7 @@ class Studio:
             self._pages.discard(page)
 
     async def _listen(self, connection: ServerConnection, page: Page) -> None:
-        """Hand over what the page sends."""
+        """Forward the messages of the page to its process."""
         try:
             async for message in connection:
                 if isinstance(message, str):
@@ -181,12 +180,12 @@ class Studio:
         except ConnectionClosed:
             pass
         finally:
-            # Whoever has gone waits for nothing.
+            # The page is gone, so its process is not needed.
             page.end()
 
 
 def _logger() -> logging.Logger:
-    """A logger that passes on errors of the server, and leaves out what only a client has done wrong."""
+    """Return a logger that records errors of the server but not those caused by clients."""
     logger = logging.getLogger(__name__)
     logger.addFilter(_not_the_clients)
     return logger

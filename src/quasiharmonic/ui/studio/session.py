@@ -1,6 +1,6 @@
-"""A page's session: what a visitor does, one message after another, and what is told of it.
+"""Session of a page: handle its messages and send updates.
 
-It knows neither sockets nor processes; whoever has a page hands over its messages, and carries what is told to it.
+The module is independent of sockets and processes. The caller passes in messages and transmits the updates.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from quasiharmonic.ui.studio.surface import Sheet, dropped_sheet, first_sheet
 from quasiharmonic.ui.studio.validation import Refused
 from quasiharmonic.util.arrays import FloatArray
 
-#: States to go back to.
+#: Maximum number of states for undo.
 MOST_MOMENTS = 40
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 
@@ -37,18 +37,18 @@ Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
 
 @dataclass(eq=False)
 class _Hand:
-    """A hand that holds a vertex.
+    """State of a drag.
 
     Attributes
     ----------
     place : (2,) float64
-        Where it took hold.
+        Position where the drag started.
     share : (k,) float64
-        By which share of its way each held vertex goes along.
+        Share of the motion for each fixed vertex.
     follower : Follower or None
-        What finds the maps, where there is one to begin with.
+        Computes the maps, if the drag starts from an injective map.
     goal : (k, 2) float64 or None
-        Where the held vertices are to be now.
+        Current target positions of the fixed vertices.
     shown : Followed or None
         The last map.
     """
@@ -61,14 +61,14 @@ class _Hand:
 
 
 class Session:
-    """What one page is doing.
+    """Session of one page.
 
     Parameters
     ----------
     tell : callable
-        Takes headers and arrays to the page.
+        Sends a header and arrays to the page.
     waiting : callable
-        Whether the visitor has done something that makes what is being computed needless.
+        Returns whether a newer message makes the current computation unnecessary.
     """
 
     def __init__(self, tell: Tell, waiting: Callable[[], bool] = lambda: False) -> None:
@@ -85,12 +85,12 @@ class Session:
         return self._moments[self._at]
 
     def open(self, sheet: Sheet | None = None) -> None:
-        """Begin with a surface, by default one of ours.
+        """Open a surface, by default a built-in one.
 
         Raises
         ------
         ValueError
-            When it is none that can be mapped; the page then goes on with what it had.
+            If the surface cannot be mapped; the page then keeps its previous surface.
         """
         sheet = first_sheet() if sheet is None else sheet
         first = first_moment(sheet)
@@ -119,7 +119,7 @@ class Session:
             self._settle(first, fit=True)
 
     def handle(self, frame: Frame) -> None:
-        """Do what a message asks for; what cannot be done is told."""
+        """Execute the command of a message; errors are sent to the page."""
         what = frame.header.get("do")
         do = self._DOERS.get(what) if isinstance(what, str) else None
         try:
@@ -162,7 +162,7 @@ class Session:
         self._busy("laying it flat")
         self._keep(freed(moment.problem, moment.recipe, moment.pins, self._step), fit=True)
 
-    # --- what the hand does ------------------------------------------------------------------------------------------
+    # --- drags and edits ---------------------------------------------------------------------------------------------
 
     def _pin(self, frame: Frame) -> None:
         moment, vertex = self.moment, asking.vertex(frame, self.moment.problem.n)
@@ -181,7 +181,7 @@ class Session:
         moment, vertex = self.moment, asking.vertex(frame, self.moment.problem.n)
         problem, result = moment.problem, moment.result
         share = grip(vertex, problem.fixed, problem.target, problem.domain.loops, moment.corners)
-        # From a map that is none there is nothing to follow from: the boundary is moved, and a map searched for then.
+        # Without an injective map the drag only moves the boundary; a search follows at its end.
         follows = result.injective and moment.in_place
         follower = Follower(problem, result.uv, result.certificate) if follows else None
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
@@ -191,7 +191,7 @@ class Session:
         to, seq = asking.place(frame), asking.number(frame, "seq")
         hand = self._hand
         if hand is None:
-            # What could not be held; the page waits for an answer all the same.
+            # The vertex could not be grabbed, but the page still waits for an answer.
             return self._tell_map({}, seq=seq)
         self._after = seq
         hand.goal = self.moment.problem.target + hand.share[:, None] * (to - hand.place)
@@ -236,7 +236,7 @@ class Session:
         self._show(fit=True)
 
     def _stop(self, frame: Frame) -> None:
-        """Nothing: it has ended what was going on by being there."""
+        """Show the state again; the arrival of this message has already stopped the computation."""
         self._show()
 
     def _save(self, frame: Frame) -> None:
@@ -251,11 +251,11 @@ class Session:
     def _send(self, name: str, content: bytes) -> None:
         self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
 
-    # --- maps at rest, and what is told ------------------------------------------------------------------------------
+    # --- final maps and updates of the page --------------------------------------------------------------------------
 
     def _settle(self, moment: SessionState, *, fit: bool = False, energy: str | None = None,
                 slide: bool | BoundaryCurves = False) -> None:  # fmt: skip
-        """Find the map of a moment, and keep it."""
+        """Compute the map of a state, and add the state."""
         self._busy("polishing" if energy else "finding the map")
         before = moment.result if moment.result.injective and moment.in_place else None
         done = settle(moment.problem, before, energy=energy, slide=slide, callback=self._step)
@@ -272,7 +272,7 @@ class Session:
         self._tell({"kind": "progress", "flips": step.inverted, "energy": _finite(step.energy)}, {})
 
     def _keep(self, moment: SessionState, *, fit: bool = False) -> None:
-        """Make a moment the last one, and show it."""
+        """Add a state as the last one, and show it."""
         del self._moments[self._at + 1 :]
         self._moments.append(moment)
         del self._moments[:-MOST_MOMENTS]
@@ -280,11 +280,11 @@ class Session:
         self._show(fit=fit)
 
     def _show(self, *, fit: bool = False) -> None:
-        """Tell all about the moment at hand."""
+        """Send the current state to the page."""
         moment = self.moment
         result, problem = moment.result, moment.problem
         there = moment.in_place
-        # What has no map yet is searched for from nothing: there is none to go on from.
+        # A state without a map is solved from scratch.
         recipe = moment.recipe if result.injective and there else replace(moment.recipe, anew=True)
         state = {
             "state": "settled",
@@ -310,7 +310,7 @@ class Session:
         shown: tuple[FloatArray, Certificate] | None = None,
         asked: FloatArray | None = None,
     ) -> None:
-        """Tell where the map is, and what is certain about it; only where its boundary is asked to be without one."""
+        """Send the map and its certificate; without ``shown`` send only the target of the boundary."""
         moment = self.moment
         header = {
             "kind": "map",

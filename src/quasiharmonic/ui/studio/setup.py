@@ -1,4 +1,4 @@
-"""Problems that a page poses: where a surface's boundary goes, and what is held inside."""
+"""Set up the problems of a page: target of the boundary, and pins."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _FIRST_OUTLINE = "rect:1x1"
 
 
 def first_moment(sheet: Sheet) -> SessionState:
-    """The problem that a surface comes with: its boundary where its own map has it, or else on a square.
+    """Return the initial state of a surface: the boundary of its own map, or a square.
 
-    With holes, or cut open, the boundary is free.
+    If a surface without a map has holes or was cut open, its boundary is free.
 
     Raises
     ------
     ValueError
-        When the surface is none that can be mapped.
+        If the surface cannot be mapped.
     """
     island = sheet.island
     if np.isnan(island.uv).any():
         loops = boundary_loops(island.F, len(island.V))
-        # A cut turns at its ends within one triangle, which a straight side would flatten.
+        # At the end of a cut two boundary edges belong to one triangle, which a straight side would make degenerate.
         if len(loops) > 1 or "--cut" in sheet.flags:
             V, F, fixed = island.V, island.F, np.concatenate(loops)
             return freed(Problem(V, F, fixed, np.zeros((len(fixed), 2))), Recipe(sheet))
@@ -52,19 +52,20 @@ def first_moment(sheet: Sheet) -> SessionState:
 
 
 def laid(sheet: Sheet, outline: Outline, corners: Sequence[tuple[int, int]] | Literal["auto"] = ()) -> SessionState:
-    """Lay a surface's boundary along an outline.
+    """Map a surface's boundary to an outline.
 
     Parameters
     ----------
     sheet : Sheet
     outline : Outline
     corners : sequence of (vertex, corner), or "auto"
-        Which boundary vertices go to which of the outline's corners; those at sharp bends, or as lengths have it.
+        Boundary vertices for corners of the outline. "auto" chooses vertices by angle; without corners arc length
+        decides.
 
     Raises
     ------
     ValueError
-        As `quasiharmonic.targets.boundary_to`.
+        As for `quasiharmonic.targets.boundary_to`.
     """
     island = sheet.island
     asked = AskedCorners(corners if corners == "auto" else tuple(corners)) if corners else None
@@ -78,12 +79,12 @@ def laid(sheet: Sheet, outline: Outline, corners: Sequence[tuple[int, int]] | Li
 
 
 def with_corner(moment: SessionState, vertex: int) -> SessionState:
-    """Send the boundary vertex nearest to another one to the next corner of the outline.
+    """Assign the boundary vertex nearest to ``vertex`` to the next corner of the outline.
 
     Raises
     ------
     ValueError
-        When there is no outline, or the corners would follow each other in another order than the vertices do.
+        If there is no outline, or the order of the corners differs from that of the vertices.
     """
     recipe, problem = moment.recipe, moment.problem
     if recipe.outline is None:
@@ -97,7 +98,7 @@ def with_corner(moment: SessionState, vertex: int) -> SessionState:
 
 
 def holding(moment: SessionState, pins: Sequence[int]) -> SessionState:
-    """Hold these vertices inside, where the map has them, and the boundary where it is."""
+    """Return a state with these pins at their positions in the map, and the boundary unchanged."""
     problem = moment.problem
     fixed = np.concatenate([*problem.domain.loops, np.array(pins, dtype=np.int64)])
     held = Problem(problem.V, problem.F, fixed, moment.result.uv[fixed])
@@ -108,12 +109,12 @@ def holding(moment: SessionState, pins: Sequence[int]) -> SessionState:
 def freed(
     problem: Problem, recipe: Recipe, pins: Sequence[int] = (), callback: Callable[[Step], object] | None = None
 ) -> SessionState:
-    """Lay a surface flat, its boundary going where distortion is least, and pins held where a problem holds them.
+    """Flatten a surface with free boundary; pins keep their target positions.
 
     Raises
     ------
     ValueError
-        When it cannot be laid flat, or the pins forbid it; the message says why.
+        If no injective map was found; the message names the cause.
     """
     held = np.array(pins, dtype=np.int64)
     edge = len(problem.fixed) - len(held)
@@ -126,6 +127,6 @@ def freed(
 
 
 def _unsolved(problem: Problem) -> MapResult:
-    """No map yet: every vertex at the middle of the target, which is not shown."""
+    """Return a placeholder result with all vertices at the centre of the target; it is never shown."""
     uv = np.broadcast_to(problem.target.mean(axis=0), (problem.n, 2)).copy()
     return MapResult(uv=uv, status=Status.INTERRUPTED, certificate=certify(problem.F, uv, boundary=False))

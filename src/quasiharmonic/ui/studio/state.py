@@ -1,4 +1,4 @@
-"""One state of the page: a problem, its map, and how it was made. Undoing goes from one to another."""
+"""State of a page: a problem, its map, and how it was computed. Undo and redo switch between states."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.recipes import Recipe
 from quasiharmonic.util.arrays import FloatArray
 
-#: Obstructions and elements of each that are told; a picture of more says no more.
+#: Maximum numbers of obstructions and of elements per obstruction that are sent to the page.
 _MOST_TOLD = 20
 _MOST_ELEMENTS = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class SessionState:
-    """One state of the page.
+    """State of a page.
 
     Attributes
     ----------
     problem : Problem
-        The boundary's loops one after another, and then pins, held where they are.
+        Its fixed vertices are the boundary loops, one after another, and then the pins.
     result : MapResult
         Its map.
     recipe : Recipe
     corners : tuple of int
         Boundary vertices at which sides end, in the order of the outline's corners.
     chosen : tuple of (int, int)
-        Vertices that the visitor has sent to a corner, and its number.
+        Vertices that the user assigned to a corner, and the numbers of the corners.
     """
 
     problem: Problem
@@ -46,28 +46,28 @@ class SessionState:
 
     @property
     def pins(self) -> list[int]:
-        """Vertices inside that are held, in the order in which they were pinned."""
+        """Fixed interior vertices, in the order in which they were pinned."""
         edge = sum(map(len, self.problem.domain.loops))
         return [int(v) for v in self.problem.fixed[edge:]]
 
     @property
     def held(self) -> list[int]:
-        """Boundary vertices at corners that somebody has chosen, or their angles: what does not slide."""
+        """Boundary vertices at chosen or detected corners, which do not slide."""
         return list(self.corners) if self.recipe.corners == "auto" else [v for v, _ in self.chosen]
 
     @property
     def in_place(self) -> bool:
-        """Whether the map's held vertices are where they are to be."""
+        """Whether the fixed vertices of the map are at their target positions."""
         return np.array_equal(self.result.uv[self.problem.fixed], self.problem.target)
 
     def with_target(self, target: FloatArray) -> SessionState:
-        """The same with its held vertices elsewhere, by hand."""
+        """Return the state with other target positions, as after a drag."""
         recipe = replace(self.recipe, outline=None, corners=None, free=False, energy=None, slide=False)
         return replace(self, problem=self.problem.with_target(target), recipe=recipe, chosen=())
 
 
 class Measured:
-    """Numbers about a map; measured now and then while it moves, so that a large one is not held up by them."""
+    """Distortion of a moving map; measured only now and then, so that large maps stay responsive."""
 
     def __init__(self, V: FloatArray, F: Array) -> None:
         self._V, self._F = V, F
@@ -76,7 +76,7 @@ class Measured:
         self.scale = 1.0
 
     def look(self, uv: FloatArray, *, now: bool) -> dict[str, Any]:
-        """Energy and worst stretch of a map; those of a little while ago unless it has to be ``now``."""
+        """Return energy and worst stretch of a map; recent values unless ``now`` is True."""
         began = time.perf_counter()
         if now or began - self._when > max(0.15, 8 * self._cost):
             measured = distortion(self._V, self._F, uv)
@@ -95,7 +95,7 @@ class Measured:
 
 
 def verdict(certificate: Certificate) -> dict[str, Any]:
-    """What is certain about the map that is shown."""
+    """Return the certificate as entries of a message."""
     bad = len(certificate.inverted) + len(certificate.degenerate) + len(certificate.nonfinite)
     return {
         "injective": certificate.injective,
@@ -106,17 +106,17 @@ def verdict(certificate: Certificate) -> dict[str, Any]:
 
 
 def bad_triangles(certificate: Certificate) -> Array:
-    """Triangles that are not positive, (k,) uint32."""
+    """Return the triangles that are not positive, (k,) uint32."""
     some = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
     return np.sort(some).astype(np.uint32)
 
 
 def told(moment: SessionState) -> list[dict[str, Any]]:
-    """What forbids a map, or a bijective one, as the page marks it."""
+    """Return the obstructions to a map, or to a bijective map, as the page marks them."""
     diagnosis, loops = moment.result.diagnosis, moment.problem.domain.loops
     if diagnosis is None:
         return []
-    # What has a place of its own tells more than what is said of whole loops.
+    # Obstructions with vertices or edges are more specific than those of whole loops.
     found = sorted(diagnosis.obstructions, key=lambda one: not (one.vertices.size or one.edges.size))
     return [
         {
@@ -132,5 +132,5 @@ def told(moment: SessionState) -> list[dict[str, Any]]:
 
 
 def _around(loops: list[Array]) -> list[list[int]]:
-    """Edges of loops."""
+    """Return the edges of loops."""
     return [edge for loop in loops for edge in np.stack([loop, np.roll(loop, -1)], axis=1).tolist()]

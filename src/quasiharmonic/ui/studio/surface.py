@@ -1,4 +1,4 @@
-"""The surface on the page: from a file, from what was dropped on the page, or one of ours."""
+"""The surface of a page: from a file, from an upload, or built in."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from quasiharmonic.geometry.mesh.seams import Island, SeamedMesh
 from quasiharmonic.geometry.surfaces import cat
 from quasiharmonic.util.arrays import FloatArray
 
-#: What may be dropped on the page. (A .gltf is in several files, of which a page hands over one.)
+#: Suffixes of files that can be uploaded. A .gltf consists of several files, so it is not supported.
 SUFFIXES = ".obj", ".off", ".ply", ".stl", ".glb"
-#: More than this is neither drawn in time nor followed by a hand.
+#: Maximum number of triangles; larger meshes are too slow to draw and drag.
 MOST_TRIANGLES = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A connected surface with a boundary, and the file it came from.
+    """Connected surface with a boundary, and its file.
 
     Attributes
     ----------
     name : str
-        Of the file, without its folder.
+        File name without folder.
     mesh : MeshData
-        As it was read; what is written carries its map.
+        The mesh as read; written files contain it with its map.
     seamed : SeamedMesh
-        The mesh, cut open where it does not lie flat.
+        The mesh, cut open if it is closed.
     island : Island
-        All of it: what is mapped.
+        The single island, which is mapped.
     flags : tuple of str
-        What tells ``qhm map`` to take the surface so.
+        Options of ``qhm map`` that produce the same surface.
     fixed : (k,) int64 or None
-        Vertices of the island that the file holds, where it says so by a list of its own.
+        Fixed vertices of the island, if the file comes with a list.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Sheet:
     fixed: np.ndarray | None = field(default=None)
 
     def written(self, uv: FloatArray) -> bytes:
-        """The file with a map (n, 2) of the island as its texture coordinates: OBJ, every digit kept."""
+        """Return an OBJ file with a map (n, 2) of the island as texture coordinates, without rounding."""
         mesh = self.mesh.with_places(self.seamed.with_places([uv]))
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "map.obj"
@@ -56,17 +56,17 @@ class Sheet:
             return path.read_bytes()
 
     def numbers(self, vertices: list[int]) -> list[int]:
-        """What the file calls some vertices of the island."""
+        """Return the file's indices of vertices of the island."""
         return [int(self.island.vertices[v]) for v in vertices]
 
 
 def first_sheet() -> Sheet:
-    """The surface for those who come without one: a cat's head."""
+    """Return the built-in surface: a cat's head."""
     return sheet_of(io.MeshData(*cat(40), source="cat.obj"), "cat.obj")
 
 
 def read_sheet(path: Path) -> Sheet:
-    """Read the surface that the command was given.
+    """Read the surface given to the command.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def read_sheet(path: Path) -> Sheet:
     Raises
     ------
     ValueError, OSError
-        When it is none, or none that has one piece and a boundary.
+        If the file is not a surface with one component and a boundary.
     """
     mesh_path, fixed_path = io.problem_files(path)
     mesh = io.read_mesh(mesh_path)
@@ -85,18 +85,18 @@ def read_sheet(path: Path) -> Sheet:
 
 
 def dropped_sheet(name: str, content: bytes) -> Sheet:
-    """Read the surface that was dropped on the page.
+    """Read an uploaded surface.
 
     Parameters
     ----------
     name : str
-        Of the file on the visitor's side, of which the ending counts.
+        File name on the user's side; only its suffix matters.
     content : bytes
 
     Raises
     ------
     ValueError
-        When it is none; the message speaks of the visitor's file, and of no place on this side.
+        If the file is not a valid surface. The message names the user's file, not a path of this machine.
     """
     shown = PurePosixPath(name.replace("\\", "/")).name[:100]
     suffix = PurePosixPath(shown).suffix.lower()
@@ -113,12 +113,12 @@ def dropped_sheet(name: str, content: bytes) -> Sheet:
 
 
 def sheet_of(mesh: io.MeshData, name: str, fixed: np.ndarray | None = None) -> Sheet:
-    """Make a sheet of a mesh, cut open if it is closed.
+    """Return the sheet of a mesh, cut open if it is closed.
 
     Raises
     ------
     ValueError
-        When it has no triangles or too many of them, or falls into several pieces.
+        If it has no triangles, too many triangles, or several components.
     """
     if len(mesh.F) > MOST_TRIANGLES:
         raise ValueError(
@@ -129,7 +129,7 @@ def sheet_of(mesh: io.MeshData, name: str, fixed: np.ndarray | None = None) -> S
         raise ValueError(f"{name} has no triangles")
     seamed, flags = io.seamed(mesh), []
     if len(seamed.islands) > 1 and not seamed.seamless:
-        # An atlas of many islands: the surface that they are parts of.
+        # An atlas of several islands: use the surface without its seams.
         seamed, flags = SeamedMesh(mesh.V, mesh.F), ["--seams", "none"]
     if len(seamed.islands) == 1 and not _has_boundary(seamed.islands[0]):
         seamed = seaming.cut_apart(seamed, polygons=mesh.polygons, disks_too=False, reach=False)

@@ -1,4 +1,4 @@
-"""What a page's messages ask for, each taken out of its message and looked at: nothing in it is taken on trust."""
+"""Extract and validate the parameters of messages from a page, which are untrusted."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from quasiharmonic.util.arrays import FloatArray
 
 
 class Refused(ValueError):  # noqa: N818
-    """What is asked for cannot be done, and the page stays as it is; the message says why."""
+    """A request cannot be fulfilled and the page is unchanged; the message states the reason."""
 
 
 def vertex(frame: Frame, n: int) -> int:
-    """The vertex, one of ``n``."""
+    """Return the vertex index, below ``n``."""
     value = number(frame, "vertex")
     if not 0 <= value < n:
         raise Refused(f"there is no vertex {value}: the surface has {n}, counted from 0")
@@ -23,7 +23,7 @@ def vertex(frame: Frame, n: int) -> int:
 
 
 def number(frame: Frame, name: str) -> int:
-    """A whole number."""
+    """Return an integer."""
     value = frame.header.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or abs(value) >= 2**53:
         raise Refused(f"a message without its {name}, a whole number")
@@ -31,7 +31,7 @@ def number(frame: Frame, name: str) -> int:
 
 
 def place(frame: Frame) -> FloatArray:
-    """The place in the plane that a hand goes to, (2,) float64."""
+    """Return the target position of a drag, (2,) float64."""
     value = frame.header.get("to")
     if not isinstance(value, list) or len(value) != 2:
         raise Refused("a message without the place that a vertex is moved to, two numbers")
@@ -42,7 +42,7 @@ def place(frame: Frame) -> FloatArray:
 
 
 def text(frame: Frame, name: str) -> str:
-    """Some words, of 200 letters at most."""
+    """Return a string of at most 200 characters."""
     value = frame.header.get(name)
     if not isinstance(value, str) or len(value) > 200:
         raise Refused(f"a message without its {name}, some words")
@@ -50,7 +50,7 @@ def text(frame: Frame, name: str) -> str:
 
 
 def content(frame: Frame) -> bytes:
-    """The bytes of a file."""
+    """Return the bytes of a file."""
     array = frame.arrays.get("content")
     if array is None or array.dtype != np.uint8:
         raise Refused("a message without the file that it speaks of")
@@ -58,7 +58,7 @@ def content(frame: Frame) -> bytes:
 
 
 def points(frame: Frame) -> FloatArray:
-    """Points in the plane, (k, 2) float64."""
+    """Return points in the plane, (k, 2) float64."""
     array = frame.arrays.get("points")
     if array is None or array.dtype != np.float64 or array.size % 2:
         raise Refused("a message without the points that it speaks of")

@@ -1,7 +1,7 @@
-"""The process of one page: messages come on standard input, and what is told to the page goes to standard output.
+"""Worker process of one page: reads messages from standard input, writes messages to standard output.
 
-Each is a message of `quasiharmonic.ui.studio.protocol` behind its length, eight bytes, little-endian. Whatever becomes
-of this process, a crash in a library included, `quasiharmonic.ui.studio.pages` and the other pages go on.
+Each message is one of `quasiharmonic.ui.studio.protocol`, preceded by its length as eight bytes, little-endian. If this
+process crashes, the server and the other pages continue.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from quasiharmonic.ui.studio.protocol import Array, Frame, decode, encode
 from quasiharmonic.ui.studio.session import Session
 from quasiharmonic.ui.studio.surface import read_sheet
 
-#: Bytes of messages that may wait.
+#: Maximum total size of waiting messages, bytes.
 MOST_WAITING = 256 << 20
-# Bytes that a message takes beside its contents.
+# Memory of a message besides its contents, bytes.
 _OVERHEAD = 1024
 
 
 def serve(source: str) -> None:
-    """Do what comes on standard input until that ends.
+    """Handle messages from standard input until it is closed.
 
     Parameters
     ----------
     source : str
-        The file that the page begins with, if it is not empty.
+        The file that the page opens; a built-in surface if it is empty.
     """
-    # Ctrl-C reaches the whole group; the server decides what becomes of this process.
+    # Ctrl-C reaches the whole process group; the server decides when this process ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
     answers = os.fdopen(os.dup(1), "wb")
-    # What libraries print must not come between the answers.
+    # Redirect standard output to standard error, so that output of libraries does not mix with the messages.
     os.dup2(2, 1)
 
     def tell(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -46,7 +46,7 @@ def serve(source: str) -> None:
             answers.write(len(message).to_bytes(8, "little") + message)
             answers.flush()
         except OSError:
-            # Whoever listened has gone.
+            # The server is gone.
             os._exit(0)
 
     inbox = Inbox(os.fdopen(os.dup(0), "rb"))
@@ -61,12 +61,12 @@ def serve(source: str) -> None:
 
 
 class Inbox:
-    """Messages as they come; of movements of a hand that nobody has looked at yet only the last one counts.
+    """Queue of incoming messages; of consecutive unread drag messages only the last one is kept.
 
     Parameters
     ----------
     source : binary file
-        Read by a thread of its own, which stops while too many bytes wait. Where it ends, so does the process.
+        Read by a separate thread, which pauses while too many bytes wait. When it ends, the process exits.
     """
 
     def __init__(self, source: BinaryIO) -> None:
@@ -79,11 +79,11 @@ class Inbox:
         while len(head := source.read(8)) == 8:
             length = int.from_bytes(head, "little")
             self._put(decode(source.read(length)), length + _OVERHEAD)
-        # The page has gone, and nobody waits for what is at hand.
+        # The page is gone, so the current computation is not needed.
         os._exit(0)
 
     def _put(self, frame: Frame, size: int) -> None:
-        """Add a message as soon as there is room for it."""
+        """Add a message as soon as the queue has space for it."""
         with self._changed:
             last = self._messages[-1][0].header.get("do") if self._messages else None
             if frame.header.get("do") == last == "drag":
@@ -95,7 +95,7 @@ class Inbox:
             self._changed.notify()
 
     def take(self) -> Frame:
-        """The next message, as soon as there is one."""
+        """Return the next message; wait for it if necessary."""
         with self._changed:
             while not self._messages:
                 self._changed.wait()
@@ -105,5 +105,5 @@ class Inbox:
             return frame
 
     def waiting(self) -> bool:
-        """Whether there is one that makes what is going on needless; to save something does not."""
+        """Whether a waiting message makes the current computation unnecessary; "save" does not."""
         return any(frame.header.get("do") != "save" for frame, _ in self._messages.copy())

@@ -1,4 +1,4 @@
-"""``qhm animate``: a mesh and where its boundary goes, frame by frame → a sequence of maps, a moving picture."""
+"""``qhm animate``: map a mesh to a sequence of targets, and write the frames or an animation."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, animate, write, read back, judge, report."""
+    """Read, animate, write, read back, certify, report."""
     import numpy as np
 
     from quasiharmonic import io
@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
         with report.after_writing(folders[0]) if written else nullcontext():
             written[folder] = _write_frames(folder, mesh, animation)
     for t, path in enumerate(drawn):
-        # What could not be drawn is wrong output, unless something is written already.
+        # Errors are `ReportError` only if another output is already written.
         before = [*folders, *drawn[:t]]
         with report.after_writing(before[0]) if before else nullcontext():
             _draw(path, problem, animation, options.frames_per_second)
@@ -143,7 +143,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _files(given: list[Path]) -> list[Path]:
-    """The files that are named, or are in the folder that is."""
+    """Return the given files, or the meshes of the given folder."""
     if len(given) == 1 and given[0].is_dir():
         found = sorted(path for path in given[0].iterdir() if path.suffix.lower() in _MESHES)
         if not found:
@@ -155,7 +155,7 @@ def _files(given: list[Path]) -> list[Path]:
 
 
 def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
-    """A folder that can be written to, or made, with none of the inputs in it."""
+    """Return the path if it can be an output folder: writable or new, and without input files."""
     if path.suffix and not path.is_dir():
         raise ValueError(f"-o {path}: neither a moving picture ({', '.join(PICTURES)}) nor the name of a folder")
     if any(source is not None and source.resolve().parent == path.resolve() for source in inputs):
@@ -166,7 +166,7 @@ def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
 
 
 def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Where the held vertices go in every frame; (t, k, 2)."""
+    """Return the target positions of the fixed vertices in every frame; (t, k, 2)."""
     import numpy as np
 
     from quasiharmonic import io
@@ -199,7 +199,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
     except FileNotFoundError as error:
         raise io.MeshFileError(path, "there is no such file") from error
     except (ValueError, EOFError, MemoryError) as error:
-        # The first sentence says what is wrong, further ones what a programmer might do about it.
+        # The first line names the error; further lines address programmers.
         said = str(error).partition("\n")[0]
         raise ValueError(f"{path}: no array of numbers in NumPy's format: {said}") from error
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, held.size) and array.shape[2] == 2
@@ -217,9 +217,9 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
     Returns
     -------
     certified : bool
-        Whether all are as a reader gets them.
+        Whether all written files are certified injective.
     others : list of str
-        Frames in the folder that are of another run.
+        Frames in the folder that belong to another run.
     """
     from quasiharmonic import io
     from quasiharmonic.ui.cli import report

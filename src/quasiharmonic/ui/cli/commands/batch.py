@@ -1,4 +1,4 @@
-"""``qhm batch``: every problem of a data set → maps, and a record of each."""
+"""``qhm batch``: map every problem of a data set, and write a record of each."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run, showing how far it is; say how it ended."""
+    """Run the data set with progress, then print a summary."""
     from quasiharmonic.ui import batch
     from quasiharmonic.ui.cli import report
 
@@ -182,7 +182,7 @@ def _account(progress: Progress, wanted: str, table: Path) -> str:
 
 
 class _Display:
-    """How far a run is: a line that is written over on a terminal, elsewhere a line now and then."""
+    """Progress display: one overwritten line on a terminal, otherwise occasional lines."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr is not None and sys.stderr.isatty()
@@ -203,7 +203,7 @@ class _Display:
             tell(text)
 
     def clear(self) -> None:
-        """Take the line away."""
+        """Erase the progress line."""
         if self._terminal:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""``qhm check``: judge any map in a file, exactly."""
+"""``qhm check``: certify the map of a file exactly."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, judge, report; or tell of the boundary."""
+    """Read, certify, report; or report the boundary."""
     from quasiharmonic import io
     from quasiharmonic.geometry.exact.convexity import not_convex
     from quasiharmonic.ui.cli import boundary, report
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     further = len(judged.V) - len(mesh.V)
     facts = {
         **judged.to_dict(),
-        # Of the triangles as they lie, mirrored ones included.
+        # Mirrored triangles count as inverted here.
         "injective": judged.certificate.injective,
         "input": str(options.input),
         "precision": precision,

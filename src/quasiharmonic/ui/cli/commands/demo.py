@@ -1,4 +1,4 @@
-"""``qhm demo``: a curved surface of the package's own onto a letter."""
+"""``qhm demo``: map a built-in surface onto a letter."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Make, map, write, judge, draw, report."""
+    """Make the surface, map it, write, certify, draw, report."""
     from quasiharmonic import io, targets
     from quasiharmonic.apps.atlas.mapped import each_island
     from quasiharmonic.geometry import surfaces

@@ -1,4 +1,4 @@
-"""``qhm diagnose``: why a mesh and a target admit no map."""
+"""``qhm diagnose``: report why a mesh and a target admit no map."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, examine, report."""
+    """Read, diagnose, report."""
     from quasiharmonic import io
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.diagnosis import diagnose

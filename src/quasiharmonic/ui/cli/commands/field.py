@@ -1,4 +1,4 @@
-"""``qhm field``: a displacement field of a picture → the nearest one without folds, and its inverse."""
+"""``qhm field``: compute the nearest displacement field of an image without folds, and its inverse."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, mend, write, report."""
+    """Read, make invertible, write, report."""
     from quasiharmonic.apps.displacement_fields.nearest import nearest_invertible
     from quasiharmonic.ui.cli import report
 
@@ -117,7 +117,7 @@ def _write(path: Path, field: NDArray[np.float64]) -> None:
 
 
 def _invert(path: Path, field: NDArray[np.float64], spacing: float | list[float]) -> str:
-    """Write the inverse, and say what it is."""
+    """Write the inverse field, and return its summary."""
     from quasiharmonic.apps.displacement_fields.inverse import inverse_field
 
     back = inverse_field(field, spacing=spacing)
@@ -126,7 +126,7 @@ def _invert(path: Path, field: NDArray[np.float64], spacing: float | list[float]
 
 
 def _border(field: NDArray[Any]) -> NDArray[np.bool_]:
-    """The border's pixels."""
+    """Return a mask of the border's pixels."""
     import numpy as np
 
     border = np.ones(field.shape[:2], dtype=bool)

@@ -1,4 +1,4 @@
-"""``qhm flatten``: a mesh file → a bijective map of it, its boundary where distortion is least."""
+"""``qhm flatten``: compute a bijective map of a mesh with free boundary and low distortion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
 
 
-# Pieces are so many allowances apart: more than two, or these would touch.
+# Distance between pieces, in allowances; with 2 or less the allowances would touch.
 _ROOM = 2.1
 
 
@@ -75,7 +75,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, flatten, write, read back, judge, report."""
+    """Read, flatten, write, read back, certify, report."""
     from quasiharmonic import io
     from quasiharmonic.apps import atlas
     from quasiharmonic.apps.flattening.patterns import write_pattern
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
     if options.start or options.fixed is not None:
         if options.cut or options.seams != "file":
             raise ValueError("--start and --fixed are of the input's own map, and new seams leave nothing of it")
-        # Says what is missing of that map.
+        # Raises an error that names the missing part of the map.
         io.mapped(mesh)
     if options.fixed is not None:
         given["fixed"] = io.read_handles(options.fixed, len(mesh.V))
@@ -134,7 +134,7 @@ def run(options: argparse.Namespace) -> int:
             "triangles": len(mesh.F),
             **found.facts,
             "energy": options.energy,
-            # Each island begins anew; of several, none is the energy of all.
+            # Each island has its own energy, so there is no value for several islands.
             "mean_energy": _mean_energy(mapped),
             "distortion": measured.to_dict(),
             "input": str(options.input),
@@ -155,7 +155,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _check_pattern(options: argparse.Namespace) -> None:
-    """Refuse before any work what would make no pattern."""
+    """Raise ValueError for invalid pattern options, before any work."""
     from quasiharmonic.apps.flattening.patterns import check_pattern
 
     if options.pattern is None:
@@ -168,7 +168,7 @@ def _check_pattern(options: argparse.Namespace) -> None:
 
 
 def _mean_energy(mapped: MappedAtlas) -> float | None:
-    """Of one island, if there is a map whose energy was lowered; JSON has neither infinity nor NaN."""
+    """Return the final mean energy of a single bijective island; else None. JSON has neither infinity nor NaN."""
     first = mapped.islands[0].result
     if len(mapped.islands) > 1 or not (first.certificate.bijective and first.history):
         return None
@@ -177,7 +177,7 @@ def _mean_energy(mapped: MappedAtlas) -> float | None:
 
 
 def _weights(path: Path) -> list[float]:
-    """One positive number on each line."""
+    """Read one positive number per line."""
     from quasiharmonic.io.errors import MeshFileError
     from quasiharmonic.io.numbers import read_rows
 

@@ -1,4 +1,4 @@
-"""``qhm harmonise``: a map in a file → an injective one of less distortion, by any energy."""
+"""``qhm harmonise``: lower the distortion of a file's map by any energy, and make it injective."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, harmonise, write, judge, report."""
+    """Read, harmonise, write, certify, report."""
     from quasiharmonic.ui.cli.commands import polish
 
     def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:

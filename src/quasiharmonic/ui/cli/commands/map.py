@@ -1,4 +1,4 @@
-"""``qhm map``: a mesh file and a place for its boundary → a certified map in a file."""
+"""``qhm map``: map a mesh onto a target boundary, and certify the written file."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Map, write, read back, judge, report."""
+    """Read, map, write, read back, certify, report."""
     from quasiharmonic import io
     from quasiharmonic.apps.atlas.mapped import each_island
     from quasiharmonic.apps.atlas.refined import written_over
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     arguments.settle(options, "plot_kind", "map", asked=options.plot is not None, belongs="--plot")
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     if options.to is not None:
-        # The handles of a folder say which vertices its own vt hold.
+        # The handles of a folder belong to the target in its own vt.
         fixed_path = None
     report.check_outputs(
         options.output, options.plot, options.json, inputs=(mesh_path, fixed_path, *targets.files(options))
@@ -185,7 +185,7 @@ def search(
 
 
 def refined_by(problem: Problem, refined: Refined | None) -> Problem:
-    """The problem that a result is of."""
+    """Return the problem on the refined mesh of a result."""
     if refined is None:
         return problem
     from quasiharmonic.solver.refine.attempts import on_refinement
@@ -196,7 +196,7 @@ def refined_by(problem: Problem, refined: Refined | None) -> Problem:
 def smoothed(
     problem: Problem, result: MapResult, linear_solver: str, slide: bool | BoundaryCurves = False
 ) -> MapResult:
-    """Take the worst distortion off a map, where that is cheap: what this command does unasked."""
+    """Run the short default polish, which lowers the worst distortion at little cost."""
     from quasiharmonic.energies import smoothing
     from quasiharmonic.ui.cli import progress
 
@@ -205,14 +205,14 @@ def smoothed(
 
 
 def crowded_note(vertices: NDArray[np.int64]) -> str:
-    """Where doubles have no room for a map."""
+    """Return a sentence about vertices where double precision is too coarse for a map."""
     from quasiharmonic.util.arrays import named
 
     return f"no room next to the fixed {named('vertex', 'vertices', vertices)}"
 
 
 def summed(facts: list[dict[str, int]]) -> dict[str, int]:
-    """What was done to all islands together."""
+    """Return the sum of the report entries of all islands."""
     total: dict[str, int] = {}
     for one in facts:
         for name, value in one.items():
@@ -221,7 +221,7 @@ def summed(facts: list[dict[str, int]]) -> dict[str, int]:
 
 
 def draw(path: Path, judged: Judged, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:
-    """Draw the rest surface, Tutte's embedding of one island, and the map; or how it distorts."""
+    """Draw the rest surface, Tutte's embedding if there is one island, and the map; or the distortion."""
     import numpy as np
 
     from quasiharmonic.linsolve import NotPositiveDefinite
@@ -235,7 +235,7 @@ def draw(path: Path, judged: Judged, problems: list[Problem], mapped: MappedAtla
         return problem.frame.inward(uv).view(np.float64).reshape(-1, 2)
 
     def halved(places: NDArray[np.float64]) -> NDArray[np.float64]:
-        # Of about unit size, so that a picture of coordinates of 1e300 does not overflow, and not rounded.
+        # Scale to about unit size by a power of two: exact, and coordinates of 1e300 do not overflow.
         return np.ldexp(places, -int(np.frexp(np.abs(places).max())[1]))
 
     rest = halved(V)

@@ -1,4 +1,4 @@
-"""``qhm measure``: how much a map distorts, in all and triangle by triangle."""
+"""``qhm measure``: measure the distortion of a map, in summary and per triangle."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     with report.about(options.input):
         found = distortion(V, F, uv, rings=options.rings if options.distances else None)
     if options.export is not None:
-        # What is coloured by first is what bounds the error of a texture.
+        # Viewers colour by the first value; the isometric distortion bounds the error of a texture.
         values = {"isometric": found.isometric, **found.per_triangle()}
         io.write_per_triangle(options.export, V, F, uv, values)
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _table(found: Distortion, count: int) -> str:
-    """A line for each measure."""
+    """Return a table with a line for each measure."""
     lines = [f"{'':20}{'mean':>12}{'median':>12}{'95 %':>12}{'min':>12}{'max':>12}  at"]
     for name, values in found.per_triangle().items():
         if (values != values).all():

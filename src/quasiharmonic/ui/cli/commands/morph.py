@@ -1,4 +1,4 @@
-"""``qhm morph``: a planar mesh whose boundary has moved → a mesh with a valid interior."""
+"""``qhm morph``: move the boundary of a planar mesh, and keep its interior valid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray
 
-# What quality is of elements with so many nodes.
+# Name of the quality measure by the number of nodes per element.
 _QUALITY = {
     3: "mean-ratio quality",
     4: "quality at the worst corner",
@@ -79,7 +79,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, morph, write, read again, judge, report."""
+    """Read, morph, write, read back, certify, report."""
     from quasiharmonic.apps.mesh_motion.morphing import morph
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import rim
@@ -113,7 +113,7 @@ def run(options: argparse.Namespace) -> int:
         )
     write_fem(options.output, mesh, morphed.points)
     with report.after_writing(options.output):
-        # What a reader gets is judged: a format may hold fewer digits.
+        # Certify the file as read back, because a format may store fewer digits.
         inverted = inverted_elements(morphed.F, read_fem(options.output).points)
         drift = None if rest is None else morphed.drift()
         facts = {
@@ -130,7 +130,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _rest(path: Path, mesh: FemMesh) -> FloatArray:
-    """Places of the same nodes in another file."""
+    """Return the positions of the same nodes in another file."""
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
@@ -164,7 +164,7 @@ def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output:
 
 
 def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Read lines of a vertex and its place."""
+    """Read lines of a vertex and its target position."""
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError

@@ -1,4 +1,4 @@
-"""``qhm plot``: a picture of the map in a file."""
+"""``qhm plot``: draw the map of a file."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, draw."""
+    """Read and draw."""
     from quasiharmonic import io
     from quasiharmonic.geometry.exact.certificate import inverted_triangles
     from quasiharmonic.ui.cli import arguments, report

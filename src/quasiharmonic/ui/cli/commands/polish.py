@@ -1,4 +1,4 @@
-"""``qhm polish``: an injective map in a file → one of less distortion."""
+"""``qhm polish``: lower the distortion of an injective map of a file."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, polish, write, judge, report."""
+    """Read, polish, write, certify, report."""
     from quasiharmonic.ui.cli import sliding
 
     if options.to is not None and not options.slide:
@@ -96,10 +96,10 @@ def run(options: argparse.Namespace) -> int:
 def improve(
     options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = (), notes: Sequence[str] = ()
 ) -> int:
-    """Read a map, lower its distortion, write, judge, report; for every command that does so.
+    """Read a map, lower its distortion, write, certify, report; used by every command that does so.
 
-    What is not to be written over, beside the input and the list of fixed vertices, are further ``inputs``. What
-    ``notes`` say by the time the map is there is told with it.
+    ``inputs`` are further files that outputs must not replace. ``notes`` are added to the report; `lower` may append to
+    them.
     """
     from quasiharmonic import io
     from quasiharmonic.apps.atlas.verdict import unmirrored
@@ -116,7 +116,7 @@ def improve(
         after = lower(before, fixed, show)
     judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, after.mesh)))
     with report.after_writing(options.output):
-        # Each with the vertices that its own seams give it, which may lie in different places.
+        # Each map is cut at its own seams, which may differ.
         opened = unmirrored(before).opened(), unmirrored(after.mesh).opened()
         measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
         facts = {
@@ -137,7 +137,7 @@ def improve(
 
 
 def _change(before: Distortion, after: Distortion) -> str:
-    """What was won, or paid, in angles and in lengths."""
+    """Return a sentence about the change of angle and length distortion."""
     angles = [found.summary("mips").mean for found in (before, after)]
     lengths = [found.summary("isometric").maximum for found in (before, after)]
     return (

@@ -1,4 +1,4 @@
-"""``qhm refine``: a problem without a map → one that leaves room for it, on a mesh with a few edges split."""
+"""``qhm refine``: split edges of a problem without a map until a map may exist."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def write(output: Path, handles: Path, origin: Path, mesh: MeshData, problem: Problem, result: RefinedProblem) -> None:
-    """Write the three files, the mesh last: when it is there, all are."""
+    """Write the three files, the mesh last: if it exists, all three are complete."""
     import json
 
     from quasiharmonic import io
@@ -107,7 +107,7 @@ def write(output: Path, handles: Path, origin: Path, mesh: MeshData, problem: Pr
 
 
 def first_guess(mesh: MeshData, problem: Problem) -> NDArray[np.float64]:
-    """The places of all vertices in the file; where there are none, the middle of the target."""
+    """Return the positions of all vertices in the file's map, or the centre of the target where a vertex has none."""
     import numpy as np
 
     from quasiharmonic import io

@@ -1,4 +1,4 @@
-"""``qhm repair``: a UV file with inverted triangles → the same file without, its boundary kept."""
+"""``qhm repair``: repair the inverted triangles of a UV map, with unchanged boundary."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, repair, write, judge, report."""
+    """Read, repair, write, certify, report."""
     from dataclasses import replace
 
     from quasiharmonic import io

@@ -1,4 +1,4 @@
-"""``qhm report``: the records of a run → one page of HTML."""
+"""``qhm report``: write the records of a run as an HTML page."""
 
 from __future__ import annotations
 

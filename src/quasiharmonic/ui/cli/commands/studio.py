@@ -1,4 +1,4 @@
-"""``qhm studio``: a page with a surface and its map, to be taken hold of."""
+"""``qhm studio``: edit a map interactively in the browser."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     if options.input is not None:
         from quasiharmonic.ui.studio.surface import read_sheet
 
-        # What is wrong with it is said here rather than on the page.
+        # Errors of the input are reported here rather than on the page.
         read_sheet(options.input)
         source = str(options.input.resolve())
 
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
         if not options.no_browser:
             webbrowser.open(address)
 
-    # With Python's own handler asyncio takes Ctrl-C as a wish to end, and not as an error wherever it happens to be.
+    # asyncio ends cleanly on Ctrl-C only if Python's default handler is installed.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with suppress(KeyboardInterrupt):
         asyncio.run(Studio(source).run(options.port, ready))

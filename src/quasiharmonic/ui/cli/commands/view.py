@@ -1,4 +1,4 @@
-"""``qhm view``: a window on a surface and its map."""
+"""``qhm view``: show a surface and its map in a window."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, show."""
+    """Read and show."""
     from quasiharmonic import io
     from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.plot.interactive import show

@@ -1,4 +1,4 @@
-// The certified maps that were shown, kept to be played back and saved as a film.
+// History of the certified maps that were shown, for playback and for saving as a film.
 
 const MOST_BYTES = 96 * 2 ** 20;
 const MOST_MAPS = 1500;
@@ -17,7 +17,7 @@ export class Film {
     this.playing = false;
   }
 
-  /** Keep a map; beyond a limit every other one goes, so that the film stays whole and only gets coarser. */
+  /** Add a map; beyond a limit remove every second map, so that the film keeps its duration and gets coarser. */
   add(places) {
     if (this.playing) return;
     this.maps.push(places);
@@ -28,7 +28,7 @@ export class Film {
     }
   }
 
-  /** Show all of them, and then again what was shown. */
+  /** Show all maps, then restore the previous view. */
   async play(view, shown = () => {}) {
     if (this.playing || !this.maps.length) return;
     this.playing = true;
@@ -42,7 +42,7 @@ export class Film {
     this.playing = false;
   }
 
-  /** Play them into a film; null where the browser cannot. */
+  /** Record the playback as a film; return null if the browser does not support it. */
   async record(view) {
     if (!window.MediaRecorder || !HTMLCanvasElement.prototype.captureStream) return null;
     const canvas = view.picture();

@@ -1,7 +1,8 @@
-// Messages: a header in JSON and named arrays behind it, in one buffer. Both ways, by a socket or a notebook's widget.
+// Messages in one buffer: a JSON header followed by named arrays. The format is the same in both directions and for
+// sockets and notebook widgets.
 //
 //   bytes 0-3   length H of the header, unsigned, little-endian (as all numbers are)
-//   then        H bytes of JSON in UTF-8, with spaces at its end so that what follows begins at a multiple of 8
+//   then        H bytes of JSON in UTF-8, padded with spaces so that the arrays begin at a multiple of 8
 //   then        the arrays, each at a multiple of 8 from there: header.arrays = {name: [type, shape, offset]}
 
 const TYPES = {
@@ -15,7 +16,7 @@ const TYPES = {
 const nameOfType = (array) => Object.keys(TYPES).find((name) => array instanceof TYPES[name]);
 const padded = (bytes) => Math.ceil(bytes / 8) * 8;
 
-/** A buffer from a header and arrays by their names: `{name: typed array}`, of one dimension. */
+/** Return the buffer of a header and arrays by name: `{name: typed array}`, one-dimensional. */
 export function encodeFrame(header, arrays = {}) {
   const described = {};
   let offset = 0;
@@ -35,9 +36,9 @@ export function encodeFrame(header, arrays = {}) {
   return buffer;
 }
 
-/** `{header, arrays}` of a buffer; the arrays are views of it, flat, their shapes in `header.arrays`. */
+/** Decode a buffer to `{header, arrays}`; the arrays are flat views of it, with their shapes in `header.arrays`. */
 export function decodeFrame(data) {
-  // A widget's buffer is a part of another one, and typed arrays want to begin at multiples of their own size.
+  // A widget's buffer may be unaligned within another one, but typed arrays must be aligned to their element size.
   const buffer = data instanceof ArrayBuffer ? data : data.buffer.slice(data.byteOffset, data.byteOffset + data.byteLength);
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));

@@ -1,10 +1,10 @@
-// What pointer and keyboard do: turn the surface, shift the map, take hold of a vertex and move it, pin, choose corners, draw.
+// Pointer and keyboard input: rotate the surface, pan the map, drag vertices, pin, choose corners, draw.
 
-const GRIP = 14; // CSS pixels around a handle within which it is taken
-const CLICK = 4; // and by which a click may move
+const GRIP = 14; // distance in CSS pixels within which a handle is grabbed
+const CLICK = 4; // maximum motion of a click in CSS pixels
 const ZOOM = 1.0015;
 
-/** The pointer and the keyboard on both panes. Without `send` nothing can be taken hold of. */
+/** Pointer and keyboard input on both panes. Without `send` vertices cannot be dragged. */
 export class Hands {
   constructor(element, { scene, plane, clock, space, send, redraw }) {
     Object.assign(this, { scene, plane, clock, space, send, redraw });
@@ -57,7 +57,7 @@ export class Hands {
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  /** Where the panes lie. */
+  /** Set the positions of the panes. */
   place(...boxes) {
     boxes.forEach((box, i) => {
       const style = { left: `${box.x}px`, top: `${box.y}px`, width: `${box.width}px`, height: `${box.height}px` };
@@ -65,7 +65,7 @@ export class Hands {
     });
   }
 
-  /** There is a new surface: nothing is held any more. */
+  /** Reset the drag, for a new surface. */
   forget() {
     this.held = -1;
     this.aimed = -1;
@@ -117,7 +117,7 @@ export class Hands {
 
   // --- the map -----------------------------------------------------------------------------------------------------
 
-  /** The vertex that could be taken hold of at a point, or -1: pins and corners before the rest of the boundary. */
+  /** Return the vertex that can be grabbed at a point, or -1. Pins and corners precede other boundary vertices. */
   handleAt(point) {
     const { scene, plane } = this;
     if (!scene.places || !this.send) return -1;
@@ -204,7 +204,7 @@ export class Hands {
 
   #grab(vertex) {
     this.held = vertex;
-    // Of what was let go of a moment ago the map may be on its way.
+    // If this vertex was released a moment ago, its map may still be under way, so keep its target.
     if (this.aimed !== vertex) this.aim = this.scene.placeOf(vertex);
     this.aimed = vertex;
     this.next = null;
@@ -212,7 +212,7 @@ export class Hands {
     this.send({ do: "grab", vertex });
   }
 
-  // One map is asked for at a time, always the newest: what is drawn is never older than one round trip.
+  // Request one map at a time, for the newest position, so that the picture lags by at most one round trip.
   #moveTo(place) {
     this.aim = place;
     this.seq += 1;
@@ -228,7 +228,7 @@ export class Hands {
     this.next = null;
   }
 
-  /** A map has come, of the hand or at rest, after a movement; the hand may be farther already. */
+  /** Handle the arrival of a map, during a drag or after it; the pointer may have moved on. */
   answered(seq, after) {
     if (seq < 0) {
       if (after >= this.seq && this.held < 0) this.aimed = -1;
@@ -257,7 +257,7 @@ export class Hands {
     this.redraw();
   }
 
-  /** Make the polygon that has been drawn the outline. */
+  /** Send the drawn polygon as the outline. */
   closeSketch() {
     const { sketch, origin } = this.scene;
     this.scene.sketch = [];

@@ -1,14 +1,14 @@
-// What is drawn over the panes: the outline, what can be taken hold of, what forbids a map, and the line being drawn by hand.
+// Overlay of the panes: the outline, handles, obstructions, and the polygon being drawn.
 
 export const INK = "#0f1f4a";
 export const RED = "#c01030";
 const HANDLE = "#b35900";
 const PIN = "#7a1fa2";
 const PAPER = "#ffffff";
-// Rings around triangles too small to be seen; more would hide the picture.
+// Maximum number of rings around triangles that are too small to see; more would hide the picture.
 const MOST_RINGS = 200;
 
-/** Draw on a 2D canvas whose unit is the CSS pixel. `scene` is what `createView` keeps. */
+/** Draw on a 2D canvas whose unit is the CSS pixel. `scene` is the scene of `createView`. */
 export function drawOverlay(context, scene, space, plane) {
   const { width, height } = scene.size;
   context.clearRect(0, 0, width, height);
@@ -48,7 +48,7 @@ function outline(context, scene, plane) {
   for (const loop of scene.loops) path(context, loop, (v) => plane.pointOf(...scene.placeOf(v)));
   context.stroke();
   if (!scene.asked) return;
-  // Where the hand wants the boundary, while no certified map has followed it there.
+  // The target of the boundary, while there is no certified map for it.
   context.strokeStyle = RED;
   context.setLineDash([6, 4]);
   context.beginPath();

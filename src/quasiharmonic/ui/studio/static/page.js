@@ -1,4 +1,4 @@
-// The page: a socket to what computes, the view, and the controls around it.
+// The page: the socket to the worker, the view, and the controls.
 
 import { Film } from "./film.js";
 import { decodeFrame, encodeFrame } from "./frames.js";
@@ -6,7 +6,7 @@ import { Panel } from "./panel.js";
 import { createView } from "./view.js";
 
 const $ = (id) => document.getElementById(id);
-const RATE_OVER = 1000; // milliseconds over which maps are counted
+const RATE_OVER = 1000; // window in milliseconds for the rate of maps
 
 class Page {
   constructor() {
@@ -55,7 +55,7 @@ class Page {
       this.panel.surface(header);
     } else if (header.kind === "map") {
       if (arrays.places) {
-        // A certified map only: a film shows nothing else.
+        // A film contains only certified maps.
         if (header.injective) this.film.add(arrays.places);
         this.count();
       }
@@ -71,7 +71,7 @@ class Page {
     while (this.arrivals[0] < now - RATE_OVER) this.arrivals.shift();
   }
 
-  /** A file of the visitor's: a surface, or an outline as a drawing. */
+  /** Upload a file of the user: a surface, or a drawing of an outline. */
   async take(file) {
     if (file.size > this.mostBytes) {
       const mega = (bytes) => `${Math.ceil(bytes / 2 ** 20).toLocaleString("en")} MB`;

@@ -1,4 +1,4 @@
-// The controls beside the view, and what they tell.
+// The controls beside the view, and their status texts.
 
 const $ = (id) => document.getElementById(id);
 
@@ -87,7 +87,7 @@ export class Panel {
     $("hint").hidden = this.dragged;
   }
 
-  /** What is certain about the map that is shown, and nothing else. */
+  /** Show the certificate and the numbers of the displayed map. */
   map(header, moved, rate) {
     if (header.seq > 2 && !this.dragged) {
       this.dragged = true;
@@ -118,7 +118,7 @@ export class Panel {
     document.body.dataset.state = "settled";
   }
 
-  /** The menu shows the outline that the map has, none of those where it is somebody's own. */
+  /** Select the map's outline in the menu; nothing for a custom outline. */
   #outline(word) {
     const [shape, ...letters] = (word ?? "").split("letter:");
     if (letters.length) $("letter").value = letters[0];
@@ -176,7 +176,7 @@ export class Panel {
     this.#gone("Cut off", "The server has ended. Reload the page once it runs again.");
   }
 
-  /** The server runs, and has no place for this page. */
+  /** Report that the server has too many open pages. */
   refused(why) {
     this.#gone("Not opened", `${why}, and no more are taken. Close one, then reload this one.`);
   }

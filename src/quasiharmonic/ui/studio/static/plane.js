@@ -1,6 +1,6 @@
-// The map in the plane: where it lies on the screen, and what the pointer may take hold of there.
+// View of the map: transformation from the plane to the screen, and picking of vertices.
 
-/** A window on the plane, which hands shift and wheels enlarge. */
+/** A window on the plane that supports pan and zoom. */
 export class PlaneView {
   constructor() {
     this.box = { x: 0, y: 0, width: 1, height: 1 };
@@ -10,7 +10,7 @@ export class PlaneView {
     this.followed = true;
   }
 
-  /** Show all of some places (n × 2), with a margin. */
+  /** Fit the view to some positions (n × 2), with a margin. */
   fit(places) {
     let [left, right, bottom, top] = [Infinity, -Infinity, Infinity, -Infinity];
     for (let i = 0; i < places.length; i += 2) {
@@ -33,7 +33,7 @@ export class PlaneView {
     }
   }
 
-  /** The place of the pane on the screen, in CSS pixels. */
+  /** Set the box of the pane on the screen, in CSS pixels. */
   setBox(box) {
     this.box = box;
     this.#refit();
@@ -44,7 +44,7 @@ export class PlaneView {
     this.centre = [this.centre[0] - dx / this.pixels, this.centre[1] + dy / this.pixels];
   }
 
-  /** Enlarge around a point of the screen. */
+  /** Zoom around a point of the screen. */
   zoomBy(factor, point) {
     this.followed = false;
     const before = this.placeOf(point);
@@ -53,7 +53,7 @@ export class PlaneView {
     this.centre = this.centre.map((c, k) => c + before[k] - after[k]);
   }
 
-  /** The place in the plane of a point of the screen. */
+  /** Return the position in the plane of a point of the screen. */
   placeOf([x, y]) {
     return [
       this.centre[0] + (x - this.box.x - this.box.width / 2) / this.pixels,
@@ -61,7 +61,7 @@ export class PlaneView {
     ];
   }
 
-  /** The point of the screen of a place in the plane. */
+  /** Return the point of the screen of a position in the plane. */
   pointOf(u, v) {
     return [
       this.box.x + this.box.width / 2 + (u - this.centre[0]) * this.pixels,
@@ -69,14 +69,14 @@ export class PlaneView {
     ];
   }
 
-  /** Scale and shift from places to the pane's clip coordinates. */
+  /** Scale and shift from positions to the pane's clip coordinates. */
   get window() {
     const sx = (2 * this.pixels) / this.box.width;
     const sy = (2 * this.pixels) / this.box.height;
     return new Float32Array([sx, sy, -sx * this.centre[0], -sy * this.centre[1]]);
   }
 
-  /** The vertex of a list that is drawn nearest to a point, if it is within so many pixels; else -1. */
+  /** Return the vertex of a list nearest to a point of the screen, within so many pixels; else -1. */
   nearest(point, vertices, places, within) {
     let best = within;
     let found = -1;

@@ -1,4 +1,4 @@
-// The programs that draw a surface and its map. Both panes are drawn from the same vertices, so that a new map is one upload.
+// Shaders for a surface and its map. Both panes share the vertex buffers, so a new map needs only one upload.
 
 const VERTEX = `#version 300 es
 uniform bool flat_pane;
@@ -14,8 +14,8 @@ void main() {
   gl_Position = flat_pane ? vec4(place * window.xy + window.zw, 0.0, 1.0) : turn * vec4(position, 1.0);
 }`;
 
-// Position and place are linear on a triangle, so their differences from pixel to pixel have the Jacobian in them:
-// nothing about triangles need be computed or sent when the map moves.
+// Surface positions and map positions are linear on a triangle, so their screen derivatives give the Jacobian.
+// No data per triangle are computed or sent when the map moves.
 const FRAGMENT = `#version 300 es
 precision highp float;
 uniform bool flat_pane;
@@ -80,7 +80,7 @@ function compiled(gl, kind, source) {
   return shader;
 }
 
-/** Whether the processor draws, for which smooth edges are most of the work. */
+/** Whether WebGL runs in software; antialiasing is then most of the work. */
 function drawsInSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
   const info = gl?.getExtension("WEBGL_debug_renderer_info");
@@ -89,11 +89,11 @@ function drawsInSoftware() {
   return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 
-/** What draws triangles and edges of one surface; throws where the browser has no WebGL 2. */
+/** Draws triangles and edges of one surface; throws if the browser has no WebGL 2. */
 export class Painter {
   constructor(canvas) {
     this.canvas = canvas;
-    /** Whether the processor draws; then a pane that is not drawn anew stays as it is. */
+    /** Whether WebGL runs in software; a pane that is not redrawn then keeps its picture. */
     this.software = drawsInSoftware();
     this.gl = canvas.getContext("webgl2", { antialias: !this.software, preserveDrawingBuffer: this.software, alpha: true });
     if (!this.gl) throw new Error("this browser has no WebGL 2, which draws the surface");
@@ -125,7 +125,7 @@ export class Painter {
     }
   }
 
-  /** Positions (n × 3), triangles (f × 3) and edges (e × 2) of a surface. */
+  /** Set positions (n × 3), triangles (f × 3) and edges (e × 2) of a surface. */
   setSurface(positions, triangles, edges) {
     const gl = this.gl;
     this.surface = { positions, triangles, edges, places: new Float32Array((positions.length / 3) * 2), bad: new Uint32Array(0) };
@@ -137,7 +137,7 @@ export class Painter {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, edges, gl.STATIC_DRAW);
   }
 
-  /** Places (n × 2) of the vertices in the map. */
+  /** Set the positions (n × 2) of the vertices in the map. */
   setPlaces(places) {
     const gl = this.gl;
     this.surface.places = places;
@@ -145,7 +145,7 @@ export class Painter {
     gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
   }
 
-  /** Numbers of the triangles that are painted red. */
+  /** Set the indices of the triangles to paint red. */
   setBad(bad) {
     const gl = this.gl;
     this.surface.bad = bad;
@@ -155,7 +155,7 @@ export class Painter {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.DYNAMIC_DRAW);
   }
 
-  /** Draw one pane: `box` in pixels of the canvas from below, and the uniforms of its look. */
+  /** Draw one pane: `box` in canvas pixels from the lower left, `look` with the uniforms. */
   pane(box, look) {
     const gl = this.gl;
     if (box.width <= 0 || box.height <= 0) return;
@@ -184,7 +184,7 @@ export class Painter {
     gl.uniform1i(this.at.colouring, FLAT);
     if (look.edges) {
       gl.enable(gl.BLEND);
-      // Opaque as before: what shines through would be the page.
+      // Keep the canvas opaque, otherwise the page shines through.
       gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
       gl.uniform4f(this.at.flat_colour, 0.06, 0.12, 0.29, 0.35);
       this.#draw(gl.LINES, this.buffers.edges, this.surface.edges.length);
@@ -194,7 +194,7 @@ export class Painter {
     this.#draw(gl.TRIANGLES, this.buffers.bad, this.surface.bad.length * 3);
   }
 
-  /** Draw nothing. */
+  /** Clear the canvas. */
   clear() {
     const gl = this.gl;
     gl.disable(gl.SCISSOR_TEST);
@@ -203,7 +203,7 @@ export class Painter {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   }
 
-  /** Wait until all that was asked for has been drawn: for measurements. */
+  /** Wait until drawing is finished, for measurements. */
   finish() {
     this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
   }

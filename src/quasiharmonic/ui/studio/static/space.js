@@ -1,6 +1,6 @@
-// The surface in space: how it is turned, and which of its vertices lies under the pointer.
+// View of the surface: rotation, projection, and picking of vertices.
 
-/** An orthographic view of points (n × 3), which hands turn and wheels enlarge. Angles in radians. */
+/** An orthographic view of points (n × 3) that supports rotation, pan and zoom. Angles in radians. */
 export class SpaceView {
   constructor(positions) {
     const low = [Infinity, Infinity, Infinity];
@@ -24,7 +24,7 @@ export class SpaceView {
     this.shift = [0, 0];
   }
 
-  /** Turn by a movement on the screen, in CSS pixels. */
+  /** Rotate by a pointer motion in CSS pixels. */
   turnBy(dx, dy) {
     this.yaw += dx * 0.01;
     this.pitch = Math.max(-Math.PI / 2, Math.min(Math.PI / 2, this.pitch + dy * 0.01));
@@ -39,7 +39,7 @@ export class SpaceView {
     this.zoom = Math.max(0.1, Math.min(200, this.zoom * factor));
   }
 
-  /** CSS pixels a unit of length. */
+  /** CSS pixels per unit of length. */
   get pixels() {
     return (0.46 * Math.min(this.box.width, this.box.height) * this.zoom) / this.radius;
   }
@@ -54,12 +54,12 @@ export class SpaceView {
     ];
   }
 
-  /** The matrix for the painter, by columns. */
+  /** The matrix for the painter, in column-major order. */
   get matrix() {
     const axes = this.axes;
     const sx = (2 * this.pixels) / this.box.width;
     const sy = (2 * this.pixels) / this.box.height;
-    // Whatever the enlargement, the whole surface lies between the planes that clip.
+    // At every zoom the whole surface lies between the clipping planes.
     const sz = -0.5 / this.radius;
     const rows = [axes[0].map((a) => a * sx), axes[1].map((a) => a * sy), axes[2].map((a) => a * sz)];
     const shift = rows.map((row) => -row.reduce((sum, a, k) => sum + a * this.centre[k], 0));
@@ -68,7 +68,7 @@ export class SpaceView {
     return new Float32Array([0, 1, 2, 3].flatMap((c) => (c < 3 ? [rows[0][c], rows[1][c], rows[2][c], 0] : [...shift, 1])));
   }
 
-  /** Where a vertex is drawn, in CSS pixels from the upper left of the whole view. */
+  /** Return the point of the screen of a vertex, in CSS pixels from the upper left of the whole view. */
   project(vertex) {
     const axes = this.axes;
     const d = [0, 1, 2].map((k) => this.positions[3 * vertex + k] - this.centre[k]);
@@ -79,7 +79,7 @@ export class SpaceView {
     ];
   }
 
-  /** Whether a vertex looks away from the eye, by the triangles around it. */
+  /** Whether the normal of a vertex points away from the viewer. */
   looksAway(vertex, triangles) {
     if (!this.normals.has(vertex)) this.normals.set(vertex, this.#normal(vertex, triangles));
     const normal = this.normals.get(vertex);
@@ -97,7 +97,7 @@ export class SpaceView {
     return sum;
   }
 
-  /** The nearest triangle under a point of the screen and the vertex of it nearest to that point, or null. */
+  /** Return the nearest triangle under a point of the screen and its vertex nearest to that point, or null. */
   pick(point, triangles) {
     const [right, up, eye] = this.axes;
     const x = (point[0] - this.box.x - this.box.width / 2 - this.shift[0]) / this.pixels;

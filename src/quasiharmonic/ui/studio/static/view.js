@@ -1,7 +1,8 @@
-// A surface beside its map. Stands alone: give `createView` an element and what sends messages, and feed it frames.
+// View of a surface and its map. It is self-contained: pass `createView` an element and a function that sends messages,
+// and pass frames to `receive`.
 //
-// It understands the frames "surface", "map" and "obstructions", and sends {do: "grab" | "drag" | "drop" | "pin" | "unpin" |
-// "corner" | "polygon"}; docs/studio.md has their fields. Without `send` it shows, and lets nothing be moved.
+// It handles the frames "surface", "map" and "obstructions", and sends {do: "grab" | "drag" | "drop" | "pin" | "unpin" |
+// "corner" | "polygon"}; docs/studio.md describes their fields. Without `send` the view is read-only.
 
 import { decodeFrame } from "./frames.js";
 import { Hands } from "./hands.js";
@@ -12,14 +13,15 @@ import { SpaceView } from "./space.js";
 
 const STACKED_BELOW = 640; // CSS pixels of width
 const NOTHING = { vertices: [], edges: [], triangles: [] };
-// Where the processor draws: what moves is drawn with so many times fewer pixels a side if all of it takes longer than this,
-// the surface with every so many-th map, and all of it once more when nothing has moved for so long. Milliseconds.
+// Settings for software rendering. If a full picture takes longer than QUICK ms, moving panes are drawn with COARSER times
+// fewer pixels per side. The surface is redrawn with every SURFACE_EVERY-th map. After REST ms without motion everything
+// is redrawn at full resolution.
 const COARSER = 3;
 const QUICK = 12;
 const SURFACE_EVERY = 4;
 const REST = 150;
 
-/** What is drawn, as the last frames have told it; see `drawOverlay`. */
+/** The scene according to the last frames; see `drawOverlay`. */
 class Scene {
   constructor() {
     this.size = { width: 1, height: 1 };
@@ -44,14 +46,14 @@ class Scene {
   }
 }
 
-/** How quick it is: milliseconds from the hand's movement to the picture of the map it asked for, of the last thousand. */
+/** Latencies: milliseconds from a pointer motion to the picture of its map, for the last thousand. */
 class Clock {
   constructor() {
     this.moved = new Map();
     this.latencies = [];
     this.frames = 0;
     this.maps = 0;
-    this.whole = 0; // milliseconds that the last picture took of which all was drawn
+    this.whole = 0; // milliseconds for the last full picture
   }
 
   move(seq) {
@@ -69,10 +71,10 @@ class Clock {
 }
 
 /**
- * Fill an element with a surface and its map.
+ * Create the view of a surface and its map in an element.
  *
- * `options.send(message, arrays)` carries what the hand does away; `options.measured` waits for every picture to be finished,
- * so that `clock` is true where drawing goes on behind the script's back.
+ * `options.send(message, arrays)` sends the user's actions. `options.measured` waits until every picture is finished, so that
+ * `clock` includes asynchronous drawing.
  */
 export function createView(element, options = {}) {
   const scene = new Scene();
@@ -83,9 +85,9 @@ export function createView(element, options = {}) {
   let scale = 1;
   let seq = -1;
   let waiting = false;
-  const stale = new Set(); // panes that the next picture has to draw anew
-  let moves = true; // whether all that asks for it moves
-  let followed = 0; // maps since the surface was drawn
+  const stale = new Set(); // panes to redraw in the next picture
+  let moves = true; // whether all requests for the next picture come from motion
+  let followed = 0; // maps since the surface was redrawn
   let resting = 0;
 
   element.classList.add("qhm-view");
@@ -100,7 +102,7 @@ export function createView(element, options = {}) {
   const painter = new Painter(canvas);
   const context = over.getContext("2d");
 
-  /** Ask for a picture: a whole one, or of one pane, "space" or "plane", in which something moves. */
+  /** Request a picture: a full one, or one of a pane in motion, "space" or "plane". */
   function redraw(moving = null) {
     for (const pane of moving ? [moving] : ["space", "plane"]) stale.add(pane);
     moves &&= moving !== null;
@@ -110,7 +112,7 @@ export function createView(element, options = {}) {
   }
 
   function draw() {
-    // What is red is shown with every pixel, in both panes.
+    // Inverted triangles are drawn at full resolution in both panes.
     const coarse = moves && stale.size > 0 && !scene.bad.length && painter.software && clock.whole > QUICK;
     const began = performance.now();
     waiting = false;
@@ -123,12 +125,12 @@ export function createView(element, options = {}) {
   }
 
   function rest() {
-    // A hand that waits for a map is not at rest.
+    // A drag that waits for a map is still in motion.
     if (hands.inFlight) resting = setTimeout(rest, REST);
     else redraw();
   }
 
-  /** Draw what is stale, coarsely, or all of it. */
+  /** Draw the stale panes coarsely, or all panes. */
   function paint(coarse = false) {
     const ratio = density() / (coarse ? COARSER : 1);
     const resized = fill(canvas, ratio);
@@ -158,7 +160,7 @@ export function createView(element, options = {}) {
     return Math.min(window.devicePixelRatio || 1, 2);
   }
 
-  /** Give a canvas so many pixels to a CSS pixel; whether that is new, which empties it. */
+  /** Set the canvas size for a pixel ratio; return whether the size changed, which clears the canvas. */
   function fill(some, ratio) {
     const [width, height] = [scene.size.width, scene.size.height].map((length) => Math.max(1, Math.round(length * ratio)));
     if (some.width === width && some.height === height) return false;
@@ -194,7 +196,7 @@ export function createView(element, options = {}) {
     for (let t = 0; t < triangles.length; t += 3) {
       for (let k = 0; k < 3; k++) {
         const [i, j] = [triangles[t + k], triangles[t + ((k + 1) % 3)]];
-        // The other half of an inner edge runs the other way; the boundary is drawn as the outline.
+        // The second halfedge of an inner edge has the opposite direction; the overlay draws the boundary.
         if (i < j) edges.push(i, j);
       }
     }
@@ -244,7 +246,7 @@ export function createView(element, options = {}) {
     clock,
     hands,
 
-    /** Take in a frame: its buffer, or what `decodeFrame` has made of it. */
+    /** Handle a frame: a buffer, or the result of `decodeFrame`. */
     receive(frame) {
       const { header, arrays } = frame.header ? frame : decodeFrame(frame);
       if (header.kind === "surface") surface(header, arrays);
@@ -255,7 +257,7 @@ export function createView(element, options = {}) {
       }
     },
 
-    /** Mark one obstruction of those told, or none. */
+    /** Mark one obstruction, or none. */
     point(obstruction) {
       scene.obstruction = obstruction ?? NOTHING;
       redraw();
@@ -267,14 +269,14 @@ export function createView(element, options = {}) {
       redraw();
     },
 
-    /** Show all of surface and map. */
+    /** Fit the views to surface and map. */
     fit() {
       if (scene.places) plane.fit(scene.places);
       space?.reset();
       redraw();
     },
 
-    /** Show other places for the same surface, as one that has been kept. */
+    /** Show another map of the same surface, for example a stored one. */
     show(places, bad = new Uint32Array(0)) {
       scene.places = places;
       scene.bad = bad;
@@ -284,7 +286,7 @@ export function createView(element, options = {}) {
       redraw("space");
     },
 
-    /** A canvas with the picture as it is now, on white. */
+    /** Return a canvas with the current picture on white. */
     picture() {
       paint();
       const whole = document.createElement("canvas");

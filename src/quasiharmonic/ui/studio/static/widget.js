@@ -1,11 +1,11 @@
-// The view in a notebook's cell: what the hand does goes to the kernel as custom messages, and frames come back.
+// The view in a notebook cell: the user's actions go to the kernel as custom messages, and the kernel returns frames.
 
 import { decodeFrame, encodeFrame } from "./frames.js";
 import { createView } from "./view.js";
 
 const TONES = { error: "#b00020", good: "inherit" };
 
-/** anywidget calls it for every cell that shows the widget, and what it returns when the cell is gone. */
+/** Called by anywidget for every cell that shows the widget; the returned function is called when the cell is gone. */
 export function render({ model, el }) {
   const box = document.createElement("div");
   const line = document.createElement("div");
