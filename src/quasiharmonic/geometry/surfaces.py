@@ -1,12 +1,12 @@
-"""Rest meshes made on the spot: planar ones with known numbers, and curved ones to look at.
+"""Example meshes: planar and curved surfaces with few parameters.
 
-Every function returns ``V, F``: vertices (n, 2) or (n, 3) float64 and triangles (f, 3) int64, a
-connected manifold without unused vertices, its triangles counterclockwise in the plane or seen from
-outside. The same arguments give the same mesh. One of them is closed, `starfish`.
+Every function returns ``V, F``: vertices (n, 2) or (n, 3) float64 and triangles (f, 3) int64. The mesh is a connected
+manifold without unused vertices. Its triangles are counterclockwise in the plane or seen from outside. The same
+arguments give the same mesh. `starfish` is closed; all others have a boundary.
 
-The boundaries have no *chords*, interior edges that join two boundary vertices. A chord must fit
-inside the target in one piece, and a triangle with all its vertices on the boundary (an "ear") goes
-where the boundary puts it; without them no boundary rules a map out by itself.
+The boundaries have no *chords*, which are interior edges between two boundary vertices. A chord must fit inside the
+target as one straight segment. The boundary alone determines a triangle with three boundary vertices (an "ear").
+Without chords and ears, no choice of the boundary excludes an injective map by itself.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def grid(nx: int, ny: int, *, alternating: bool = False) -> tuple[FloatArray, In
     nx, ny : int
         Cells along x and y, at least 2 each.
     alternating : bool
-        Turn the diagonal of every other cell. Otherwise all rise to the right, except in the two
-        corners where that would leave a triangle with all vertices on the boundary.
+        Alternate the direction of the diagonals. By default all diagonals rise to the right, except in two
+        corners, where such a diagonal would create a triangle with all vertices on the boundary.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def grid(nx: int, ny: int, *, alternating: bool = False) -> tuple[FloatArray, In
     Raises
     ------
     ValueError
-        When there are fewer than two cells either way; such a grid has chords.
+        If there are fewer than 2 cells along an axis; such a grid has chords.
     """
     if nx < 2 or ny < 2:
         raise ValueError(f"a grid needs at least 2 cells along each axis, not {nx} by {ny}")
@@ -65,8 +65,7 @@ def annulus(
     Parameters
     ----------
     cells : int
-        Cells across the whole square, at least 2; the strips beside the hole have at least two
-        each, however narrow.
+        Cells across the whole square, at least 2. Each strip beside the hole has at least 2 cells across.
     hole : (4,) float
         Left, bottom, right and top of the hole.
 
@@ -74,12 +73,12 @@ def annulus(
     -------
     V : (n, 2) float64
     F : (f, 3) int64
-        Two boundary loops, both with vertices at their corners.
+        There are two boundary loops, both with vertices at their corners.
 
     Raises
     ------
     ValueError
-        When there are fewer than two cells, or the hole is empty or not inside the square.
+        If there are fewer than 2 cells, or the hole is empty or not inside the square.
     """
     left, bottom, right, top = hole
     if cells < 2:
@@ -111,24 +110,24 @@ def disk(rings: int = 12) -> tuple[FloatArray, IntArray]:
     Returns
     -------
     V : (1 + 3 rings (rings + 1), 2) float64
-        From the centre outwards, each ring counterclockwise from the x-axis; the last ``6 rings``
+        From the centre outwards, each ring counterclockwise from the x-axis. The last ``6 rings``
         vertices are the boundary, in order.
     F : (6 rings², 3) int64
 
     Raises
     ------
     ValueError
-        When ``rings`` is not positive.
+        If ``rings`` is not positive.
     """
     if rings < 1:
         raise ValueError(f"a disk needs at least 1 ring, not {rings}")
     V, F = [np.zeros((1, 2))], []
-    inner, m = 0, 1  # the first vertex of the ring within, and how many it has
+    inner, m = 0, 1  # the first vertex of the previous ring, and its number of vertices
     for k in range(1, rings + 1):
         outer, step = inner + m, np.arange(6 * k)
         angle = step * (np.pi / (3 * k))
         V.append(np.stack([np.cos(angle), np.sin(angle)], axis=1) * (k / rings))
-        # In each of six sectors k triangles stand on the outer ring and k - 1 hang from the inner.
+        # In each of six sectors k triangles have an edge on the outer ring and k - 1 on the inner ring.
         a, b = outer + step, outer + (step + 1) % (6 * k)
         sector, along = np.divmod(step, k)
         c = sector * (k - 1) + along
@@ -141,29 +140,29 @@ def disk(rings: int = 12) -> tuple[FloatArray, IntArray]:
 def random_delaunay(n: int, seed: int = 0) -> tuple[FloatArray, IntArray]:
     """Triangulate the unit disk irregularly but with well-shaped triangles.
 
-    Random points, drawn apart by a few rounds of moving each to the centroid of its triangles.
+    The points are random. Four rounds then move each interior point to the centroid of its triangles.
 
     Parameters
     ----------
     n : int
         Number of vertices, at least 4.
     seed : int
-        Of the random points.
+        Seed of the random points.
 
     Returns
     -------
     V : (n, 2) float64
-        The first ones are the boundary, evenly spaced on the unit circle and counterclockwise.
+        The first vertices are the boundary, evenly spaced on the unit circle and counterclockwise.
     F : (f, 3) int64
 
     Raises
     ------
     ValueError
-        When there are fewer than four vertices.
+        If there are fewer than 4 vertices.
     """
     if n < 4:
         raise ValueError(f"a disk with a vertex inside needs at least 4 vertices, not {n}")
-    # As many boundary vertices as a disk of equilateral triangles has.
+    # The number of boundary vertices of a disk of equilateral triangles.
     k = int(np.sqrt(12 * n - 3) - 3 + 1e-9)
     angle = np.arange(k) * (2 * np.pi / k)
     rng = np.random.default_rng(seed)
@@ -177,7 +176,7 @@ def random_delaunay(n: int, seed: int = 0) -> tuple[FloatArray, IntArray]:
     return V, _delaunay(V)
 
 
-# The cat's features: direction (x, y) with x mirrored, widths, height, and sharpness of the fall-off.
+# Features of the cat: direction (x, y), mirrored in x, two widths, height, and sharpness of the fall-off.
 _CAT = np.array(
     [
         (0.56, 0.70, 0.20, 0.24, +0.80, 1.5),  # ears
@@ -196,40 +195,40 @@ _CAT = np.array(
 def cat(rings: int = 50) -> tuple[FloatArray, IntArray]:
     """Model the head of a cat, a curved surface with one boundary.
 
-    An ellipsoid with bumps for ears, eyes and nose, open behind. It looks along +z with its ears
-    towards +y, and a map of it is easily read: one sees where the face went.
+    The shape is an ellipsoid, open at the back, with bumps for ears, eyes and nose. It looks along +z, and its ears
+    point towards +y. The face makes the distortion of a map easy to see.
 
     Parameters
     ----------
     rings : int
-        Rings of triangles around the nose, at least 1; below about 30 the features are lost.
+        Rings of triangles around the nose, at least 1. Below about 30 the features are not resolved.
 
     Returns
     -------
     V : (1 + 3 rings (rings + 1), 3) float64
         The last ``6 rings`` vertices are the boundary, counterclockwise seen from the front.
     F : (6 rings², 3) int64
-        Seen from outside counterclockwise; finer in the face than behind the ears.
+        Counterclockwise seen from outside; finer in the face than behind the ears.
 
     Raises
     ------
     ValueError
-        When ``rings`` is not positive.
+        If ``rings`` is not positive.
     """
     flat, F = disk(rings)
     inside = len(flat) - 6 * rings
-    r = np.hypot(*flat.T)[:, None]  # of a quarter turn; flat / r * sin(π r / 2) has no value at 0
+    r = np.hypot(*flat.T)[:, None]  # in quarter turns; np.sinc avoids 0 / 0 in flat / r * sin(π r / 2)
     direction = np.concatenate([flat * np.sinc(r / 2) * (np.pi / 2), np.cos(r * (np.pi / 2))], axis=1)
     for _ in range(40):
         away = ((direction[F].mean(axis=1) - (0, -0.05, 1)) ** 2).sum(axis=1)
-        # The weights draw the triangles to the face.
+        # The weights concentrate the triangles in the face.
         moved = _relax(_cat_point(direction), F, 1 + 6 * np.exp(-away / 0.6))[:inside]
         direction[:inside] = moved / np.linalg.norm(moved, axis=1)[:, None]
     return _cat_point(direction), F
 
 
 def _cat_point(direction: FloatArray) -> FloatArray:
-    """Points of the cat in unit directions from its middle; both (n, 3) float64."""
+    """Points of the cat in unit directions from its centre; both (n, 3) float64."""
     radius = 1 / np.linalg.norm(direction / (1.12, 0.98, 0.80), axis=1)
     for x, y, wide, high, height, sharpness in _CAT:
         z = np.sqrt(1 - x * x - y * y)
@@ -240,29 +239,29 @@ def _cat_point(direction: FloatArray) -> FloatArray:
 
 
 def starfish(arms: int = 5, rings: int = 40) -> tuple[FloatArray, IntArray]:
-    """Model a starfish, a closed surface that lies flat only if cuts reach the ends of its arms.
+    """Model a starfish, a closed surface that maps well to the plane only if cuts reach the ends of its arms.
 
-    A ball, flattened, whose equator is drawn out into arms.
+    It is a flattened ball with arms at its equator.
 
     Parameters
     ----------
     arms : int
-        How many, evenly around, at least 1.
+        Number of arms, evenly spaced, at least 1.
     rings : int
-        Rings of triangles from the middle of either side to the equator, at least 2; each arm should have a dozen of
-        the equator's ``6 rings`` vertices.
+        Rings of triangles from the centre of either side to the equator, at least 2. The equator has ``6 rings``
+        vertices; use at least a dozen for each arm.
 
     Returns
     -------
     V : (6 rings² + 2, 3) float64
-        The upper side from the middle outwards, with the equator, and then the lower side.
+        The upper side from the centre outwards, including the equator, then the lower side.
     F : (12 rings², 3) int64
         Counterclockwise seen from outside.
 
     Raises
     ------
     ValueError
-        When there is no arm, or fewer than two rings.
+        If there is no arm, or there are fewer than 2 rings.
     """
     if arms < 1 or rings < 2:
         raise ValueError(f"a starfish needs at least 1 arm and 2 rings, not {arms} and {rings}")
@@ -272,7 +271,7 @@ def starfish(arms: int = 5, rings: int = 40) -> tuple[FloatArray, IntArray]:
     across = flat * np.sinc(r / 2) * (np.pi / 2)
     drawn_out = (0.5 + 0.5 * np.cos(arms * np.arctan2(*flat.T[::-1])[:, None])) ** 3 * np.sin(r * (np.pi / 2)) ** 6
     V = np.concatenate([across * (1 + 3 * drawn_out), 0.45 * np.cos(r * (np.pi / 2))], axis=1)
-    # The lower side is the upper one's mirror image, with the same equator.
+    # The lower side is the mirror image of the upper side and shares its equator.
     lower = np.concatenate([len(flat) + np.arange(inside), np.arange(inside, len(flat))])
     return np.concatenate([V, V[:inside] * (1, 1, -1)]), np.concatenate([upper, lower[upper[:, ::-1]]])
 
@@ -288,9 +287,9 @@ def refine(V: NDArray[np.floating], F: NDArray[np.integer]) -> tuple[FloatArray,
     Returns
     -------
     V : (n + e, d) float64
-        The given vertices, then one for each of the ``e`` edges.
+        The given vertices, then the midpoint of each of the ``e`` edges.
     F : (4 f, 3) int64
-        Triangle ``t`` becomes ``4 t … 4 t + 3``: its three corners and its middle.
+        Triangle ``t`` becomes ``4 t … 4 t + 3``: three corner triangles, then the middle triangle.
     """
     V = np.asarray(V, dtype=np.float64)
     F = np.asarray(F, dtype=np.int64)
@@ -305,13 +304,13 @@ def refine(V: NDArray[np.floating], F: NDArray[np.integer]) -> tuple[FloatArray,
 def _rectangles(
     x: FloatArray, y: FloatArray, solid: NDArray[np.bool_] | None, alternating: bool
 ) -> tuple[FloatArray, IntArray]:
-    """Triangulate the cells between grid lines, or those of them that are ``solid``."""
+    """Triangulate the cells between grid lines; only the ``solid`` cells if given."""
     nx, ny = x.size - 1, y.size - 1
     j, i = np.divmod(np.arange(nx * ny), nx)
     low = i + j * (nx + 1)
     corners = np.stack([low, low + 1, low + nx + 2, low + nx + 1], axis=1)
     falling = (i + j) % 2 == 1 if alternating else np.zeros(nx * ny, dtype=bool)
-    # In the corners of the square the diagonal must end at the corner, or it would be a chord.
+    # In the corners of the square the diagonal must end at the corner; otherwise it is a chord.
     falling[[0, -1]] = False
     falling[[nx - 1, -nx]] = True
     corners[falling] = np.roll(corners[falling], -1, axis=1)
@@ -324,7 +323,7 @@ def _rectangles(
 
 
 def _delaunay(V: FloatArray) -> IntArray:
-    """Delaunay triangles of points in the plane, counterclockwise and in a fixed order."""
+    """Delaunay triangles of points in the plane, counterclockwise and in a deterministic order."""
     F: IntArray = Delaunay(V).simplices.astype(np.int64)
     a, b, c = V[F[:, 0]], V[F[:, 1]], V[F[:, 2]]
     turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
@@ -333,10 +332,10 @@ def _delaunay(V: FloatArray) -> IntArray:
 
 
 def _relax(V: FloatArray, F: IntArray, weight: FloatArray) -> FloatArray:
-    """Move every vertex to the centroid of its triangles, these weighted by (f,) ``weight`` × area."""
+    """Move every vertex to the centroid of its triangles, weighted by (f,) ``weight`` × area."""
     corners = V[F]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    # Lagrange's identity: twice the area, in the plane as in space.
+    # Lagrange's identity gives twice the area in the plane and in space.
     area = np.sqrt(np.maximum((a * a).sum(1) * (b * b).sum(1) - (a * b).sum(1) ** 2, 0))
     triangle = np.arange(F.size) // 3
     around = csr_array(((weight * area)[triangle], (F.ravel(), triangle)), shape=(len(V), len(F)))

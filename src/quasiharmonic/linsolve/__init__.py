@@ -1,4 +1,4 @@
-"""Sparse Cholesky behind one small protocol: analyse a pattern once, factor, solve, release.
+"""Sparse Cholesky solvers behind one protocol: analyse a pattern once, factor, solve, release.
 
 The package builds on `geometry.mesh`. Start reading in `base`, then `laplacian`.
 
@@ -24,7 +24,7 @@ from quasiharmonic.linsolve.errors import NotPositiveDefinite
 
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "takes_order"]
 
-# Fastest first: the order in which "auto" tries them. Each entry is the module and the class in it.
+# Fastest first: the order in which "auto" tries the backends. Each entry is the module and the class in it.
 BACKENDS = {
     "pardiso": ("mkl", "Pardiso"),
     "cholmod": ("cholmod", "Cholmod"),
@@ -32,9 +32,9 @@ BACKENDS = {
     "qdldl": ("qdldl", "Qdldl"),
     "superlu": ("superlu", "SuperLU"),
 }
-# Up to this many entries in the upper triangle QDLDL is tried before rslab, whose supernodes then cost more than they
-# save: analysis and ten factorisations take the same at 40,000 entries of a Laplacian (10,000 unknowns), and at 15,000
-# to 20,000 of a Newton system (2,500), whose rows are twice as long.
+# Number of entries in the upper triangle up to which QDLDL is tried before rslab, whose supernodes have an overhead.
+# Analysis and ten factorisations take the same time at 40,000 entries of a Laplacian (10,000 unknowns). For Newton
+# systems (2,500 unknowns), whose rows are twice as long, this is at 15,000 to 20,000 entries.
 QDLDL_UP_TO = 25_000
 
 
@@ -46,9 +46,9 @@ def _backend(name: str) -> type[LinearSolver]:
 
 
 def available(entries: int | None = None) -> tuple[str, ...]:
-    """Names of the backends whose libraries are installed, best first; none of them is loaded.
+    """Names of the installed backends, best first; does not load them.
 
-    Best for upper triangles of so many entries, or by default for large ones.
+    The order is for upper triangles with this number of entries, by default for large ones.
     """
     present = [name for name in BACKENDS if _backend(name).present()]
     if entries is not None and entries <= QDLDL_UP_TO and {"qdldl", "rslab"} <= set(present):
@@ -58,7 +58,7 @@ def available(entries: int | None = None) -> tuple[str, ...]:
 
 
 def takes_order(name: str = "auto") -> bool:
-    """Whether the backend that `make_solver` takes by this name for a large system has a use for a good order."""
+    """Whether `make_solver` with this name and a large system uses a given elimination order."""
     chosen = available()[0] if name == "auto" else name
     return chosen in BACKENDS and _backend(chosen).takes_order
 
@@ -72,30 +72,29 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
         Upper triangle of the pattern in compressed sparse rows: columns ascending within each row, every row starting
         with its diagonal entry.
     name : {"auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"}
-        Which backend to use. "auto" takes the first of `available` for so many entries that loads.
+        Backend to use. "auto" uses the first of `available` for this number of entries that can be loaded.
     ordered : bool
-        The unknowns are numbered such that eliminating them in turn leaves a sparse factor, as
-        `quasiharmonic.linsolve.dissection` numbers them. A backend then looks for no order of its own, if it can be
-        told.
+        Whether the unknowns are numbered such that elimination in this order gives a sparse factor, as
+        by `quasiharmonic.linsolve.dissection`. If so, a backend that accepts an order does not compute its own.
 
     Returns
     -------
     LinearSolver
-        Its ``name`` says which backend it is.
+        Its ``name`` gives the backend.
 
     Raises
     ------
     ValueError
-        No backend has this name, or the pattern is not as described.
+        If the name is unknown or the pattern is not valid.
     ImportError
-        The backend named is not installed, or its library does not load.
+        If the named backend is not installed or its library does not load.
     """
     if name == "auto":
         for candidate in available(np.size(indices)):
             try:
                 return _backend(candidate)(indptr, indices, ordered=ordered)
             except ImportError:
-                continue  # installed but broken; the last candidate comes with SciPy and always loads
+                continue  # installed but broken; the last candidate is part of SciPy and always loads
     if name not in BACKENDS:
         raise ValueError(
             f"there is no linear solver {name!r}; the names are 'auto', {', '.join(map(repr, BACKENDS))}, "

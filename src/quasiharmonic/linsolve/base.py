@@ -1,7 +1,7 @@
-"""The protocol every sparse solver follows.
+"""The protocol of all sparse solvers.
 
-A backend supplies four steps, `_analyse`, `_factor`, `_solve` and `_release`. What is the same for all of them is here:
-checks, the copy of the values, the residual test, one step of refinement, locking.
+A backend implements four steps: `_analyse`, `_factor`, `_solve` and `_release`. The base class does the rest: checks,
+the copy of the values, the residual test, one step of refinement, locking.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Pattern = NDArray[np.int32]
 
 
 class LinearSolver(ABC):
-    """Solve A x = b for symmetric positive definite A of one fixed sparsity pattern.
+    """Solve A x = b for symmetric positive definite A with a fixed sparsity pattern.
 
-    The pattern is analysed at construction, `factor` takes new values for it, `solve` any number of right-hand
-    sides. A solver may be shared between threads; each call is atomic.
+    The constructor analyses the pattern. `factor` takes new values for it, and `solve` any number of right-hand
+    sides. Threads may share a solver; each call is atomic.
 
     Parameters
     ----------
@@ -36,24 +36,24 @@ class LinearSolver(ABC):
     indices : (nnz,) integer array
         Column indices, ascending within each row. Every row starts with its diagonal entry.
     ordered : bool
-        The unknowns are numbered such that eliminating them in turn leaves a sparse factor, and no other order need be
-        looked for. No matter to a backend whose `takes_order` is False.
+        Whether the unknowns are numbered such that elimination in this order gives a sparse factor. If so, the
+        backend does not compute an order. No effect if `takes_order` is False.
 
     Raises
     ------
     ValueError
-        The pattern is not as described.
+        If the pattern is not valid.
     ImportError
-        The library behind the backend cannot be loaded.
+        If the library of the backend cannot be loaded.
     """
 
-    # No scaling is applied before factoring. Cholesky without pivoting commutes with scaling by powers of two: short of
-    # under- and overflow the factor of S A S is that of A, scaled, in every bit; so it saves no matrix that would fail.
-    # It matters where sizes are compared, which is in the residual test, and there the diagonal is scaled to one.
+    # The matrix is not scaled before factoring. Cholesky without pivoting commutes with scaling by powers of two:
+    # except for underflow and overflow, the factor of S A S is the scaled factor of A in every bit. So scaling would
+    # not prevent any failure. Only the residual test compares sizes, and it scales the diagonal to one.
 
     name: ClassVar[str]
     requirement: ClassVar[str]
-    #: Whether it can be told that the unknowns are numbered well, and then looks for no order of its own.
+    #: Whether the backend can use a given numbering instead of computing an order.
     takes_order: ClassVar[bool] = True
 
     def __init__(self, indptr: ArrayLike, indices: ArrayLike, *, ordered: bool = False) -> None:
@@ -61,8 +61,8 @@ class LinearSolver(ABC):
         self._indptr, self._indices = _checked_pattern(indptr, indices)
         self.n = len(self._indptr) - 1
         self.nnz = len(self._indices)
-        # The backend reads from this buffer and from no other: the caller's array is free for the next matrix, and a
-        # backend that holds addresses can prepare them once.
+        # The backend reads only from this buffer. So the caller may reuse its array, and a backend that stores
+        # addresses can prepare them once.
         self._values: FloatArray = np.zeros(self.nnz)
         self._lock = threading.Lock()
         self._ready = False
@@ -74,7 +74,7 @@ class LinearSolver(ABC):
 
     @classmethod
     def present(cls) -> bool:
-        """Whether the library behind this backend is installed, found without loading it."""
+        """Whether the library of this backend is installed; does not load it."""
         return True
 
     def factor(self, values: ArrayLike) -> None:
@@ -83,14 +83,14 @@ class LinearSolver(ABC):
         Parameters
         ----------
         values : (nnz,) array
-            Entries of the upper triangle, aligned with the pattern given at construction. They are copied.
+            Entries of the upper triangle, aligned with the pattern passed to the constructor. They are copied.
 
         Raises
         ------
         NotPositiveDefinite
-            A pivot or a diagonal entry is not positive, or an entry is not finite.
+            If a pivot or a diagonal entry is not positive, or an entry is not finite.
         ValueError
-            The array has the wrong shape, or the solver is closed.
+            If the array has the wrong shape, or the solver is closed.
         """
         values = np.asarray(values)
         if values.shape != (self.nnz,):
@@ -111,22 +111,22 @@ class LinearSolver(ABC):
         Parameters
         ----------
         rhs : (n,) or (n, k) array
-            Right-hand sides; left unchanged.
+            Right-hand sides; not modified.
 
         Returns
         -------
         (n,) or (n, k) float64 array
-            The solution, a new array. With several columns it is Fortran-ordered.
+            Solution, a new array. With several columns it is Fortran-ordered.
 
         Raises
         ------
         NotPositiveDefinite
-            The residual shows that the matrix is singular to working precision or the factor wrong, also after one
-            step of iterative refinement; or `rhs` is not finite.
+            If the residual is too large, also after one step of iterative refinement. Then the matrix is singular to
+            working precision, or the factor is wrong. Also if ``rhs`` is not finite.
         ValueError
-            `rhs` has the wrong shape, or the solver is closed.
+            If ``rhs`` has the wrong shape, or the solver is closed.
         RuntimeError
-            There is no factor: `factor` was not called or did not succeed.
+            If there is no factor: `factor` was not called or failed.
         """
         given = np.asarray(rhs, dtype=np.float64)
         if given.ndim not in (1, 2) or given.shape[0] != self.n:
@@ -145,7 +145,7 @@ class LinearSolver(ABC):
         return x[:, 0] if given.ndim == 1 else x
 
     def close(self) -> None:
-        """Release the factor and whatever the library holds for it. Closing twice is allowed."""
+        """Release the factor and the memory of the library. Repeated calls have no effect."""
         with self._lock:
             if not self._closed:
                 self._closed = True
@@ -166,7 +166,7 @@ class LinearSolver(ABC):
             raise ValueError("the solver is closed")
 
     def _examine(self, b: FloatArray, x: FloatArray) -> FloatArray:
-        """Judge by the true residual, refine once if it is too large, and give up if that does not help."""
+        """Check the true residual, refine once if it is too large, and raise if it is still too large."""
         excess = self._test.excess(b, x)
         if excess > 1:
             with np.errstate(all="ignore"):
@@ -181,7 +181,7 @@ class LinearSolver(ABC):
             f"{self.name} is {excess:.1e} times what is allowed"
         )
 
-    # ---- what a backend supplies ------------------------------------------------------------------------------------
+    # ---- implemented by backends ------------------------------------------------------------------------------------
 
     @abstractmethod
     def _analyse(self) -> None:
@@ -193,15 +193,15 @@ class LinearSolver(ABC):
 
     @abstractmethod
     def _solve(self, b: FloatArray) -> FloatArray:
-        """Solve for (n, k) Fortran-ordered `b`, leaving it as it is, into a new Fortran-ordered array."""
+        """Solve for (n, k) Fortran-ordered `b` without modifying it; return a new Fortran-ordered array."""
 
     @abstractmethod
     def _release(self) -> None:
-        """Drop the factor and whatever the library holds."""
+        """Release the factor and the memory of the library."""
 
 
 def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:
-    """Private int32 copies of a pattern of an upper triangle, checked entry by entry."""
+    """Check the pattern of an upper triangle and return private int32 copies."""
     starts, columns = np.array(indptr), np.array(indices)
     if starts.ndim != 1 or columns.ndim != 1 or starts.size == 0 or starts[0] != 0 or starts[-1] != columns.size:
         raise ValueError("indptr must be one-dimensional, start with 0 and end with the number of indices")
@@ -209,7 +209,7 @@ def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pa
         raise ValueError(f"the matrix has {columns.size} entries; at most 2^31 - 1 are supported")
     n = starts.size - 1
     if columns.dtype != np.int32:
-        # What 32 bits do not hold is out of range, and stays so.
+        # Clip indices that do not fit into 32 bits to values that are still out of range.
         columns = np.clip(columns, -1, n).astype(np.int32)
     pattern = starts.astype(np.int32, copy=False), columns
     wrong = wrong_pattern(*pattern)
@@ -228,7 +228,7 @@ _RIGHT, _EMPTY_ROW, _NO_DIAGONAL, _NOT_ASCENDING = range(4)
 
 @compiled
 def wrong_pattern(indptr: Pattern, indices: Pattern) -> int:
-    """What is wrong with the rows of an upper triangle, from 0 to all of the entries: one of the numbers above."""
+    """Check rows of an upper triangle, from 0 to the number of entries; return one of the constants above."""
     n = indptr.size - 1
     if n and np.diff(indptr).min() < 1:
         return _EMPTY_ROW

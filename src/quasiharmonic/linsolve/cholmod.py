@@ -1,4 +1,4 @@
-"""CHOLMOD by way of scikit-sparse, for those who have it. Never a dependency: its supernodal part is under the GPL."""
+"""CHOLMOD through scikit-sparse, if installed. It is not a dependency, because its supernodal part is under the GPL."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.util.arrays import FloatArray
 
-# Up to this many unknowns of a planar mesh the supernodal code does not repay its overhead (18 ms against 30 at 20k).
+# Number of unknowns of a planar mesh below which the simplicial code is faster (18 against 30 ms at 20,000).
 SIMPLICIAL_BELOW = 50_000
 
 
 class Cholmod(LinearSolver):
-    """CHOLMOD through either of scikit-sparse's two interfaces, that of 0.4 and that of 0.5."""
+    """CHOLMOD through the interfaces of scikit-sparse 0.4 and 0.5."""
 
     name = "cholmod"
     requirement = "pip install scikit-sparse (which needs SuiteSparse and a C compiler)"
 
     @classmethod
-    @cache  # to look for what is not there takes as long as to solve for a hundred unknowns
+    @cache  # searching for a missing package takes as long as solving for 100 unknowns
     def present(cls) -> bool:
         """Whether the package scikit-sparse is installed."""
         return find_spec("sksparse") is not None
@@ -34,10 +34,10 @@ class Cholmod(LinearSolver):
         from sksparse import cholmod
 
         self._errors = cholmod.CholmodError
-        # The upper triangle by rows is the lower triangle by columns, which is what CHOLMOD reads by default. A view:
-        # its data are the solver's values.
+        # The upper triangle by rows is the lower triangle by columns, which CHOLMOD reads by default. The matrix is a
+        # view of the solver's values.
         self._matrix = csc_matrix((self._values, self._indices, self._indptr), shape=(self.n, self.n))
-        self._values[self._indptr[:-1]] = 1.0  # 0.5 refuses to look at a matrix that is zero
+        self._values[self._indptr[:-1]] = 1.0  # version 0.5 rejects a zero matrix
         small = self.n < SIMPLICIAL_BELOW
         mode, ordering = ("simplicial", "amd") if small else ("auto", "default")
         if self._ordered:
@@ -54,11 +54,11 @@ class Cholmod(LinearSolver):
             if self._old:
                 self._numeric = self._symbolic
                 self._numeric.cholesky_inplace(self._matrix)
-                # The simplicial code makes an LDLᵀ, and that exists for indefinite matrices as well.
+                # The simplicial code computes LDLᵀ, which exists for indefinite matrices as well.
                 positive = bool(self._numeric.D().min() > 0)
             else:
-                # Factoring leaves a simplicial factor behind, whatever the analysis chose, so each starts from a copy
-                # of the analysis. It asks for LLᵀ, which raises where there is none.
+                # Factoring always leaves a simplicial factor, so each factorisation starts from a copy of the analysis.
+                # It requests LLᵀ, which raises for indefinite matrices.
                 self._numeric = self._symbolic.copy()
                 self._numeric.factorize(self._matrix)
                 positive = self._numeric.rcond > 0
@@ -74,7 +74,7 @@ class Cholmod(LinearSolver):
         elif self._numeric.rcond >= self.n * np.finfo(np.float64).eps:
             x = self._numeric.solve(b)
         else:
-            # It now warns that the diagonal spans many powers of ten. The residual test judges better.
+            # CHOLMOD would warn about a poorly conditioned diagonal. The residual test is more reliable.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 x = self._numeric.solve(b)

@@ -1,10 +1,10 @@
-"""What a factorisation or a solve may end in."""
+"""Errors of factorisations and solves."""
 
 from __future__ import annotations
 
 
 class NotPositiveDefinite(ArithmeticError):  # noqa: N818  (the name says what happened to the matrix, not to the program)
-    """The matrix is not numerically positive definite, or no solution can be vouched for.
+    """Raised if a matrix is not numerically positive definite, or if no solution is accurate enough.
 
-    Callers are expected to handle it: by a shorter step, by adding to the diagonal, by another backend.
+    Callers are expected to handle it with a shorter step, an addition to the diagonal, or another backend.
     """

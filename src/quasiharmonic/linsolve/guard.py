@@ -1,4 +1,4 @@
-"""The residual test that no solution leaves a solver without."""
+"""Residual test of every solution that a solver returns."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.kernels import compiled
 
-# Largest residual that a backward stable factorisation can be held responsible for, relative to |A||x| + |b| after
-# scaling the diagonal to one. Cholesky stays near 1e-15; a factor that is wrong is wrong in the first digits.
+# Maximum residual that a backward stable factorisation can cause, relative to |A||x| + |b| after scaling the diagonal
+# to one. Cholesky stays near 1e-15; a wrong factor fails in the first digits.
 BACKWARD = 1e-10
-# Largest residual relative to |b| alone. When x has become so large that rounding in A x hides b, the matrix is within
-# rounding of a singular one and x means nothing, however small the backward error is.
+# Maximum residual relative to |b| alone. If x is so large that rounding in A x hides b, the matrix is singular up to
+# rounding, and x is meaningless even if the backward error is small.
 FORWARD = 1e-4
 
 
 class ResidualTest:
-    """Judge solutions of A x = b, with A given by its upper triangle.
+    """Test solutions of A x = b, with A given by its upper triangle.
 
-    Sizes are compared after scaling A to a unit diagonal, S A S with S = diag(a_ii)^-1/2, where Cholesky's own error
-    bound, |ΔA_ij| <= c n ε √(a_ii a_jj), is the same number in every row whatever the units of A are.
+    Sizes are compared after scaling A to a unit diagonal, S A S with S = diag(a_ii)^-1/2. Then Cholesky's error bound,
+    |ΔA_ij| <= c n ε √(a_ii a_jj), is the same in every row for any units of A.
 
     Parameters
     ----------
     indptr, indices : (n+1,) and (nnz,) int32 arrays
         Upper triangle in compressed sparse rows, the diagonal entry first in each row.
     values : (nnz,) float64 array
-        Its entries. The array is kept and read anew by `read`.
+        Entries of the matrix. The array is kept; `read` reads it again.
     """
 
     def __init__(self, indptr: NDArray[np.int32], indices: NDArray[np.int32], values: FloatArray) -> None:
@@ -38,12 +38,12 @@ class ResidualTest:
         self._root, self._probe, self._image = np.empty(n), np.empty(n), np.empty(n)
 
     def read(self) -> None:
-        """Take up the values as they are now.
+        """Read the current values.
 
         Raises
         ------
         NotPositiveDefinite
-            A diagonal entry is not positive, or an entry is not finite.
+            If a diagonal entry is not positive, or an entry is not finite.
         """
         indptr, indices, values = self._matrix
         with np.errstate(all="ignore"):
@@ -52,7 +52,7 @@ class ResidualTest:
             raise NotPositiveDefinite(
                 f"the matrix is not positive definite: diagonal entry {worst} is {values[indptr[worst]]:g}"
             )
-        # Every entry went into the image, and if A is positive definite none of its products is larger than √a_ii.
+        # Every entry contributes to the image. If A is positive definite, no product in it exceeds √a_ii.
         if not (np.isfinite(self._image.min()) and np.isfinite(self._image.max())):
             raise NotPositiveDefinite("the matrix is not positive definite: it has entries that are NaN or too large")
 
@@ -63,9 +63,9 @@ class ResidualTest:
     def plausible(self, b: FloatArray, x: FloatArray) -> bool:
         """Whether all columns of x pass a test that needs no product with A.
 
-        For the probe z = S·(random signs), zᵀ(b - A x) = zᵀb - (A z)ᵀx has the size of the scaled residual, and A z is
-        known since `read`: 6 % of the time of a solve instead of 25. A residual that exceeds the limit by a factor q
-        slips through with a chance of about 1/q, and a wrong factor exceeds it by 1e6 and more.
+        For the probe z = S·(random signs), zᵀ(b - A x) = zᵀb - (A z)ᵀx has the size of the scaled residual. A z is
+        known from `read`, so the test takes 6 % of the time of a solve instead of 25 %. A residual that exceeds the
+        limit by a factor q passes with probability about 1/q. A wrong factor exceeds the limit by at least 1e6.
         """
         residual, size_b, size_x = sizes = np.empty((3, b.shape[1]))
         with np.errstate(all="ignore"):
@@ -74,9 +74,9 @@ class ResidualTest:
             return bool(np.all((residual <= limit) & np.isfinite(limit)))
 
     def excess(self, b: FloatArray, x: FloatArray) -> float:
-        """Largest true residual of the columns of x in units of what is allowed; infinite if anything is not finite.
+        """Maximum true residual of the columns of x relative to the limit; infinite if a value is not finite.
 
-        In the maximum norm, which neither over- nor underflows.
+        It uses the maximum norm, which neither overflows nor underflows.
         """
         with np.errstate(all="ignore"):
             size_x = np.abs(self._root[:, None] * x).max(axis=0)
@@ -98,7 +98,7 @@ def probe_matrix(
     probe: FloatArray,
     image: FloatArray,
 ) -> int:
-    """Fill in S⁻¹ as ``root``, z = S·signs and A z; -1, or the first row whose diagonal entry is not positive."""
+    """Fill in S⁻¹ as ``root``, z = S·signs and A z; return -1, or the first row with a non-positive diagonal entry."""
     diagonal = values[indptr[:-1]]
     if not diagonal.min() > 0:
         return int(np.flatnonzero(~(diagonal > 0))[0])
@@ -120,9 +120,9 @@ def _product(indptr: NDArray[np.int32], indices: NDArray[np.int32], values: Floa
 def scaled_sizes(
     root: FloatArray, probe: FloatArray, image: FloatArray, b: FloatArray, x: FloatArray, sizes: FloatArray
 ) -> None:
-    """Fill in, (3, k), ``|zᵀb - (A z)ᵀx|`` and the sizes of S b and S⁻¹ x for each row of b and x, (k, n)."""
+    """Fill in ``|zᵀb - (A z)ᵀx|`` and the sizes of S b and S⁻¹ x, (3, k), for each row of b and x, (k, n)."""
     scaled_b, scaled_x = probe * b, root * x
-    # Not `@`: BLAS would wake its threads for a few microseconds of work.
+    # Avoid `@`: BLAS would wake its threads for a few microseconds of work.
     sizes[0] = np.abs(np.einsum("i,ji->j", image, x) - scaled_b.sum(axis=1))
     sizes[1] = np.sqrt(np.einsum("ji,ji->j", scaled_b, scaled_b))
     sizes[2] = np.sqrt(np.einsum("ji,ji->j", scaled_x, scaled_x))

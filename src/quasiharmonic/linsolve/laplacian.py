@@ -1,8 +1,7 @@
 """The anisotropic Laplacian ``Gᵀ A G`` and the map it determines, A ↦ (u, v): §6.2, equation 12.
 
-The pattern of ``Sᵀ Gᵀ A G S`` is that of the mesh's edges and never changes, so it is found and
-analysed once. An assembly is then one gather of the triangles' edge stiffnesses into the values that
-the factorisation reads.
+The pattern of ``Sᵀ Gᵀ A G S`` is that of the mesh's edges. It does not change, so it is computed and
+analysed once. An assembly then gathers the edge stiffnesses of the triangles into the values of the factorisation.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from quasiharmonic.linsolve.pattern import stiffness_pattern
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, own_triangles
 from quasiharmonic.util.kernels import compiled
 
-# From this many unknowns on they are numbered by dissection. Minimum degree is as good for fewer (10k unknowns: 17 ms
-# to order and analyse, 7 to factor, for both), and there is nothing to do in parallel yet.
+# Number of unknowns from which dissection is used. For fewer unknowns minimum degree is equally good (10,000 unknowns:
+# 17 ms to order and analyse and 7 ms to factor, for both), and parallel work does not pay.
 DISSECT_FROM = 30_000
 
 
 class Laplacian:
     """The pattern of ``Gᵀ A G`` restricted to the free vertices, analysed once for any number of tensor fields A.
 
-    Threads may share it: each gets the answers for its own tensors, though they refactor in turn.
+    Threads may share it. Each gets correct results for its own tensors, but they factor one after another.
 
     Parameters
     ----------
@@ -36,17 +35,17 @@ class Laplacian:
     n : int
         Number of vertices.
     fixed : (k,) int
-        Vertices whose positions are given; the others are solved for.
+        Fixed vertices; the positions of the others are unknowns.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
     points : (n, d) float64, optional
-        Positions of the vertices, by which the free vertices of a large mesh are ordered for the factorisation. They
-        have no other part in it.
+        Positions of the vertices. They determine the elimination order of a large mesh and do not affect the
+        result otherwise.
 
     Attributes
     ----------
     free : (n - k,) int64
-        The other vertices in the order of the unknowns: the columns of the paper's ``S``.
+        Free vertices in the order of the unknowns: the columns of the paper's ``S``.
     """
 
     def __init__(
@@ -74,20 +73,20 @@ class Laplacian:
         self._pattern = pattern = stiffness_pattern(F, self._place(), self.free.size)
         self._values = np.empty(pattern.indices.size)
         self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver, ordered=order is not None)
-        # Whose the one factor is may be asked only while nobody can overwrite it before the solve.
+        # The lock prevents another thread from replacing the factor between its check and the solve.
         self._lock = Lock()
         self._factored: FactoredLaplacian | None = None
         self._F = F
 
     def _place(self) -> NDArray[np.int32]:
-        """Number of the unknown at each vertex, -1 at fixed ones; (n,)."""
+        """Index of the unknown of each vertex, -1 at fixed vertices; (n,)."""
         place = np.full(self.n, -1, dtype=np.int32)
         place[self.free] = np.arange(self.free.size, dtype=np.int32)
         return place
 
     @cached_property
     def _rim(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Half-edges with a fixed vertex, and their tails and heads."""
+        """Half-edges with at least one fixed end, and their tails and heads."""
         corner = np.ascontiguousarray(self._F.T)
         tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
         held = self._place() < 0
@@ -95,7 +94,7 @@ class Laplacian:
         return rim, tail[rim], head[rim]
 
     def factor(self, stiffness: FloatArray) -> FactoredLaplacian:
-        """Assemble and factor.
+        """Assemble and factor the Laplacian for one tensor field.
 
         Parameters
         ----------
@@ -105,12 +104,12 @@ class Laplacian:
         Returns
         -------
         FactoredLaplacian
-            For these tensors, whatever is factored after them.
+            Operator for these tensors; it stays valid when other tensors are factored later.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When rounding leaves no positive definite matrix.
+            If the matrix is not positive definite because of rounding.
         """
         if stiffness.size != self._F.size:
             raise ValueError(f"stiffness must have shape (3, {len(self._F)}), not {stiffness.shape}")
@@ -120,7 +119,7 @@ class Laplacian:
         return made
 
     def _refactor(self, operator: FactoredLaplacian) -> None:
-        """Make the solver's one factor that of an operator; with the lock held."""
+        """Make the solver's factor that of ``operator``. The caller holds the lock."""
         self._factored = None
         of = self._pattern
         assemble(
@@ -138,7 +137,7 @@ class Laplacian:
         self._factored = operator
 
     def _solve(self, operator: FactoredLaplacian, load: FloatArray, out: ComplexArray) -> None:
-        """One solve for both coordinates (2, n - k) with an operator's factor, into the free vertices of a map."""
+        """Solve for both coordinates (2, n - k) with an operator's factor, and write the free vertices of ``out``."""
         with self._lock:
             if self._factored is not operator:
                 self._refactor(operator)
@@ -149,8 +148,8 @@ class Laplacian:
 class FactoredLaplacian:
     """``Gᵀ A G`` for one A, made by `Laplacian.factor`.
 
-    A solver holds one factor at a time. An operator whose factor has been overwritten by a later one's makes it anew
-    when it is asked to solve, which costs time and changes no answer.
+    A solver holds one factor at a time. If a later operator has replaced the factor, the next solve factors again. This
+    costs time and does not change the result.
 
     Parameters
     ----------
@@ -164,17 +163,17 @@ class FactoredLaplacian:
         self.stiffness = stiffness
 
     def extend(self, w: ComplexArray) -> ComplexArray:
-        """The quasi-harmonic map with ``w``'s values at the fixed vertices (eq. 12).
+        """Compute the quasi-harmonic map that equals ``w`` at the fixed vertices (eq. 12).
 
         Parameters
         ----------
         w : (n,) complex128
-            ``u + i v``; only the fixed vertices' values are read.
+            ``u + i v``; only the values at the fixed vertices are used.
 
         Returns
         -------
         (n,) complex128
-            Equal to ``w`` at the fixed vertices, to the last bit.
+            Equal to ``w`` at the fixed vertices in every bit.
         """
         of, pattern, out = self.pattern, self.pattern._pattern, w.copy()
         if w.shape != (of.n,):
@@ -185,7 +184,7 @@ class FactoredLaplacian:
         return out
 
     def respond(self, load: ComplexArray) -> ComplexArray:
-        """Solve ``Sᵀ Gᵀ A G S x = Sᵀ load``: the response to a load, zero at the fixed vertices.
+        """Solve ``Sᵀ Gᵀ A G S x = Sᵀ load``; the solution is zero at the fixed vertices.
 
         Parameters
         ----------
@@ -201,7 +200,7 @@ class FactoredLaplacian:
         return out
 
     def flux(self, w: ComplexArray) -> ComplexArray:
-        """``Gᵀ A G w`` at the fixed vertices, the discrete Neumann data (§6.2), and zero elsewhere.
+        """Compute ``Gᵀ A G w`` at the fixed vertices, the discrete Neumann data (§6.2); zero elsewhere.
 
         Parameters
         ----------
@@ -234,10 +233,10 @@ def assemble(
     border_row: IntArray,
     values: FloatArray,
 ) -> None:
-    """Fill in the values of the upper triangle from the half-edges' stiffness (3 f,), by a `StiffnessPattern`."""
+    """Fill in the upper triangle from the stiffness (3 f,) of the half-edges, by a `StiffnessPattern`."""
     above, size = np.add.reduceat(stiffness[halves], offsets[:-1]), indptr.size - 1
-    # Rows of Gᵀ A G sum to zero, so each half-edge is taken off the diagonal at both of its ends.
-    # Where no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
+    # Rows of Gᵀ A G sum to zero, so each half-edge is subtracted from the diagonal at both of its ends.
+    # If no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
     on = np.bincount(row, above, size).astype(np.float64, copy=False)
     on += np.bincount(column, above, size)
     on += np.bincount(border_row, stiffness[border], size)
@@ -254,7 +253,7 @@ def boundary_load(
     w: ComplexArray,
     load: FloatArray,
 ) -> None:
-    """Fill in both coordinates of the right-hand side (2, n - k), which half-edges to fixed vertices make."""
+    """Fill in both coordinates of the right-hand side (2, n - k), the load from half-edges to fixed vertices."""
     pull = -stiffness[border] * w[border_fixed]
     for coordinate, some in zip(load, (pull.real, pull.imag), strict=True):
         coordinate[:] = np.bincount(border_row, some, load.shape[1])
@@ -262,5 +261,5 @@ def boundary_load(
 
 @compiled
 def put_at(solution: FloatArray, free: IntArray, out: ComplexArray) -> None:
-    """Put both coordinates (2, k) in their places in a map."""
+    """Write both coordinates (2, k) to the free vertices of a map."""
     out.real[free], out.imag[free] = solution

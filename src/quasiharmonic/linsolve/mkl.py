@@ -1,4 +1,4 @@
-"""MKL PARDISO, called through ctypes from the library that the `mkl` wheel brings."""
+"""MKL PARDISO, called through ctypes from the library in the `mkl` wheel."""
 
 from __future__ import annotations
 
@@ -24,15 +24,14 @@ _MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3
 _CLASSIC_TWO_LEVEL, _IMPROVED_TWO_LEVEL = 1, 10
 _INTEL_THREADS = 0
 
-# Below this many unknowns: minimum degree ordering, one thread. Above: dissection, all threads. At 10k METIS takes
-# three times as long to order (25 against 10 ms), and what it then saves, in parallel factorisation, is 1 ms of 4.
-# Small tasks on all threads also suffer badly when the machine is busy with something else, because MKL's threads wait
-# for each other by spinning.
+# Below this number of unknowns: minimum degree ordering and one thread. Above: dissection and all threads. For 10,000
+# unknowns METIS takes 25 ms to order instead of 10 ms and saves 1 ms of 4 ms in parallel factorisation. Small tasks on
+# all threads are also slow on a busy machine, because MKL's threads spin while they wait for each other.
 SEQUENTIAL_BELOW = 30_000
 
-# From 10,000 unknowns on the improved two-level algorithm takes a path that is more than twice as fast (MKL 2024.2 and
-# 2026.2, a planar mesh: 9,801 unknowns are analysed in 9.8 ms and factored in 7.6, 10,201 in 4.8 and 3.0). So matrices
-# a little smaller get unknowns of their own on top, ones on the diagonal: with 10,000 the 9,801 take 5.0 and 2.9 ms.
+# From 10,000 unknowns the improved two-level algorithm is more than twice as fast. For a planar mesh (MKL 2024.2 and
+# 2026.2), 9,801 unknowns take 9.8 ms to analyse and 7.6 ms to factor; 10,201 take 4.8 and 3.0 ms. So slightly smaller
+# matrices are padded to 10,000 unknowns with ones on the diagonal. The 9,801 unknowns then take 5.0 and 2.9 ms.
 FAST_FROM, FILL_UP_FROM = 10_000, 2_500
 
 _NOT_POSITIVE_DEFINITE = {-4, -7}
@@ -70,14 +69,14 @@ class Pardiso(LinearSolver):
         self._entries = values[: self.nnz]
         sequential = self.n < SEQUENTIAL_BELOW
         self.handle = self._begun(indptr, indices, values, sequential)
-        # With several threads and any ordering but METIS's, the improved two-level algorithm's solution of a single
-        # right-hand side is wrong, of two or more right; and a solution on one thread spoils the next factorisation on
-        # several, or crashes it (MKL 2026.2). So it never gets fewer than two.
+        # With several threads and any ordering except METIS's, the improved two-level algorithm solves a single
+        # right-hand side incorrectly; two or more are correct. A solve on one thread then corrupts or crashes the next
+        # factorisation on several threads (MKL 2026.2). So at least two right-hand sides are always passed.
         self._fewest = 1 if sequential or not self.handle.improved else 2
         self._ones = np.ones((self._size, self._fewest), order="F")
 
     def _begun(self, indptr: Pattern, indices: Pattern, values: FloatArray, sequential: bool) -> Handle:
-        """A pattern analysed, by as many threads as there may be now."""
+        """Analyse a pattern with the number of threads that is currently allowed."""
         handle = Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
         self._release_once = weakref.finalize(self, handle.release)
         handle.check(_ANALYSE)
@@ -85,15 +84,15 @@ class Pardiso(LinearSolver):
 
     def _factor(self) -> None:
         if self.handle.threads != self.handle.threads_now:
-            # An instance that is made to work with fewer or more threads than before crashes (MKL 2026.2).
+            # An instance crashes if the number of threads changes (MKL 2026.2), so a new one is made.
             self._release_once()
-            self.handle.threads = 0  # should memory run out now, it is begun anew the next time
+            self.handle.threads = 0  # if memory runs out now, the next call analyses again
             self.handle = self._begun(*self.handle.pattern, self.handle.sequential)
         if self._size > self.n:
             self._entries[:] = self._values
         self.handle.check(_FACTOR)
-        # The improved two-level algorithm takes the root of a negative pivot and goes on. The NaN spreads to all that
-        # depends on it, and half a solve with one right-hand side, 5 % of the factorisation's time, finds it.
+        # The improved two-level algorithm takes the square root of a negative pivot and continues. The NaN spreads to
+        # all dependent entries. A forward solve with one right-hand side detects it, in 5 % of the factorisation time.
         if self.handle.improved:
             forward = np.empty_like(self._ones)
             self.handle.check(_FORWARD_ONLY, self._ones, forward)
@@ -115,10 +114,10 @@ class Pardiso(LinearSolver):
 
 
 class Handle:
-    """One PARDISO instance with its arguments laid out once, so that a call only sets the phase.
+    """One PARDISO instance with prepared arguments, so that a call only sets the phase.
 
-    It keeps the arrays alive whose addresses it holds, and does not know the solver, so that it can outlive it for the
-    moment it takes to release the memory.
+    It keeps the arrays alive whose addresses it stores. It has no reference to the solver, so it can outlive the solver
+    until the memory is released.
     """
 
     def __init__(
@@ -132,15 +131,15 @@ class Handle:
         self._order = order
         self.memory = np.zeros(64, dtype=np.int64)
         self.iparm = np.zeros(64, dtype=np.int32)
-        self.iparm[0] = 1  # take nothing from the defaults
+        self.iparm[0] = 1  # use no defaults
         self.iparm[1] = _MINIMUM_DEGREE if sequential else _PARALLEL_DISSECTION
         self.iparm[4] = ordered
-        # No iterative refinement: zero is off for Cholesky (a negative count refines in extended precision).
+        # No iterative refinement: zero disables it for Cholesky (a negative count refines in extended precision).
         self.iparm[7] = 0
-        # The plain algorithm is slower to factor and takes four times as long for two right-hand sides. The classic
-        # two-level one reports negative pivots but insists on METIS's ordering. The improved one takes any; but on
-        # several threads it may crash at a negative pivot when the order of elimination is a chain, as of a mesh
-        # numbered row by row (MKL 2026.2; never seen in a thousand indefinite matrices ordered by dissection).
+        # The plain algorithm factors more slowly and takes four times as long for two right-hand sides. The classic
+        # two-level algorithm reports negative pivots but requires METIS's ordering. The improved one accepts any
+        # ordering. On several threads it may crash at a negative pivot if the elimination order is a chain, as for a
+        # mesh numbered row by row (MKL 2026.2). This did not happen in 1,000 indefinite matrices ordered by dissection.
         self.improved = sequential or ordered
         self.iparm[23] = _IMPROVED_TWO_LEVEL if self.improved else _CLASSIC_TWO_LEVEL
         self.iparm[34] = 1  # indices count from zero
@@ -165,13 +164,13 @@ class Handle:
 
     @property
     def threads_now(self) -> int:
-        """How many threads the caller allows at this moment, by the environment, threadpoolctl or MKL itself."""
+        """Number of threads that the environment, threadpoolctl or MKL currently allows."""
         return 1 if self.sequential else min(int(self._library.MKL_Get_Max_Threads()), _largest_team())
 
     def check(self, phase: int, b: FloatArray | None = None, x: FloatArray | None = None) -> None:
         """Run one phase and turn its error code into an exception."""
         code = self.call(phase, b, x)
-        # Positive codes are not documented; seen where a pivot came out negative.
+        # Positive codes are not documented; they occur when a pivot is negative.
         if code in _NOT_POSITIVE_DEFINITE or (code > 0 and phase == _FACTOR):
             raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a pivot that is not positive")
         if code:
@@ -179,14 +178,14 @@ class Handle:
             raise MemoryError(text) if code in _OUT_OF_MEMORY else RuntimeError(text)
 
     def release(self) -> None:
-        """Free what PARDISO allocated."""
+        """Release the memory of PARDISO."""
         self.call(_RELEASE, None, None)
 
     def call(self, phase: int, b: FloatArray | None, x: FloatArray | None) -> int:
         self._phase.value = phase
         self._columns.value = 1 if b is None else b.shape[1]
         self._error.value = 0
-        # The setting is local to the calling thread and overrides the environment's; zero takes it back.
+        # The setting is local to the calling thread and overrides the environment's; zero removes it.
         before = self._library.MKL_Set_Num_Threads_Local(self.threads)
         try:
             self._library.pardiso(*self.arguments, _address(b), _address(x), ctypes.byref(self._error))
@@ -199,16 +198,16 @@ def _address(array: FloatArray | Pattern | np.ndarray[tuple[int, ...], np.dtype[
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
-# What in the environment lets OpenMP give fewer threads than are asked for, which MKL does not look at.
+# Environment variables by which OpenMP gives fewer threads than requested; MKL ignores them.
 _TEAM_LIMITS = "OMP_THREAD_LIMIT", "KMP_DEVICE_THREAD_LIMIT", "KMP_ALL_THREADS"
 _NO = "", "0", "false", ".false.", "f", ".f.", "no", "n", "off", "disabled"
 
 
 @cache
 def _largest_team() -> int:
-    """How many threads OpenMP is sure to give. With fewer than it asked for PARDISO hangs for ever (MKL 2026.2).
+    """Number of threads that OpenMP is certain to give. With fewer than requested PARDISO hangs (MKL 2026.2).
 
-    The environment is read once, as OpenMP reads it.
+    The environment is read once, as OpenMP does.
     """
     if os.environ.get("OMP_DYNAMIC", "").strip().lower() not in _NO:
         return 1
@@ -220,7 +219,7 @@ def _largest_team() -> int:
 
 @cache
 def load_mkl() -> ctypes.CDLL:
-    """Load MKL's runtime library, once; raise ImportError if there is none that serves."""
+    """Load MKL's runtime library once; raise ImportError if no suitable library is found."""
     path = find_mkl()
     if path is None:
         raise ImportError("MKL's runtime library mkl_rt was not found; install it with: pip install mkl")
@@ -229,10 +228,10 @@ def load_mkl() -> ctypes.CDLL:
         layer = library.MKL_Set_Interface_Layer(0)
     except (OSError, AttributeError) as error:
         raise ImportError(f"MKL's runtime library {path} does not load: {error}") from error
-    # The environment or another package may already have switched MKL to 64-bit integers, for the whole process.
+    # The environment or another package may have switched MKL to 64-bit integers for the whole process.
     if layer & 1:
         raise ImportError("MKL is set to 64-bit integers (ILP64) in this process; PARDISO is called with 32-bit ones")
-    # Left to itself MKL takes GNU's threads once another package, such as gmsh, has loaded them, and PARDISO crashes.
+    # By default MKL uses GNU threads if another package, such as gmsh, has loaded them, and PARDISO then crashes.
     library.MKL_Set_Threading_Layer(_INTEL_THREADS)
     library.pardiso.restype = None
     return library
@@ -247,13 +246,13 @@ def find_mkl() -> str | None:
 
 
 def candidates() -> Iterator[str]:
-    """Paths where MKL's runtime library lies, the likeliest first, newer versions before older ones."""
+    """Yield candidate paths of MKL's runtime library, likeliest first, newer versions before older ones."""
     for prefix in (sys.prefix, site.getuserbase()):
         found = [
             path for folder in ("lib", "Library/bin") for path in Path(prefix, folder).glob("*mkl_rt*") if _fits(path)
         ]
         yield from map(str, sorted(found, key=_version, reverse=True))
-    # Environments that see the packages of another one.
+    # Environments that use the packages of another environment.
     from importlib.metadata import PackageNotFoundError, files
 
     try:
@@ -269,7 +268,7 @@ def candidates() -> Iterator[str]:
 
 
 def _fits(path: Path) -> bool:
-    """Whether the file is a runtime library by its name: libmkl_rt.so.3, libmkl_rt.2.dylib or mkl_rt.3.dll."""
+    """Whether the file name is that of a runtime library: libmkl_rt.so.3, libmkl_rt.2.dylib or mkl_rt.3.dll."""
     return re.fullmatch(r"(lib)?mkl_rt(\.\d+)?\.(so(\.\d+)*|dylib|dll)", path.name) is not None
 
 

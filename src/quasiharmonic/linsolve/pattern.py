@@ -1,4 +1,4 @@
-"""Where the edge stiffnesses of triangles go: the pattern of ``Sᵀ Gᵀ A G S``, and of what fixed vertices add to it."""
+"""Sparsity pattern of ``Sᵀ Gᵀ A G S``, and assembly lists for the edge stiffnesses of triangles."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from quasiharmonic.util.kernels import compiled
 
 
 class StiffnessPattern(NamedTuple):
-    """The entries of a Laplacian among the free vertices, and the half-edges that they are summed of.
+    """The entries of a Laplacian among the free vertices, and the half-edges summed into each entry.
 
     Half-edge e·f + t is edge e of triangle t, the layout of `ReferenceMesh.edge_stiffness`.
 
     Attributes
     ----------
     indptr, indices : (size + 1,), (size + e,) int32
-        The upper triangle in compressed sparse rows, each of them its diagonal entry and then those above.
+        The upper triangle in compressed sparse rows; each row has its diagonal entry first.
     row, column : (e,) int64
         The entries above the diagonal, row by row.
     halves, offsets : (m,), (e + 1,) int32
-        The half-edges of each of these, ascending, and where they start.
+        Ascending half-edges of each entry above the diagonal, and the start of each list.
     border, border_row, border_fixed : (b,) int64
-        Half-edges between a free and a fixed vertex, ascending; the row of the one, and the other.
+        Ascending half-edges between a free and a fixed vertex, the row of the free vertex, and the fixed vertex.
     """
 
     indptr: NDArray[np.int32]
@@ -41,7 +41,7 @@ class StiffnessPattern(NamedTuple):
 
 
 def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> StiffnessPattern:
-    """Find the pattern.
+    """Find the pattern of the Laplacian of a mesh among its free vertices.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> Stiff
     place : (n,) int32
         Row of every free vertex, -1 at fixed ones.
     size : int
-        How many are free.
+        Number of free vertices.
     """
     F = own_triangles(F)
     check_range("F", F, place.size)
@@ -69,7 +69,7 @@ def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> Stiff
     sizes = np.empty(3, dtype=np.int64)
     find_pattern(F, place, *made, sizes)
     entries, inner, border = sizes.tolist()
-    # What memory is not needed is given back, none of it touched yet.
+    # Release the unused memory, which was never touched.
     lengths = size + 1, size + entries, entries, entries, inner, entries + 1, border, border, border
     arrays: list[NDArray[Any]] = list(made)
     for array, length in zip(arrays, lengths, strict=True):
@@ -92,7 +92,7 @@ def find_pattern(
     border_fixed: IntArray,
     sizes: IntArray,
 ) -> None:
-    """Fill in a `StiffnessPattern`, in arrays that are long enough, and the numbers e, m and b (3,)."""
+    """Fill in a `StiffnessPattern`, in arrays of sufficient length, and the numbers e, m and b (3,)."""
     size = indptr.size - 1
     tail = place[F.T]
     tail, head = tail.ravel(), tail[(1, 2, 0), :].ravel()

@@ -1,4 +1,4 @@
-"""QDLDL, a small LDLᵀ factorisation with wheels for every platform: for small systems where MKL is not installed."""
+"""QDLDL, a small LDLᵀ factorisation with wheels for every platform; for small systems without MKL."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Qdldl(LinearSolver):
 
     name = "qdldl"
     requirement = "pip install qdldl"
-    # It always orders by minimum degree, which breaks ties by number: numbered by dissection, a regular mesh's unknowns
-    # take 1.5 to 2.5 times as long to factor as numbered row by row.
+    # QDLDL always orders by minimum degree, which breaks ties by index. A regular mesh numbered by dissection takes 1.5
+    # to 2.5 times as long to factor as the same mesh numbered row by row.
     takes_order = False
 
     @classmethod
@@ -32,14 +32,14 @@ class Qdldl(LinearSolver):
         import qdldl
         from scipy.sparse import csc_matrix, csr_array
 
-        # QDLDL reads the upper triangle by columns: the same entries in another order.
+        # QDLDL reads the upper triangle by columns, so the entries must be reordered.
         entries = np.arange(self.nnz, dtype=np.float64)
         by_columns = csr_array((entries, self._indices, self._indptr), shape=(self.n, self.n)).tocsc()
         self._source = by_columns.data.astype(np.intp)
-        # It factors what it analyses, so it is given the identity, spelled out on the whole pattern.
+        # QDLDL factors during its analysis, so it gets the identity, stored explicitly on the whole pattern.
         identity = np.zeros(self.nnz)
         identity[self._indptr[:-1]] = 1.0
-        # The package accepts no sparse arrays, only sparse matrices.
+        # The package accepts sparse matrices and rejects sparse arrays.
         data = identity[self._source]
         self._matrix = csc_matrix((data, by_columns.indices, by_columns.indptr), shape=(self.n, self.n))
         self._solver: Any = qdldl.Solver(self._matrix, upper=True)
@@ -50,8 +50,9 @@ class Qdldl(LinearSolver):
             self._solver.update(self._matrix, upper=True)
         except RuntimeError:
             raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is zero") from None
-        # LDLᵀ exists for indefinite matrices as well, and QDLDL goes on after a zero pivot without a word. The signs of
-        # D are the only sound test. They come with a copy of L, a quarter of the factorisation's time.
+        # LDLᵀ exists for indefinite matrices as well, and QDLDL may continue after a zero pivot without an error. Only
+        # the signs of D are a reliable test. QDLDL returns D with a copy of L, which takes a quarter of the
+        # factorisation time.
         pivots = self._solver.factors()[1]
         if not pivots.min() > 0:
             raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is not positive")

@@ -1,12 +1,12 @@
-"""rslab, a supernodal LDLᵀ factorisation in Rust with wheels for every platform: for large systems where MKL is not.
+"""rslab, a supernodal LDLᵀ factorisation in Rust with wheels for every platform; for large systems without MKL.
 
-It is young, so it is never alone. What it fails at in any other way than by finding the matrix indefinite, an error of
-its own or a solution whose residual is wrong, is done again by QDLDL, or by SuperLU where that is not installed either.
+rslab is a young library, so another solver repeats a failed step: QDLDL, or SuperLU if QDLDL is not installed. A step
+fails if rslab reports an error other than an indefinite matrix, or if the residual of its solution is too large.
 
-It is loaded by a thread of its own that never ends. rslab 1.7 brings an allocator, mimalloc 3.3, that keeps the heap of
-the thread that loads it under that thread's identifier, and frees the heap, but not the identifier, when the thread
-ends. The system gives the identifier to a later thread, which then takes the heap that is gone, and the process crashes
-(microsoft/mimalloc#1287; on Linux and macOS). An identifier that stays in use is given to no other thread.
+A separate thread that never ends loads rslab. rslab 1.7 contains the allocator mimalloc 3.3, which stores the heap of
+the loading thread under that thread's identifier. When the thread ends, it frees the heap and keeps the identifier. The
+system may give the identifier to a later thread, which then uses the freed heap and crashes the process
+(microsoft/mimalloc#1287; on Linux and macOS). The identifier of a live thread is not given to another thread.
 """
 
 from __future__ import annotations
@@ -28,30 +28,31 @@ from quasiharmonic.linsolve.qdldl import Qdldl
 from quasiharmonic.linsolve.superlu import SuperLU
 from quasiharmonic.util.arrays import FloatArray
 
-# Minimum fill. Left to itself rslab tries several orders. Its nested dissection takes five times as long to analyse
-# (300,000 unknowns: 3.3 s against 0.3 to 0.6) for a factor that is never twice as quick. It takes no order of ours.
+# Minimum fill. By default rslab tries several orders. Its nested dissection takes five times as long to analyse
+# (300,000 unknowns: 3.3 s against 0.3 to 0.6 s), and its factor is less than twice as fast. rslab accepts no given
+# order.
 _ORDERING = "amf"
-# Supernodes of fewer columns are merged: half of rslab's own number, up to a tenth off factor and solve of large ones.
+# Supernodes with fewer columns are merged. Half of rslab's default saves up to a tenth of factor and solve times.
 _NEMIN = 8
-# Below this many unknowns there is nothing to do in parallel, and from this many threads on no more is gained.
+# Number of unknowns below which threads are of no use, and number of threads above which there is no more gain.
 SEQUENTIAL_BELOW, _MOST_THREADS = 30_000, 4
-# What limits the threads of other libraries limits rslab's in factoring, where it is told a number. Its solves, a tenth
-# of the time, take what RAYON_NUM_THREADS allows, whatever they are told (1.7).
+# Variables that limit the threads of other libraries also limit rslab's factorisation, which accepts a number of
+# threads. Its solves take a tenth of the time and obey only RAYON_NUM_THREADS (rslab 1.7).
 _LIMITS = "OMP_NUM_THREADS", "RAYON_NUM_THREADS"
-# What rslab says of a pivot that is zero, by an exception of no class of its own.
+# Part of rslab's message for a zero pivot; the exception has no class of its own.
 _SINGULAR = "rank-deficient"
 
 _Made = TypeVar("_Made")
-# The process that rslab has worked in first. After a fork it waits for ever for threads that are not there (1.7).
+# The process in which rslab ran first. After a fork rslab waits forever for threads that do not exist (1.7).
 _home: list[int] = []
-# The thread that loads rslab, and what it loads: one entry at most. A forked process looks at neither, see `_home`.
+# The thread that loads rslab, and the loaded module: at most one entry. A forked process uses neither, see `_home`.
 _LOADER = "quasiharmonic: loads rslab"
 _loading: list[Future[Any]] = []
 _lock = threading.Lock()
 
 
 class Rslab(LinearSolver):
-    """LDLᵀ with a minimum fill ordering, multi-threaded for large matrices, the same in every bit on any number."""
+    """LDLᵀ with a minimum fill ordering, multi-threaded for large matrices; bitwise equal for any thread count."""
 
     name = "rslab"
     requirement = "pip install rslab"
@@ -66,7 +67,7 @@ class Rslab(LinearSolver):
     def _analyse(self) -> None:
         from scipy.sparse import csc_matrix
 
-        # The upper triangle by rows is the lower triangle by columns, which is what rslab reads.
+        # The upper triangle by rows is the lower triangle by columns, which rslab reads.
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
         self._symbolic: Any = self._tried(
@@ -76,7 +77,7 @@ class Rslab(LinearSolver):
         self._second: LinearSolver | None = None
 
     def _factor(self) -> None:
-        self._numeric = None  # its memory may serve for the next
+        self._numeric = None  # releases memory for the next factor
         self._numeric = self._tried(lambda: self._symbolic.factor(self._values)) if self._symbolic else None
         if self._numeric is None:
             self._factor_by_another()
@@ -109,7 +110,7 @@ class Rslab(LinearSolver):
             self._second.close()
 
     def _factor_by_another(self) -> None:
-        """Factor the matrix at hand by the backend that stands in for this one."""
+        """Factor the current matrix with the fallback backend."""
         self._numeric = None
         if self._second is None:
             other = Qdldl if Qdldl.present() else SuperLU
@@ -117,7 +118,7 @@ class Rslab(LinearSolver):
         self._second.factor(self._values)
 
     def _tried(self, step: Callable[[], _Made]) -> _Made | None:
-        """What a step of rslab's comes to; None where it fails for no reason that lies in the matrix."""
+        """Run a step of rslab; return None if it fails for a reason other than the matrix."""
         if not _home:
             _home.append(os.getpid())
         if os.getpid() != _home[0]:
@@ -130,19 +131,19 @@ class Rslab(LinearSolver):
                     "the matrix is not positive definite: rslab met a pivot that is zero"
                 ) from None
         except BaseException as error:
-            # A panic, as Rust calls an assertion that does not hold. Its class cannot be imported.
+            # Rust panics on a failed assertion. The exception class cannot be imported.
             if type(error).__name__ != "PanicException":
                 raise
         return None
 
 
 def library() -> Any:
-    """The package rslab, loaded by a thread that lives as long as the process.
+    """Return the package rslab, loaded by a thread that lives as long as the process.
 
     Raises
     ------
     ImportError
-        It cannot be loaded, or something else has loaded it before, perhaps in a thread that has ended.
+        If rslab cannot be loaded, or if other code loaded it before, perhaps in a thread that has ended.
     """
     with _lock:
         if not _loading:
@@ -163,7 +164,7 @@ def _load() -> Future[Any]:
 
 
 def _import_and_stay(loaded: Future[Any]) -> None:
-    """Import rslab, and never end."""
+    """Import rslab and wait forever."""
     try:
         import rslab
 
@@ -174,7 +175,7 @@ def _import_and_stay(loaded: Future[Any]) -> None:
 
 
 def _threads() -> int:
-    """How many threads the machine and the environment allow, and are of use."""
+    """Number of threads that the machine and the environment allow, up to the useful maximum."""
     given = [os.environ.get(name, "").strip() for name in _LIMITS]
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(_MOST_THREADS, here, *(int(text) for text in given if text.isdecimal())))

@@ -1,4 +1,4 @@
-"""SuperLU, which comes with SciPy: the last resort, slower than the others but always there."""
+"""SuperLU, which is part of SciPy: the fallback, slower than the others but always available."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class SuperLU(LinearSolver):
     def _analyse(self) -> None:
         from scipy.sparse import csc_array, csr_array
 
-        # SciPy cannot keep SuperLU's ordering between factorisations. So it is asked for once, on a matrix with the
-        # same pattern that surely factors, and from then on the matrix is handed over already permuted: a third of
-        # the time of ordering anew.
+        # SciPy cannot reuse SuperLU's ordering between factorisations. So the ordering is computed once, on a matrix
+        # with the same pattern that is positive definite. Later matrices are permuted before factoring, which takes a
+        # third of the time of ordering again.
         entries = np.arange(1, self.nnz + 1)
         upper = csr_array((entries, self._indices, self._indptr), shape=(self.n, self.n))
         lower = csr_array((entries, self._indices, self._indptr), shape=(self.n, self.n)).T.tocsr()
@@ -37,7 +37,7 @@ class SuperLU(LinearSolver):
             self._order = np.argsort(ordering.perm_c)
         permuted = full[self._order][:, self._order].tocsc()
         permuted.sort_indices()
-        # Where each entry of the permuted full matrix comes from in the upper triangle.
+        # Index in the upper triangle of each entry of the permuted full matrix.
         self._source = permuted.data - 1
         self._permuted = csc_array((np.zeros(permuted.nnz), permuted.indices, permuted.indptr), shape=full.shape)
         self._lu: Any = None
@@ -55,8 +55,8 @@ class SuperLU(LinearSolver):
             lu = self._splu(self._permuted, "NATURAL")
         except RuntimeError as error:
             raise NotPositiveDefinite(f"the matrix is not positive definite: SuperLU says {error}") from None
-        # With all pivots on the diagonal U = D Lᵀ, and A has as many positive eigenvalues as D positive entries.
-        # SuperLU leaves the diagonal only where a pivot is exactly zero.
+        # With all pivots on the diagonal U = D Lᵀ, and A has as many positive eigenvalues as D has positive entries.
+        # SuperLU leaves the diagonal only if a pivot is exactly zero.
         if not (np.array_equal(lu.perm_r, lu.perm_c) and lu.U.diagonal().min() > 0):
             raise NotPositiveDefinite("the matrix is not positive definite: SuperLU met a pivot that is not positive")
         self._lu = lu

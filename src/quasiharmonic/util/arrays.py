@@ -1,6 +1,6 @@
-"""Arrays: their types, what callers hand over as such, and how their elements are named in messages.
+"""Array types, conversion and checks of arguments, and names of elements in messages.
 
-One wording for each error: whoever takes ``V``, ``F`` or rows of coordinates takes them through here.
+All functions that accept ``V``, ``F`` or rows of coordinates use this module, so that each error has one wording.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class ReadOnly:
-    """What has arrays that nobody may change, in a copy or out of a pickle neither: NumPy forgets it there."""
+    """Base class of objects whose arrays are read-only, also in copies and after unpickling."""
 
     def _read_only(self) -> Iterable[NDArray[Any]]:
-        """The arrays."""
+        """The arrays to protect."""
         raise NotImplementedError
 
     def _seal(self) -> None:
@@ -39,30 +39,30 @@ class ReadOnly:
 
 
 def real_array(name: str, values: ArrayLike) -> FloatArray:
-    """Real numbers of any type as float64, always a copy.
+    """Convert real numbers of any type to float64; always returns a copy. Numbers out of range become infinite.
 
     Raises
     ------
     ValueError
-        When they are no real numbers, or make no array; too large ones become infinite.
+        If the values are not real numbers or do not form an array.
     """
     array = _array(name, values)
     if array.dtype.kind not in "iufb":
         raise ValueError(f"{name} must hold real numbers, not {_held(values, array)}")
     if array.dtype == np.float64:
         return np.array(array, order="C")
-    # A signalling NaN, which is invalid in a conversion, is reported as what is not finite.
+    # A signalling NaN is invalid in a conversion. It is reported later as not finite.
     with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=np.float64, order="C")
 
 
 def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
-    """Integers of any type as int64, a copy unless that is not asked for; nothing at all is an array of none.
+    """Convert integers of any type to int64; returns a copy unless ``copy`` is False. Empty input of any type is valid.
 
     Raises
     ------
     ValueError
-        When they are no integers, make no array, or are larger than any index.
+        If the values are not integers, do not form an array, or exceed 64 bits.
     """
     array = _array(name, values)
     if array.size == 0:
@@ -82,7 +82,7 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
 
 
 def _integers(values: ArrayLike, array: NDArray[Any]) -> NDArray[np.object_] | None:
-    """Integers that NumPy converts to floats or objects, as too large ones are; None when not all are integers."""
+    """Return integers that NumPy converted to floats or objects, as objects; None if not all values are integers."""
     if array.dtype.kind == "f" and not isinstance(values, list | tuple):
         return None
     objects = np.array(values, dtype=object)
@@ -93,7 +93,7 @@ def _integers(values: ArrayLike, array: NDArray[Any]) -> NDArray[np.object_] | N
 
 
 def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
-    """Integers of any size as int64; a ValueError that names the first one that does not fit."""
+    """Convert integers of any size to int64, or raise a ValueError that names the first one that does not fit."""
     for value in integers.flat:
         if not -(2**63) <= int(value) < 2**63:
             raise ValueError(f"{name} refers to vertex {kind_of(value)}, which no mesh has")
@@ -101,15 +101,15 @@ def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
 
 
 class _Unchangeable(np.ndarray):
-    """Owns the memory of what `unchangeable` returns: nobody else has it but as the base of that."""
+    """Owner of the memory of a result of `unchangeable`; only that result refers to it."""
 
 
 def unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """The numbers of an array in memory that nobody can write to.
+    """Return the values of an array in memory that no other code can write to.
 
-    The array itself where `unchangeable` made it, or it is a view of such a one; else a contiguous copy. That an array
-    is not writeable does not prove it: whoever has the base of a view may write, and whoever has the array itself may
-    set its flag again.
+    An array that `unchangeable` made, or a view of one, is returned as it is; any other array is copied. A
+    read-only flag alone is not enough: other code may write through the base of a view, or set the flag of the array
+    back.
     """
     owner = array
     while isinstance(owner, np.ndarray) and not owner.flags.writeable:
@@ -123,17 +123,17 @@ def unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
 
 
 def own_triangles(F: ArrayLike) -> IntArray:
-    """As `triangle_rows`, contiguous and such that nobody can change them: what kernels want."""
+    """Triangles as from `triangle_rows`, contiguous and unchangeable, as kernels require."""
     return unchangeable(triangle_rows(F, copy=False))
 
 
 def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:
-    """Positions in the plane or in space, (n, 2) or (n, 3), finite unless that is not asked for, as float64; a copy.
+    """Convert positions (n, 2) or (n, 3) to float64, finite unless ``finite`` is False; returns a copy.
 
     Raises
     ------
     ValueError
-        When they are not; names the first vertices that are not finite.
+        If the shape is wrong or a vertex is not finite; the message names the first ones.
     """
     array = real_array(name, V)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
@@ -144,12 +144,12 @@ def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> Float
 
 
 def triangle_array(F: ArrayLike, n: int) -> IntArray:
-    """Triangles (f, 3) among ``n`` vertices as int64; a copy.
+    """Convert triangles (f, 3) among ``n`` vertices to int64; returns a copy.
 
     Raises
     ------
     ValueError
-        When there are none, they are no triangles, or refer to vertices that there are not.
+        If there are no triangles, the shape is wrong, or a vertex does not exist.
     """
     array = triangle_rows(F)
     if array.size == 0:
@@ -159,12 +159,12 @@ def triangle_array(F: ArrayLike, n: int) -> IntArray:
 
 
 def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArray:
-    """Any number of triangles (f, 3), and be it none, as int64; what they refer to is not looked at.
+    """Convert any number of triangles (f, 3), also zero, to int64 without a check of the index range.
 
     Raises
     ------
     ValueError
-        When they are no triangles.
+        If the shape is wrong or the values are not integers.
     """
     array = index_array(name, F, copy=copy)
     if array.size == 0:
@@ -175,21 +175,21 @@ def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArr
 
 
 def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = True) -> FloatArray:
-    """Places in the plane, finite unless that is not asked for, as (n, 2) float64; a copy.
+    """Convert positions in the plane to (n, 2) float64, finite unless ``finite`` is False; returns a copy.
 
     Parameters
     ----------
     name : str
-    uv : (n, 2) array, or anything with such a ``uv``, as results have
+    uv : (n, 2) array, or an object with an attribute ``uv``, such as a result
     n : int, optional
-        How many there must be, one for each vertex; any number by default.
+        Required number of rows, one for each vertex; any number by default.
     finite : bool
-        Whether they must be finite.
+        Whether the positions must be finite.
 
     Raises
     ------
     ValueError
-        When they are not; names the first vertices that are not finite.
+        If the shape is wrong or a vertex is not finite; the message names the first ones.
     """
     array = real_array(name, getattr(uv, "uv", uv))
     if array.ndim != 2 or array.shape[1] != 2 or n not in (None, len(array)):
@@ -201,12 +201,12 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
 
 
 def held_vertices(fixed: ArrayLike, n: int) -> IntArray:
-    """Vertices of ``n`` that are held, ``fixed`` everywhere, each once, as (k,) int64; a copy.
+    """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy.
 
     Raises
     ------
     ValueError
-        When they are not; names the first that are none, or are named more than once.
+        If the shape is wrong, a vertex does not exist, or a vertex occurs twice; the message names the first ones.
     """
     array = index_array("fixed", fixed)
     if array.ndim != 1:
@@ -219,12 +219,12 @@ def held_vertices(fixed: ArrayLike, n: int) -> IntArray:
 
 
 def held_places(target: ArrayLike, k: int) -> FloatArray:
-    """Where ``k`` vertices are held, ``target`` everywhere, as (k, 2) float64; a copy.
+    """Convert the target positions of ``k`` fixed vertices to (k, 2) float64; returns a copy.
 
     Raises
     ------
     ValueError
-        When that is not what it is; names the first rows that are not finite.
+        If the shape is wrong or a row is not finite; the message names the first ones.
     """
     array = real_array("target", target)
     if array.shape != (k, 2):
@@ -234,12 +234,12 @@ def held_places(target: ArrayLike, k: int) -> FloatArray:
 
 
 def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
-    """Boundary loops of three vertices or more each, of ``n``, as (l,) int64; copies.
+    """Convert boundary loops of at least three vertices each, among ``n`` vertices, to (l,) int64; returns copies.
 
     Raises
     ------
     ValueError
-        When they are not; names the loop.
+        If a loop is not valid; the message names it.
     """
     if isinstance(loops, str | bytes) or not isinstance(loops, Iterable):
         raise ValueError(f"loops must be a sequence of boundary loops, not {kind_of(loops)}")
@@ -258,7 +258,7 @@ def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
 
 
 def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
-    """Raise a ValueError that names the first rows, such as ``one`` vertex, with NaN or infinite numbers."""
+    """Raise a ValueError that names the first rows with NaN or infinite numbers; ``one``, ``many`` name a row."""
     finite = np.isfinite(rows)
     if not finite.all():
         raise ValueError(f"{name} is not finite at {named(one, many, np.flatnonzero(~finite.all(axis=1)))}")
@@ -267,9 +267,9 @@ def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
 def check_range(
     name: str, indices: IntArray, n: int, one: str = "vertex", many: str = "vertices", *, least: int = 0
 ) -> None:
-    """Raise a ValueError that names the first indices that are no vertex of ``n``, or whatever they stand for.
+    """Raise a ValueError that names the first indices outside ``least … n - 1``; ``one``, ``many`` name an element.
 
-    ``least`` is -1 where that stands for none.
+    ``least`` is -1 if -1 is allowed as a mark.
     """
     if indices.size and (indices.min() < least or indices.max() >= n):
         bad = np.unique(indices[(indices < least) | (indices >= n)])
@@ -286,9 +286,9 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:
-    """An array of what may be one, those of PyTorch and JAX included, or a ValueError that says what it is instead."""
+    """Convert values, including PyTorch and JAX arrays, to an array, or raise a ValueError that says what they are."""
     try:
-        # What offers its memory in no other way is an object to `asarray`.
+        # `asarray` treats objects that offer their memory only by DLPack as scalars.
         if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
             return np.from_dlpack(cast(Any, values))
         return np.asarray(values)
@@ -299,7 +299,7 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
 
 
 def _withheld(name: str, values: Any, error: Exception) -> str:
-    """Why an array of another library does not give its numbers away, and what to do."""
+    """Explain why an array of another library cannot be converted, and what to do."""
     if getattr(values, "requires_grad", False):
         return f"that requires grad, which would be lost here: hand over {name}.detach(), or see quasiharmonic.torch"
     if "Tracer" in type(values).__name__:
@@ -311,7 +311,7 @@ def _withheld(name: str, values: Any, error: Exception) -> str:
 
 
 def _held(values: object, array: NDArray[Any]) -> str:
-    """What an array holds that should hold numbers."""
+    """Describe the elements of an array that should be numbers."""
     if not array.ndim:
         return kind_of(values)
     if array.dtype == object and array.size:
@@ -320,7 +320,7 @@ def _held(values: object, array: NDArray[Any]) -> str:
 
 
 def kind_of(value: object) -> str:
-    """Name what was given, for messages: ``a Trimesh``, ``None``, ``'letter:R'``."""
+    """Describe a value for messages: ``a Trimesh``, ``None``, ``'letter:R'``."""
     if isinstance(value, PathLike):
         value = fspath(value)
     if isinstance(value, Integral) and abs(int(value)) >= 10**80:
@@ -334,36 +334,36 @@ def kind_of(value: object) -> str:
 
 
 def whole_number(name: str, value: Any, *, least: int) -> None:
-    """Raise a ValueError for what is not an integer of at least ``least``."""
+    """Raise a ValueError unless the value is an integer of at least ``least``."""
     if not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, not {kind_of(value)}")
 
 
 def true_or_false(name: str, value: Any) -> None:
-    """Raise a ValueError for what is neither: a word that says no would count as yes."""
+    """Raise a ValueError unless the value is a boolean; a non-empty string such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, not {kind_of(value)}")
 
 
 def not_negative(name: str, value: Any) -> None:
-    """Raise a ValueError for what is not a finite number of at least zero."""
+    """Raise a ValueError unless the value is a finite number of at least zero."""
     if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
         raise ValueError(f"{name} must be a finite number of at least 0, not {kind_of(value)}")
 
 
 def check_callback(callback: Any) -> None:
-    """Raise a ValueError for what is neither callable nor None, before anything is computed that would call it."""
+    """Raise a ValueError unless the callback is callable or None. Called before any work that reports to it."""
     if callback is not None and not callable(callback):
         raise ValueError(f"callback must be callable, or None, not {kind_of(callback)}")
 
 
 def work(force: ComplexArray, displacement: ComplexArray) -> float:
-    """Real inner product ``Re forceᴴ displacement``; not by BLAS, whose threads cost more to wake than this takes."""
+    """Real inner product ``Re forceᴴ displacement``, without BLAS, because waking its threads takes longer."""
     return float((force.real * displacement.real + force.imag * displacement.imag).sum())
 
 
 def counted(one: str, many: str, count: int) -> str:
-    """Say how many of some elements there are: ``1 vertex``, ``7 vertices``."""
+    """Give the number of some elements in words: ``1 vertex``, ``7 vertices``."""
     return f"{count} {one if count == 1 else many}"
 
 

@@ -1,12 +1,12 @@
 """Display of results: one line in a console, a picture in a notebook.
 
-A result does not import the code that draws it. The drawing package is registered here as a function that imports it,
-and that function is called when a result is displayed for the first time.
+A result does not import the code that draws it. Instead the drawing package registers a function that imports it. This
+function is called when a result is displayed for the first time.
 """
 
 from __future__ import annotations
 
-# As of `typing`, whose import would take longer than all else here.
+# Same effect as in `typing`, whose import would dominate the import time of this module.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def register_renderer(loader: Callable[[], Any]) -> None:
     Parameters
     ----------
     loader : callable
-        Called without arguments. What it returns has ``html(result) -> str`` and
+        Called without arguments. It returns an object with ``html(result) -> str`` and
         ``draw(result, kind, **options) -> Figure``.
     """
     global _loader
@@ -32,7 +32,7 @@ def register_renderer(loader: Callable[[], Any]) -> None:
 
 
 class Displayable:
-    """Base of the results that have a short text, a summary and a picture in a notebook."""
+    """Base class of results with a short text, a summary and a notebook picture."""
 
     def summary(self) -> str:
         """Describe the result in a few lines."""

@@ -1,7 +1,8 @@
-"""The caller's callback, heard while work takes long that has no steps of its own to tell.
+"""Progress reports: regular calls of the caller's callback during long work.
 
-Whoever takes a callback is `reports_progress`, and calls it at every step. What may take long in between, wherever it
-is, says now and then that it is `heartbeat`; if nothing has been told for a while, the last step is told once more.
+A public function with a callback is decorated with `reports_progress` and calls the callback at every step. Code that
+may run long between two steps calls `heartbeat` regularly. If no step was reported for `INTERVAL`, `heartbeat` reports
+the last step again.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ import numpy as np
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Seconds after which the last step is told again; half of what is promised.
+# Seconds after which the last step is reported again; half of the documented interval.
 INTERVAL = 0.25
 
 
 class _Hearing:
-    """A callback, and when it was called last."""
+    """A callback and the time of its last call."""
 
     def __init__(self, callback: Callable[[Any], object]) -> None:
         self._callback = callback
@@ -32,9 +33,9 @@ class _Hearing:
 
     def tell(self, step: Any) -> None:
         """Call the callback."""
-        # Once it has raised, what is left to be done is done undisturbed.
+        # If the callback raises, do not call it again while the exception propagates.
         self._told = []
-        # What it does takes part in nothing that is going on here.
+        # Work that the callback does itself must not report to this callback.
         token = _HEARING.set(None)
         try:
             with np.errstate(**self._errors):
@@ -45,7 +46,7 @@ class _Hearing:
             self._when = time.monotonic()
 
     def remind(self) -> None:
-        """Tell the last step again, if there is one and it is long ago."""
+        """Report the last step again if the last call was at least `INTERVAL` ago."""
         if self._told and time.monotonic() - self._when >= INTERVAL:
             self.tell(self._told[0])
 
@@ -54,7 +55,7 @@ _HEARING: ContextVar[_Hearing | None] = ContextVar("hearing", default=None)
 
 
 def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
-    """Have the argument ``callback`` of a function called with its last step again, whenever it has none for long."""
+    """Decorate a function with a ``callback`` argument so that `heartbeat` repeats its last step during long work."""
 
     @wraps(function)
     def hearing(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -73,9 +74,9 @@ def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def heartbeat() -> None:
-    """Say that work goes on, from wherever it may take long: a tenth of a second apart at most.
+    """Report that work continues; long loops call this at least every tenth of a second.
 
-    Whatever the callback raises comes out of here.
+    Exceptions raised by the callback propagate to the caller.
     """
     one = _HEARING.get()
     if one is not None:

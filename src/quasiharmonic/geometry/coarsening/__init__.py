@@ -1,5 +1,5 @@
-"""Coarser meshes of a surface, and the way back to the fine one.
+"""Coarse meshes of a surface, and prolongation of maps to the fine mesh.
 
-The package builds on `geometry.mesh`. Start reading in `levels`; `removal` removes vertices, `prolongation` puts them
-back.
+The package builds on `geometry.mesh`. Start reading in `levels`; `removal` removes vertices, and `prolongation` inserts
+them again.
 """

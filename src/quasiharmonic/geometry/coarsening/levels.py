@@ -1,6 +1,6 @@
-"""Coarse meshes by taking interior vertices out, a fifth of those left at a time.
+"""Coarse meshes by removal of interior vertices, about a fifth of the remaining ones in each round.
 
-The triangles around a vertex form a polygon, its *ring*. When the vertex is taken out, a *fan* of triangles
+The triangles around a vertex form a polygon, its *ring*. When the vertex is removed, a *fan* of triangles
 around one vertex of the ring, the *apex*, fills the polygon:
 
         r₂ ───── r₁            r₂ ───── r₁
@@ -11,10 +11,10 @@ around one vertex of the ring, the *apex*, fills the polygon:
        ╲  ╱     ╲  ╱          ╲       ╲  ╱
         r₄ ───── r₅            r₄ ───── r₅
 
-Any injective map of the mesh without the vertex becomes one of the mesh with it: all of the ring is seen from
-the apex, so next to the apex there is a place for the vertex from where it is seen too (`prolongation`) [1]_.
-So a coarse mesh is not an approximation here. It is the fine problem with fewer unknowns, and a map of it is as
-good as solved; only whether there is one may differ.
+An injective map of the mesh without the vertex always extends to the mesh with it. All of the ring is visible from
+the apex, so it is also visible from a position close to the apex (`prolongation`) [1]_.
+So the coarse mesh poses the same problem with fewer unknowns, and a map of it extends to the fine mesh. However, the
+coarse mesh may have no injective map even if the fine mesh has one.
 
 References
 ----------
@@ -32,14 +32,14 @@ from quasiharmonic.geometry.coarsening.removal import by_degree, fill_rings, rem
 from quasiharmonic.util.arrays import BoolArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# Where so small a share of the vertices is all that a round can take out, it is the last.
+# A round that can remove only this fraction of the vertices is not carried out.
 _FEW = 0.04
-# Where a smaller share of the numbers is of vertices that are left, the others are taken out of the arrays.
+# If fewer than this fraction of the vertices in the arrays remain, the arrays are compacted.
 _SPARSE = 0.7
 
 
 class Removal(NamedTuple):
-    """Vertices of one degree that are taken out together, no two of them neighbours.
+    """Vertices of one degree that are removed together; no two of them are neighbours.
 
     Attributes
     ----------
@@ -54,16 +54,16 @@ class Removal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Coarsening:
-    """A coarse mesh and the way back. Vertices keep the numbers they have in the fine mesh.
+    """A coarse mesh and the removals that led to it. Vertices keep their numbers in the fine mesh.
 
     Attributes
     ----------
     F : (fc, 3) int64
         Triangles of the coarse mesh.
     rounds : list of list of Removal
-        What was taken out, round by round.
+        Removed vertices, round by round.
     levels : dict of int to (f, 3) int64
-        Triangles before some of the rounds: before the first, and whenever half of the vertices have gone.
+        Triangles before some of the rounds: before the first, and whenever half of the vertices have been removed.
     """
 
     F: IntArray
@@ -72,11 +72,11 @@ class Coarsening:
 
 
 def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
-    """Take vertices out until few are left.
+    """Remove vertices until few are left.
 
-    Vertices with few neighbours go first. No new edge ends at a held vertex: it would be a constraint that the
-    fine mesh does not have, since the held vertex must see the other end. So there are no new chords either, and the
-    triangles along the boundary stay about as they are.
+    Vertices with few neighbours are removed first. No new edge ends at a fixed vertex. Such an edge would be a
+    constraint that the fine mesh does not have, because the other end must be visible from the fixed vertex. So there
+    are no new chords, and the triangles along the boundary change little.
 
     Parameters
     ----------
@@ -85,13 +85,13 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
     n : int
         Number of vertices.
     held : (n,) bool
-        Vertices that stay: at least the whole boundary.
+        Fixed vertices: at least the whole boundary.
     goal : int
-        How many vertices to leave; more are left where no other can be taken out.
+        Number of vertices to leave; more are left if no other vertex can be removed.
     """
     names, free, there = np.arange(n), ~held, np.ones(n, dtype=bool)
     dice = np.random.default_rng(0).random(n)
-    # Corner by corner, (3, f): what is done to all first corners at once is done quickly.
+    # Transposed, (3, f), because operations on all first corners are then contiguous.
     T: IntArray = np.ascontiguousarray(F.T)
     rounds: list[list[Removal]] = []
     levels: dict[int, IntArray] = {}
@@ -99,7 +99,7 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
     while left > goal:
         heartbeat()
         if left < _SPARSE * len(names):
-            # Numbers for those that are left alone, in the same order.
+            # Renumber the remaining vertices in the same order.
             T = (np.cumsum(there) - 1).take(T)
             names, free, dice, there = names[there], free[there], dice[there], there[there]
         vertices, rings, of_degree = room_for_round(T)
@@ -119,13 +119,13 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
 
 
 def touching(T: IntArray, marked: BoolArray) -> BoolArray:
-    """Which triangles have a marked corner; (f,) bool."""
+    """Whether each triangle has a marked corner; (f,) bool."""
     corners = marked.take(T)
     return corners[:, 0] | corners[:, 1] | corners[:, 2]
 
 
 def _removals(names: IntArray, vertices: IntArray, rings: IntArray, of_degree: IntArray) -> list[Removal]:
-    """What a round takes out, by the names that vertices have in the fine mesh."""
+    """The removals of a round, with the vertex numbers of the fine mesh."""
     found, done = [], 0
     for some in by_degree(names.take(rings[: of_degree @ np.arange(of_degree.size)]), of_degree):
         found.append(Removal(names.take(vertices[done : done + len(some)]), some))

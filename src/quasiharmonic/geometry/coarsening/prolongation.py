@@ -1,7 +1,8 @@
-"""From a map of a coarse mesh to one of the fine mesh: vertices are put back in the reverse order of their removal.
+"""Prolongation of a map from a coarse mesh to the fine mesh: vertices are inserted in the reverse order of removal.
 
-Each goes where its triangles are best shaped, which is in the middle of its ring where that is convex, and next
-to the apex where nothing else is left. If the coarse map is injective, so is the fine one, but for rounding.
+Each vertex goes to the position where its triangles have the best shape. This is the centre of a convex ring,
+or a position close to the apex if no other is valid. If the coarse map is injective, so is the fine map, up to
+rounding.
 """
 
 from __future__ import annotations
@@ -13,33 +14,34 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
 
-# A triangle's squared sides over twice its area are 2√3 = 3.5 when it is equilateral. Below this on average a vertex
-# has a good place.
+# The sum of the squared sides of a triangle over twice its area is 2√3 ≈ 3.5 if it is equilateral. A vertex whose
+# triangles have a mean below this limit has a good position.
 _GOOD = 8.0
-# Places to try otherwise, besides the ring's middle: so far from the apex towards it, and straight into the ring, in
-# units of the distance to the nearest side; and what is tried where none of these will do. The last one is sure to.
+# Other positions to try: fractions of the way from the apex to the centre of the ring, and distances from the apex into
+# the ring, in units of the distance to the nearest side. The second set is tried if none of the first is valid. Its
+# last position is always valid up to rounding.
 _TOWARDS_MIDDLE, _INWARDS = (0.75, 0.5), (2.0, 1.0, 0.5)
 _LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS = (0.25, 0.1), (8.0, 4.0, 0.25)
-# Rings at a time: what is in work stays in the cache.
+# Rings per block, so that the data stay in the cache.
 _RINGS = 1024
 
 
 def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> ComplexArray:
-    """Carry a map from the coarse mesh to the fine one.
+    """Prolong a map from the coarse mesh to the fine mesh.
 
     Parameters
     ----------
     w : (n,) complex128
-        ``u + i v``, of which the values at the coarse mesh's vertices are read.
+        Map ``u + i v``; only the values at the vertices of the coarse mesh are used.
     coarsening : Coarsening
     held : (n,) bool
-        Vertices that are not moved.
+        Fixed vertices.
 
     Returns
     -------
     (n,) complex128
-        Equal to ``w`` at held vertices. Others are moved on the way, to smooth the map, as far as no triangle
-        is inverted by it.
+        Equal to ``w`` at fixed vertices. Other vertices may move, because the map is smoothed where this inverts no
+        triangle.
     """
     w = w.copy()
     for number in reversed(range(len(coarsening.rounds))):
@@ -52,7 +54,7 @@ def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> Complex
 
 
 def places(ring: ComplexArray) -> ComplexArray:
-    """Where to put a vertex into each ring; (r,) from (r, d), the apex first."""
+    """Position of a vertex in each ring (r, d), the apex first; (r,) complex128."""
     place = np.empty(len(ring), dtype=np.complex128)
     find_places(np.ascontiguousarray(ring), place)
     return place
@@ -60,18 +62,18 @@ def places(ring: ComplexArray) -> ComplexArray:
 
 @compiled
 def find_places(ring: ComplexArray, place: ComplexArray) -> None:
-    """Fill in where to put a vertex (r,) into each ring (r, d), the apex first."""
+    """Fill in the position (r,) of a vertex in each ring (r, d), the apex first."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for start in range(0, len(ring), _RINGS):
             some = ring[start : start + _RINGS]
-            # Corner by corner: rows are too short for NumPy to be quick along them. And in real numbers, products of
-            # which are rounded alike everywhere, as those of complex ones are not.
+            # Transpose to corner by corner, because rows are too short for fast NumPy operations. Use real numbers,
+            # because products of complex numbers are not rounded the same way on all platforms.
             corners = np.ascontiguousarray(some.view(np.float64).reshape(*some.shape, 2).transpose(1, 2, 0))
             place.view(np.float64).reshape(-1, 2)[start : start + _RINGS] = _best(corners).T
 
 
 def _best(ring: FloatArray) -> FloatArray:
-    """Places for rings (d, 2, r), the apex first; (2, r)."""
+    """Positions for rings (d, 2, r), the apex first; (2, r)."""
     place = _sum(ring) / len(ring)
     shape = _shape(place[None], ring)[0]
     poor = np.flatnonzero(~(shape < _GOOD * len(ring)))
@@ -97,7 +99,7 @@ def _best(ring: FloatArray) -> FloatArray:
 def _candidates(
     ring: FloatArray, middle: FloatArray, towards: tuple[float, ...], inwards: tuple[float, ...]
 ) -> FloatArray:
-    """Places (c, 2, r) that rings (d, 2, r), whose middles are given, may be seen from."""
+    """Candidate positions (c, 2, r) in rings (d, 2, r) with the given centres."""
     apex = ring[0]
     arm_x, arm_y = ((ring[1:] - apex)[:, i] for i in (0, 1))
     length = _length(arm_x, arm_y)
@@ -105,8 +107,8 @@ def _candidates(
     turn_x = right_x * left_x + right_y * left_y
     turn_y = right_x * left_y - right_y * left_x
     room = (turn_y / _length(left_x - right_x, left_y - right_y)).min(axis=0)
-    # A fan of positive triangles turns from the first arm to the last; half that turn leads inwards. Half of a
-    # triangle's part of it is where the sum of both its arms' unit vectors points.
+    # A fan of positive triangles turns from the first arm to the last; half that turn points inwards. For one triangle,
+    # the sum of the unit vectors of its two arms points in the direction of half its angle.
     size = length[1:] * length[:-1]
     turn_x /= size
     turn_x += 1
@@ -126,14 +128,14 @@ def _candidates(
 
 
 def _length(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Of vectors."""
+    """Lengths of vectors."""
     square = x * x
     square += y * y
     return np.sqrt(square, out=square)
 
 
 def _shape(place: FloatArray, ring: FloatArray) -> FloatArray:
-    """Squared sides over twice the area, summed over the triangles around each vertex; infinite if one is inverted.
+    """Squared sides over twice the area, summed over the triangles around each vertex; infinite if one is not positive.
 
     Parameters
     ----------
@@ -156,7 +158,7 @@ def _shape(place: FloatArray, ring: FloatArray) -> FloatArray:
 
 
 def _sum(terms: FloatArray) -> FloatArray:
-    """Along the first axis, one after another, as NumPy does it unless there is one number in each."""
+    """Sum over the first axis in order. NumPy uses another order if each term is a single number."""
     total: FloatArray = terms[0].copy()
     for term in terms[1:]:
         total += term
@@ -165,18 +167,18 @@ def _sum(terms: FloatArray) -> FloatArray:
 
 @compiled
 def smooth(w: ComplexArray, F: IntArray, held: BoolArray) -> None:
-    """Move every vertex to the middle of its neighbours, and those back that invert a triangle; in place.
+    """Move every vertex to the centre of its neighbours, and undo moves that invert a triangle; in place.
 
     Parameters
     ----------
     w : (n,) complex128
     F : (f, 3) int64
     held : (n,) bool
-        Vertices that are not moved.
+        Fixed vertices.
     """
     from scipy.sparse import csr_array
 
-    # Of an interior vertex every neighbour is once the head of a half-edge.
+    # Every neighbour of an interior vertex is the head of exactly one half-edge from it.
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     degree = np.bincount(tail, minlength=w.size)
     moving = np.flatnonzero((degree > 0) & ~held)
@@ -194,14 +196,14 @@ def smooth(w: ComplexArray, F: IntArray, held: BoolArray) -> None:
         corners = corners[~back[corners]]
         back[corners] = True
         new[corners] = w[corners]
-        # Only what is around those that have just gone back may be inverted now and was not before.
+        # Only triangles around the restored vertices may have become inverted.
         around = of_vertex[:, corners].indices
         inverted = around[~positive(new, F[around])]
     w[:] = new
 
 
 def positive(w: ComplexArray, T: IntArray) -> BoolArray:
-    """Whether triangles (t, 3) of a map are positive, in floating point; (t,) bool."""
+    """Whether triangles (t, 3) of a map are positive in floating point; (t,) bool."""
     corners = w.take(T)
     x, y = corners.real, corners.imag
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])

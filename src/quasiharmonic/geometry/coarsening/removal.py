@@ -1,7 +1,7 @@
-"""One round of coarsening: which vertices go, and the triangles that fill the rings they leave.
+"""One round of coarsening: choose the vertices to remove, and fill their rings with triangles.
 
-No two vertices that go are neighbours, and no fan brings in an edge that ends at a held vertex, that is there already,
-or that another fan brings in too. So the vertices may be taken out, and put back, in any order.
+No two removed vertices are neighbours. No fan adds an edge that ends at a fixed vertex, that exists already, or that
+another fan adds, too. So the vertices may be removed and inserted in any order.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
-#: Vertices with more neighbours stay until they have lost some.
+#: Maximum number of neighbours of a vertex to remove.
 MOST_NEIGHBOURS = 8
-# Passes in which vertices are chosen for a round.
+# Number of passes that choose the vertices of a round.
 _PASSES = 3
-# How much a neighbour counts in the order of removal, in which a random number from 0 to 1 counts too.
+# Weight of each neighbour in the order of removal, relative to a random number in [0, 1].
 _PER_NEIGHBOUR = 0.35
 
 
 def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Room for vertices, rings and degrees of a round; vertices that are no neighbours have no triangle in common."""
+    """Allocate vertices, rings and degrees of a round. Each triangle belongs to at most one removed vertex."""
     f = T.shape[1]
     vertices, rings, of_degree = (np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
     return vertices, rings, of_degree
@@ -33,26 +33,26 @@ def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 def remove_vertices(
     T: IntArray, free: BoolArray, dice: FloatArray, vertices: IntArray, rings: IntArray, of_degree: IntArray
 ) -> None:
-    """Choose the vertices that one round takes out.
+    """Choose the vertices that one round removes.
 
     Parameters
     ----------
     T : (3, f) int64
         Triangles, corner by corner.
     free : (n,) bool
-        Vertices that may go, and between which there may be new edges; all interior.
+        Vertices that may be removed or get new edges; all interior.
     dice : (n,) float64
-        From 0 to 1, for the order of removal.
+        Random numbers in [0, 1] for the order of removal.
     vertices : (f // 3,) int64
-        Filled with those that go, as far as there are any: by degree, and those of one degree in ascending order.
+        Output: the chosen vertices, sorted by degree, then by index.
     rings : (f,) int64
-        Filled with their neighbours, vertex after vertex, each ring counterclockwise from its apex.
+        Output: their neighbours, vertex after vertex, each ring counterclockwise from its apex.
     of_degree : (MOST_NEIGHBOURS + 1,) int64
-        Filled with how many of the vertices have so many neighbours.
+        Output: the number of chosen vertices of each degree.
     """
     degree = np.bincount(T.ravel(), minlength=free.size)
     chosen = _independent(T, free, degree, dice)
-    # A fan takes edges from the apex's neighbours and gives them to the apex: best if that has few.
+    # A fan moves edges from the apex's neighbours to the apex, so an apex with few edges is best.
     burden = np.where(free, degree + dice, np.inf)
     candidates = []
     for some, around in _rings(T, chosen, degree):
@@ -74,7 +74,7 @@ def remove_vertices(
 
 @compiled
 def fill_rings(T: IntArray, there: BoolArray, rings: IntArray, of_degree: IntArray, filled: IntArray) -> None:
-    """Fill in the triangles after a round: those of T (3, f) whose corners are all there, and the fans of the rings."""
+    """Fill in the triangles after a round: those of T (3, f) with all corners left, and the fans of the rings."""
     kept = there.take(T[0])
     for corner in T[1:]:
         kept &= there.take(corner)
@@ -88,7 +88,7 @@ def fill_rings(T: IntArray, there: BoolArray, rings: IntArray, of_degree: IntArr
 
 
 def by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
-    """Rings that lie one after another, as arrays (r, d), for every d of which there are any."""
+    """Yield concatenated rings as arrays (r, d), for every degree d that occurs."""
     begin = 0
     for d, r in enumerate(of_degree.tolist()):
         if r:
@@ -97,11 +97,11 @@ def by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
 
 
 def _independent(T: IntArray, free: BoolArray, degree: IntArray, dice: FloatArray) -> BoolArray:
-    """A set of free vertices of few neighbours, no two of them neighbours."""
+    """Choose free vertices of few neighbours, no two of them neighbours; (n,) bool."""
     order = np.where(free & (degree > 0) & (degree <= MOST_NEIGHBOURS), dice + _PER_NEIGHBOUR * degree, np.inf)
     chosen = np.zeros(order.size, dtype=bool)
-    # A vertex that comes first in all its triangles is chosen. Further passes over the triangles that have no chosen
-    # corner, where neighbours of chosen ones no longer count, find half as many again.
+    # Choose every vertex that comes first in all its triangles. Further passes use the triangles without a chosen
+    # corner and exclude the neighbours of chosen vertices. They add about half as many vertices.
     for _ in range(_PASSES):
         first, soonest = T[0], order.take(T[0])
         for corner in T[1:]:
@@ -117,7 +117,7 @@ def _independent(T: IntArray, free: BoolArray, degree: IntArray, dice: FloatArra
 
 
 def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Chosen vertices, all interior and no two neighbours, with their rings, degree by degree.
+    """Yield the chosen vertices with their rings, degree by degree; they are interior and no two are neighbours.
 
     Yields
     ------
@@ -135,7 +135,7 @@ def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[I
     columns = [number.take(corner) for corner in T]
     places = [np.flatnonzero(column >= 0) for column in columns]
     columns = [column.take(place) for column, place in zip(columns, places, strict=True)]
-    # Turning the table of entries and vertices on its side sorts by vertex, in a fifth of a sort's time.
+    # Converting the sparse matrix of entries and vertices to columns sorts by vertex in a fifth of the time of a sort.
     entries = sum(place.size for place in places)
     table = (np.ones(entries, dtype=np.int8), np.concatenate(columns), np.arange(entries + 1, dtype=np.int32))
     order = csr_array(table, shape=(entries, vertices.size)).tocsc().indices
@@ -153,14 +153,14 @@ def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[I
         rings = np.empty_like(tails)
         rings[0], rings[1] = tails[0], heads[0]
         for i in range(2, d):
-            # The triangle whose tail is the last vertex found has the next one for its head.
+            # The triangle whose tail is the last vertex found has the next vertex as its head.
             rings[i] = (heads[1:] * (tails[1:] == rings[i - 1])).sum(axis=0)
         yield vertices[done : done + count], rings
         begin, done = begin + d * count, done + count
 
 
 def _from_apex(rings: IntArray, burden: FloatArray) -> IntArray:
-    """Rings (d, r) turned so that they begin with the vertex of least burden."""
+    """Rotate rings (d, r) so that they begin with the vertex of least burden."""
     d, r = rings.shape
     turn = burden.take(rings).argmin(axis=0)
     turned: IntArray = rings.take((turn + np.arange(d)[:, None]) % d * r + np.arange(r))
@@ -168,18 +168,18 @@ def _from_apex(rings: IntArray, burden: FloatArray) -> IntArray:
 
 
 def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[BoolArray]:
-    """Which fans of rings (d, r) bring in only edges that are not there, and that no fan before them claims."""
+    """Whether each fan of rings (d, r) adds only edges that do not exist and that no earlier fan adds."""
     apex = np.concatenate([rings[0].repeat(len(rings) - 3) for rings in candidates])
     other = np.concatenate([rings[2:-1].T.ravel() for rings in candidates])
     claims = edge_keys(apex, other, n)
-    # Edges that are there, of which at most a few are claimed: those from an apex to a vertex that is to have one.
+    # Existing edges that may be claimed: from an apex to a vertex that is to get an edge to an apex.
     tails, heads = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
     tails[apex], heads[other] = True, True
     there = []
     for tail, head in zip(T, T[(1, 2, 0), :], strict=True):
         at = np.flatnonzero(tails.take(tail) & heads.take(head))
         there.append(edge_keys(tail.take(at), head.take(at), n))
-    # Sorted together, with a claim of an edge after the edge.
+    # Sort existing edges and claims together, with a claim after the edge of the same key.
     keys = 2 * np.concatenate([*there, claims])
     keys[keys.size - claims.size :] += 1
     keys.sort()

@@ -1,7 +1,7 @@
-"""Plane curves by arc length, and which boundary vertices slide along them.
+"""Plane curves parametrised by arc length, and the boundary vertices that slide along them.
 
-The package builds on `geometry.exact`. Start reading in `curve`, then `boundary_curves`; `deviation` bounds how far
-edges of the boundary may be from their curve.
+The package builds on `geometry.exact`. Start reading in `curve`, then `boundary_curves`; `deviation` bounds the
+distance between boundary edges and their curve.
 """
 
 from quasiharmonic.geometry.curves.arcs import Arc

@@ -1,4 +1,4 @@
-"""What curves are made of: lines, Bézier curves and elliptic arcs; their points in twice the digits."""
+"""Pieces of curves: lines, Bézier curves and elliptic arcs, and their points evaluated in twice the precision."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.exact.predicates import two_product, two_sum
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, check_finite, real_array
 
-# The longest arc, so that few nodes integrate its length to rounding.
+# Longest arc in radians, so that a few nodes integrate its length to rounding.
 _LONGEST_ARC = np.pi / 4
-# Radians by which a chord's piece bends.
+# Turn of a curve along one chord, in radians.
 _FLAT = 0.1
-# Of its size: a curve slower than this stands still. It does so between its ends where that is at least this far from
-# both in its parameter.
+# Relative to the curve's size, a derivative below SLOW counts as zero. A zero of the derivative is interior if its
+# parameter differs by at least _INSIDE from both ends.
 SLOW, _INSIDE = 1e-9, 1e-6
 # Nodes of Gauss' formula for a length.
 _NODES = 16
@@ -31,9 +31,9 @@ class Arc:
     Attributes
     ----------
     centre, a, b : (2,) float
-        ``a`` and ``b`` of equal length and at right angles make a circle; any others an ellipse.
+        Axes. If they are orthogonal and of equal length, the arc is circular.
     first, last : float
-        Radians; the arc runs clockwise where ``last`` is the smaller.
+        Angles in radians. The arc runs clockwise if ``last`` is smaller.
     """
 
     centre: ArrayLike
@@ -43,24 +43,24 @@ class Arc:
     last: float
 
     def transformed(self, matrix: FloatArray, shift: FloatArray) -> Arc:
-        """The arc after ``x → matrix @ x + shift``, an elliptic arc again."""
+        """The elliptic arc after ``x → matrix @ x + shift``."""
         centre, a, b = (matrix @ np.asarray(x, dtype=np.float64) for x in (self.centre, self.a, self.b))
         return Arc(centre + shift, a, b, self.first, self.last)
 
 
 class Piece(NamedTuple):
-    """A piece as curves keep it.
+    """Internal form of a piece of a curve.
 
     Attributes
     ----------
     degree : int
-        Of a Bézier curve; 0 for an arc.
+        Degree of a Bézier curve; 0 for an arc.
     control : (4,) complex128
-        Control points, or centre and axes; zeros behind.
+        Control points, or centre and axes, padded with zeros.
     angles : (float, float)
-        Of an arc.
+        First and last angle of an arc.
     within : bool
-        Whether it is a later part of an arc.
+        Whether it continues an arc that was split.
     """
 
     degree: int
@@ -70,7 +70,7 @@ class Piece(NamedTuple):
 
 
 def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
-    """Piece ``i`` of a curve, checked; long arcs in several, Bézier curves that turn on the spot in two or three."""
+    """Check piece ``i`` of a curve. Split long arcs, and split Bézier curves at interior zeros of the derivative."""
     if isinstance(piece, Arc):
         rows = [real_array(f"piece {i} of the curve", x) for x in (piece.centre, piece.a, piece.b)]
         if any(row.shape != (2,) for row in rows):
@@ -94,16 +94,16 @@ def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
 
 
 def _four(control: FloatArray) -> ComplexArray:
-    """Control points, or centre and axes (k, 2), as `Piece` has them."""
+    """Control points, or centre and axes (k, 2), in the format of `Piece`."""
     four = np.zeros(4, dtype=np.complex128)
     four[: len(control)] = as_complex(control)
     return four
 
 
 def _cusps(control: FloatArray) -> list[float]:
-    """Parameters within a Bézier curve where its speed is zero, ascending: where it turns back, or comes to a point.
+    """Ascending interior parameters of a Bézier curve with zero speed: turning points and cusps.
 
-    There both coordinates of the derivative vanish: a complex polynomial has a real root.
+    There both coordinates of the derivative vanish, so the complex polynomial has a real root.
     """
     points = as_complex(control - control[0])
     if len(points) < 3:
@@ -120,7 +120,7 @@ def _cusps(control: FloatArray) -> list[float]:
 
 
 def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
-    """The straight lines between points."""
+    """Straight lines between consecutive points."""
     array = real_array("points", points)
     least = 3 if closed else 2
     if array.ndim != 2 or array.shape[1] != 2 or len(array) < least:
@@ -131,7 +131,7 @@ def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
 
 
 def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
-    """Chords into which a piece is taken apart so that each bends little."""
+    """Number of chords of a piece such that the curve turns little along each."""
     if degree == 1:
         return 1
     if degree == 0:
@@ -139,15 +139,15 @@ def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
     sides = np.diff(control[: degree + 1])
     sides = sides[sides != 0]
     bends = np.abs(np.angle(sides[1:] / sides[:-1])).sum()
-    # The handles' bends are spread unevenly over the parameter.
+    # Use more chords for Bézier curves, because the turn is not spread evenly over the parameter.
     return int(max(4, 2 * np.ceil(bends / _FLAT)))
 
 
 def between(control: FloatArray, t: float, u: float) -> FloatArray:
-    """The control points (degree + 1, 2) of a Bézier curve's part from one parameter to another.
+    """Control points (degree + 1, 2) of the part of a Bézier curve between two parameters.
 
-    They are the values of its blossom, de Casteljau's construction with a parameter of its own in each round: k of them
-    are ``u`` and the others ``t``.
+    They are values of its blossom: de Casteljau's construction with a separate parameter in each round. For control
+    point k, k of the parameters are ``u`` and the others ``t``.
     """
     if (t, u) == (0.0, 1.0):
         return control
@@ -161,17 +161,17 @@ def between(control: FloatArray, t: float, u: float) -> FloatArray:
 
 
 def as_complex(points: ArrayLike) -> ComplexArray:
-    """Points (k, 2) as complex numbers (k,)."""
+    """Convert points (k, 2) to complex numbers (k,)."""
     return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
 
 
 def angle_at(angles: FloatArray, t: FloatArray) -> FloatArray:
-    """Angles on arcs (k, 2) at parameters from 0 to 1."""
+    """Angles on arcs with angles (k, 2) at parameters in [0, 1]."""
     return angles[:, 0] + t * (angles[:, 1] - angles[:, 0])
 
 
 def on_bezier(control: FloatArray, t: FloatArray) -> FloatArray:
-    """De Casteljau's construction in twice the digits, rounded; control (k, degree + 1, 2), t (k,)."""
+    """De Casteljau's construction in twice the precision, rounded once; control (k, degree + 1, 2), t (k,)."""
     t = t[:, None]
     high, low = np.moveaxis(control, 1, 0), np.zeros((control.shape[1], len(t), 2))
     u, u_low = two_sum(np.ones_like(t), -t)
@@ -185,10 +185,10 @@ def on_bezier(control: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
-    """``centre + a cos θ + b sin θ`` in twice the digits, rounded; control (k, 4, 2), angle (k,)."""
+    """``centre + a cos θ + b sin θ`` in twice the precision, rounded once; control (k, 4, 2), angle (k,)."""
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    # A cosine and a sine as rounded lie off the unit circle; put back onto it they belong to an angle beside the one
-    # that was meant, which nobody minds.
+    # Rounded cosines and sines lie off the unit circle. The correction moves them back onto it. The result then belongs
+    # to a slightly different angle, which is harmless.
     (cc, cc_low), (ss, ss_low) = two_product(cos, cos), two_product(sin, sin)
     square, square_low = two_sum(cc, ss)
     off = ((square - 1) + (square_low + cc_low + ss_low)) / 2

@@ -1,4 +1,4 @@
-"""Which boundary vertices slide, along which curve, and in which order."""
+"""Boundary curves: assignment of boundary vertices to curves, and their order along the curves."""
 
 from __future__ import annotations
 
@@ -22,40 +22,40 @@ from quasiharmonic.util.arrays import (
     named,
 )
 
-# Of the largest coordinate: a vertex this near to its place is there, and keeps every bit.
+# Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
 _THERE = 2.0**-51
 
 
 class BoundaryCurves:
-    """The outline that boundary vertices slide along: what ``slide=`` takes.
+    """Curves along which boundary vertices slide: the argument ``slide=``.
 
-    Vertices at corners stay, the others glide between them in their order. A vertex not quite on its curve is moved
-    onto it first, and the one nearest to a corner onto the corner, if it is within ``tolerance`` of it. A corner
-    that no vertex is so near to is not kept.
+    Vertices at corners are fixed. The others slide between the corners in their order. A vertex near its curve is first
+    moved onto it. The vertex nearest to a corner is moved to the corner if it is within ``tolerance`` of it. A corner
+    without such a vertex has no effect.
 
     Parameters
     ----------
     curves : sequence of Curve or (k, 2) float, or one of these
         Contours, or single sides; arrays are closed polygons.
     on : mapping from int to int, optional
-        Boundary vertices that are told their curve, by its number. All others are on the curve nearest to them, or, if
-        none is near, stay where they are.
+        Index of the curve for some boundary vertices. Each other vertex is on the nearest curve. It is fixed if no
+        curve is within ``tolerance``.
     fixed : sequence of int
-        Boundary vertices that stay although they could slide.
+        Boundary vertices that are fixed although they could slide.
     corner_angle : float
-        Degrees by which a curve turns at a corner, at the least. The ends of an open curve are corners too; a closed
-        one without any holds nothing, so that all its vertices may go around.
+        Minimum turn of a curve at a corner, in degrees. The ends of an open curve are corners, too. A closed
+        curve without corners has no fixed vertices, so all its vertices may slide around it.
     tolerance : float
-        How far off its curve a vertex may be, as a share of the larger side of all curves.
+        Maximum distance of a vertex from its curve, as a fraction of the larger side of all curves.
 
     Raises
     ------
     ValueError
-        When there is no curve, one is malformed (see `Curve`), or a number is out of range.
+        If there is no curve, a curve is not valid (see `Curve`), or a number is out of range.
 
     Examples
     --------
-    The vertices of a disk's boundary may go around on the circle; of a square, those on its sides slide:
+    Vertices on the boundary of a disk may slide around the circle. On a square, vertices slide along the sides:
 
     >>> round_ = BoundaryCurves([Curve.circle()])
     >>> square = BoundaryCurves([[(0, 0), (1, 0), (1, 1), (0, 1)]])
@@ -92,17 +92,17 @@ class BoundaryCurves:
 
     @classmethod
     def around(cls, loops: Sequence[IntArray], uv: FloatArray, *, fixed: ArrayLike = ()) -> BoundaryCurves:
-        """The polygons of boundary loops in a map (n, 2), each vertex told its own."""
+        """Create the polygons of boundary loops in a map (n, 2), with each vertex assigned to its own polygon."""
         loops = loop_arrays(loops, len(uv))
         on = {int(v): k for k, loop in enumerate(loops) for v in loop}
         return cls([uv[loop] for loop in loops], on=on, fixed=fixed)
 
     def holding(self, vertices: IntArray) -> BoundaryCurves:
-        """The same with further vertices that stay, unless they are told a curve."""
+        """Return a copy with more fixed vertices, except those in ``on``."""
         return self._with(self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on)))))
 
     def among(self, used: IntArray) -> BoundaryCurves:
-        """The same for a mesh of some of the vertices, ascending."""
+        """Return a copy for a submesh with the given vertices, ascending."""
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
         if absent.size:
@@ -114,20 +114,20 @@ class BoundaryCurves:
         return BoundaryCurves(self.curves, on=on, fixed=fixed, corner_angle=self.corner_angle, tolerance=self.tolerance)
 
     def lay(self, loops: Sequence[IntArray], uv: FloatArray) -> Track:
-        """Find every boundary vertex its place.
+        """Find the initial position of every boundary vertex.
 
         Parameters
         ----------
         loops : list of (l,) int64
             Boundary loops.
         uv : (n, 2) float64
-            A map; only its boundary is looked at.
+            A map; only its boundary is used.
 
         Raises
         ------
         ValueError
-            When a vertex is told a curve that it is not on, or is not on the boundary; when none is on any curve; when
-            two are in one place, or follow each other otherwise than along the curve.
+            If a vertex in ``on`` is not on its curve or not on the boundary, or no vertex is on any curve. Also if two
+            vertices have the same position, or neighbours on the boundary are not neighbours on the curve.
         """
         boundary = np.concatenate(loops)
         curve, s = self._found(boundary, uv)
@@ -151,15 +151,15 @@ class BoundaryCurves:
         return Track(chains, places)
 
     def off(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
-        """The boundary vertices that are on no curve, and stay; raises as `lay` does for those told a curve."""
+        """Boundary vertices that are on no curve and are fixed; checks the vertices in ``on`` as `lay` does."""
         boundary = np.concatenate(loops)
         curve, _ = self._found(boundary, uv)
         return boundary[curve < 0]
 
     def _corners(self, one: Curve, places: FloatArray) -> dict[int, float]:
-        """The rows of the boundary's places (b, 2) that are at corners of a curve, and where these are along it.
+        """Rows of the boundary positions (b, 2) that are at corners of a curve, with their lengths along it.
 
-        A corner has the vertex nearest to it, be it on this curve or another, and a vertex one corner.
+        Each corner gets the vertex nearest to it, on this curve or another. A vertex gets at most one corner.
         """
         marks = one.corners(self.corner_angle)
         found = []
@@ -173,7 +173,7 @@ class BoundaryCurves:
         return taken
 
     def _found(self, boundary: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
-        """The curve of each boundary vertex, -1 for none, and where along it."""
+        """Index of the curve of each boundary vertex, -1 if there is none, and its length along the curve."""
         told = index_array("on", list(self.on))
         check_range("on", told, len(uv))
         check_range("fixed", self.fixed, len(uv))
@@ -204,7 +204,7 @@ class BoundaryCurves:
 
 
 def rails_of(slide: bool | BoundaryCurves, loops: Sequence[IntArray], uv: FloatArray) -> BoundaryCurves:
-    """What ``slide=`` means: `BoundaryCurves` themselves, or True for the polygons of the boundary as it is."""
+    """Interpret the argument ``slide``: `BoundaryCurves`, or True for the polygons of the current boundary."""
     if isinstance(slide, BoundaryCurves):
         return slide
     if slide is True:
@@ -221,9 +221,9 @@ class Chain:
     curve : Curve
     vertices : (k,) int64
     s : (k,) float64
-        Where they are at first, increasing.
+        Initial lengths along the curve, increasing.
     sliding : (k,) bool
-        Whether they may go elsewhere.
+        Whether each vertex may slide.
     """
 
     curve: Curve
@@ -232,23 +232,23 @@ class Chain:
     sliding: BoolArray
 
     def every(self, s: FloatArray) -> FloatArray:
-        """Where all vertices are with the sliding ones at ``s``."""
+        """Lengths of all vertices along the curve, with the sliding ones at ``s``."""
         every = self.s.copy()
         every[self.sliding] = s
         return every
 
     def in_order(self, s: FloatArray) -> bool:
-        """Whether the vertices are in their order still with the sliding ones at ``s``."""
+        """Whether the vertices are still in order with the sliding ones at ``s``."""
         every = self.every(s)
         backwards = np.diff(every) <= 0
         if not self.curve.closed:
             return not backwards.any()
-        # Around a closed curve the order begins anew once.
+        # Around a closed curve the lengths decrease exactly once.
         return int(backwards.sum()) + int(every[0] <= every[-1]) == 1
 
 
 class Track:
-    """The vertices that slide, and all that is asked of their curves at once.
+    """All sliding vertices, with the geometry of all curves evaluated together.
 
     Parameters
     ----------
@@ -261,9 +261,9 @@ class Track:
     chains : list of Chain
     uv : (n, 2) float64
     vertices : (k,) int64
-        Those that slide, curve by curve.
+        Sliding vertices, curve by curve.
     s : (k,) float64
-        Where they are at first.
+        Initial lengths along the curves.
     """
 
     def __init__(self, chains: Sequence[Chain], uv: FloatArray) -> None:
@@ -274,15 +274,15 @@ class Track:
         self.s = np.concatenate([chain.s[chain.sliding] for chain in chains])
 
     def every(self, s: FloatArray) -> list[FloatArray]:
-        """Where all vertices of each chain are with the sliding ones at ``s``."""
+        """Lengths of all vertices of each chain, with the sliding ones at ``s``."""
         return [chain.every(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
 
     def position(self, s: FloatArray) -> FloatArray:
-        """Places of the sliding vertices; (k, 2) float64."""
+        """Positions of the sliding vertices; (k, 2) float64."""
         return np.concatenate([curve.position(s[part]) for curve, part in self._parts()])
 
     def frame(self, s: FloatArray, forward: BoolArray) -> tuple[ComplexArray, FloatArray]:
-        """Tangents and curvatures, as `Curve.frame` has them; no tangent where an open curve has ended."""
+        """Tangents and curvatures as from `Curve.frame`; the tangent is 0 beyond the end of an open curve."""
         tangent, curvature = np.empty(s.size, dtype=np.complex128), np.empty(s.size)
         for curve, part in self._parts():
             tangent[part], curvature[part] = curve.frame(s[part], forward[part])
@@ -290,15 +290,15 @@ class Track:
         return tangent, curvature
 
     def advance(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
-        """Places after a step along the curves, as `Curve.advance` has it."""
+        """Lengths after a step along the curves, as from `Curve.advance`."""
         return np.concatenate([curve.advance(s[part], step[part], stop=stop) for curve, part in self._parts()])
 
     def at_kink(self, s: FloatArray) -> BoolArray:
-        """Who is at a kink, or at the end of an open curve."""
+        """Whether each sliding vertex is at a kink or at the end of an open curve; (k,) bool."""
         return np.concatenate([np.isin(s[part], curve.stops) for curve, part in self._parts()])
 
     def in_order(self, s: FloatArray) -> bool:
-        """Whether on every curve the vertices are in their order, and none in one place."""
+        """Whether the vertices of every curve are in order at distinct positions."""
         return all(chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True))
 
     def _parts(self) -> list[tuple[Curve, slice]]:
@@ -309,14 +309,14 @@ class Track:
 
 
 def _move(places: FloatArray, vertices: IntArray, there: FloatArray) -> None:
-    """Put vertices into their places, but for those that are there up to rounding."""
+    """Move vertices to their positions, except those that are there up to rounding."""
     off = np.abs(places[vertices] - there) > _THERE * np.abs(there).max(initial=0)
     moves = off.any(axis=1)
     places[vertices[moves]] = there[moves]
 
 
 def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> None:
-    """Raise when vertices are in one place, or neighbours along the boundary are none along the curve."""
+    """Raise if vertices coincide, or if neighbours along the boundary are not neighbours along the curve."""
     count = chain.vertices.size
     same = np.flatnonzero(np.diff(chain.s) <= 0)
     if same.size:

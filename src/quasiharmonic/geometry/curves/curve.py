@@ -1,8 +1,8 @@
-"""Curves that vertices slide along: lines, Bézier curves and elliptic arcs, joined, and measured by their length.
+"""Curves along which vertices slide: connected lines, Bézier curves and elliptic arcs, parametrised by arc length.
 
-A place on a curve is the length of the way there, ``s``. Positions are evaluated in twice the digits and rounded
-once, so that what slides is on the curve as well as doubles can say it. At a *joint*, where two pieces meet, the curve
-may turn: by an angle that makes it a corner, or by less, which is a kink; there it has a direction on either side.
+A position on a curve is given by ``s``, its arc length from the start. Points are evaluated in twice the precision and
+rounded once, so they are on the curve up to rounding. At a *joint*, where two pieces meet, the curve may turn. A large
+turn is a corner and a smaller one a kink. At both the curve has two directions.
 """
 
 from __future__ import annotations
@@ -28,49 +28,49 @@ from quasiharmonic.geometry.curves.arcs import (
 )
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-# Coordinates between these have squares, and products of four, that neither overflow nor vanish.
+# Squares, and products of four numbers, of coordinates in this range neither overflow nor underflow.
 _LARGEST, _SMALLEST = 1e75, 1e-75
-# Ends nearer than this share of the curve's size meet.
+# Ends closer than this fraction of the curve's size are connected.
 _MEET = 1e-9
-# Bends of fewer radians than this are passed like none at all: what they change in a descent is beyond its tolerance.
+# Smaller turns, in radians, are ignored: their effect on an optimisation is below its tolerance.
 _KINK = 1e-3
-# Where a piece stands still its direction is taken from so short a chord, in its parameter.
+# Step in the parameter of the chord that gives the direction of a piece where its derivative is zero.
 _CHORD = 1e-5
-# Distances between points and chords computed at a time.
+# Number of distances between points and chords computed together.
 _PAIRS = 1 << 20
-# Lengths below this share of the curve's size are rounding.
+# Lengths below this fraction of the curve's size count as rounding.
 _SNAP = 1e-13
-# Parameters of each piece in the table of lengths.
+# Number of parameters of each piece in the table of lengths.
 _TABLE = 32
-# From how far within a piece its end is searched for.
+# Distance in the parameter from an end of a piece at which the search near that end starts.
 _INWARD = 1e-2
-# A parameter that moves by no more than this is at rest.
+# A search for a parameter has converged if the parameter changes by at most this.
 _RESTS = 1e-15
-# Steps of the searches for a parameter by length, and by distance.
+# Maximum number of steps of the searches for a parameter by length, and by distance.
 _MOST_STEPS, _REFINEMENTS = 60, 40
 
 
 class Curve:
-    """A path of pieces, each of which begins where the one before ends.
+    """A plane curve made of pieces, each starting at the end of the previous one.
 
     Parameters
     ----------
     pieces : sequence of (degree + 1, 2) float or Arc
-        Lines and Bézier curves of degree 1 to 3 by their control points, and elliptic arcs. Pieces without length
-        are left out. The curve is closed if it ends where it begins.
+        Lines and Bézier curves of degree 1 to 3 by their control points, and elliptic arcs. Pieces of zero length
+        are dropped. The curve is closed if it ends at its start.
 
     Raises
     ------
     ValueError
-        When a piece is none of these, not finite, or does not begin where the one before ends; when the curve has no
-        length, or coordinates so large or small that their products leave the numbers' range.
+        If a piece has another type, is not finite, or does not start at the end of the previous one. Also if the curve
+        has zero length, or coordinates are so large or small that products overflow or underflow.
 
     Attributes
     ----------
     closed : bool
     length : float
     size : float
-        The larger side of the box around its control points.
+        Larger side of the bounding box.
 
     Examples
     --------
@@ -89,14 +89,14 @@ class Curve:
         self._degree = np.array([part.degree for part in found])
         self._control = np.stack([part.control for part in found])
         self._angles = np.array([part.angles for part in found])
-        # An arc is taken apart for the sake of its length; where it is, is no joint.
+        # Long arcs are split to integrate their length. These splits are not joints.
         self._within = np.array([part.within for part in found])
         self._measure()
         self._join()
 
     @classmethod
     def contour(cls, pieces: Sequence[ArrayLike | Arc]) -> Curve:
-        """The pieces, and if they do not end where they begin a straight line from there to here."""
+        """Create a closed curve from pieces, with a straight line from the end to the start if needed."""
         curve = cls(pieces)
         if curve.closed:
             return curve
@@ -105,21 +105,21 @@ class Curve:
 
     @classmethod
     def polygon(cls, points: ArrayLike) -> Curve:
-        """The closed polygon through (k, 2) points."""
+        """Create the closed polygon through points (k, 2)."""
         return cls(straight(points, closed=True))
 
     @classmethod
     def polyline(cls, points: ArrayLike) -> Curve:
-        """The open polyline through (k, 2) points."""
+        """Create the open polyline through points (k, 2)."""
         return cls(straight(points, closed=False))
 
     @classmethod
     def circle(cls, radius: float = 1.0, centre: ArrayLike = (0.0, 0.0)) -> Curve:
-        """The circle, counterclockwise from its rightmost point."""
+        """Create a circle, counterclockwise from its rightmost point."""
         return cls([Arc(centre, (radius, 0.0), (0.0, radius), 0.0, 2 * np.pi)])
 
     def transformed(self, matrix: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> Curve:
-        """The curve after ``x → matrix @ x + shift``; ``matrix`` (2, 2) or a number, ``shift`` (2,)."""
+        """Transform the curve by ``x → matrix @ x + shift``; ``matrix`` (2, 2) or a number, ``shift`` (2,)."""
         matrix = np.asarray(matrix, dtype=np.float64) * (np.eye(2) if np.ndim(matrix) == 0 else 1.0)
         offset = np.asarray(shift, dtype=np.float64)
         return Curve(
@@ -130,7 +130,7 @@ class Curve:
         )
 
     def section(self, start: float, end: float) -> list[FloatArray | Arc]:
-        """The pieces from one length along the curve to another; on from its beginning if ``end`` is not beyond."""
+        """Pieces between two lengths along the curve; continues past the start if ``end`` is not larger."""
         m = self._degree.size
         (first, last), (begin, stop) = self.place(np.array([start, end]))
         last += m if end <= start else 0
@@ -152,16 +152,16 @@ class Curve:
         return found
 
     def sides(self, angle: float) -> list[Curve]:
-        """The curves from one corner to the next, the first corner's first; the curve itself where it has none.
+        """Split the curve at its corners, starting at the first corner; without corners, return the curve itself.
 
-        ``angle`` as `corners` has it.
+        ``angle`` is as for `corners`.
         """
         marks = self.corners(angle)
         ends = np.roll(marks, -1) if self.closed else marks[1:]
         return [Curve(self.section(*pair)) for pair in zip(marks, ends, strict=False)] or [self]
 
     def position(self, s: FloatArray) -> FloatArray:
-        """Points at lengths (k,) along the curve, rounded once from twice the digits; (k, 2) float64."""
+        """Points at lengths (k,) along the curve, evaluated in twice the precision and rounded once; (k, 2) float64."""
         piece, t = self.place(np.asarray(s, dtype=np.float64))
         found = np.empty((t.size, 2))
         for degree in np.unique(self._degree[piece]):
@@ -176,8 +176,8 @@ class Curve:
     def sampled(self, s: FloatArray, *, exactly: bool = False) -> tuple[ComplexArray, ComplexArray]:
         """Points and unit tangents at lengths of any shape.
 
-        From a table at about these lengths: quick, for measures of shape. Or exactly at them, so that the tangents are
-        the points' derivatives to rounding.
+        By default the lengths are interpolated in a table, which is fast and accurate enough for measures of shape.
+        With ``exactly`` they are exact, so that the tangents are the derivatives of the points up to rounding.
         """
         if self.closed:
             s = np.mod(s, self.length)
@@ -190,18 +190,18 @@ class Curve:
         return self._point(piece, t).reshape(s.shape), self._direction(piece, t)[0].reshape(s.shape)
 
     def frame(self, s: FloatArray, forward: BoolArray) -> tuple[ComplexArray, FloatArray]:
-        """Direction and curvature.
+        """Direction and curvature of the curve.
 
         Parameters
         ----------
         s : (k,) float64
         forward : (k,) bool
-            At a joint: of the piece that begins there, and not of the one that ends.
+            At a joint, whether to use the piece that begins there instead of the piece that ends there.
 
         Returns
         -------
         tangent : (k,) complex128
-            Of length 1, with the curve.
+            Unit tangents in the direction of the curve.
         curvature : (k,) float64
             Positive where the curve turns to the left.
         """
@@ -213,14 +213,14 @@ class Curve:
         return self._direction(piece, np.where(back, 1.0, t))
 
     def advance(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
-        """Go along the curve, around if it is closed, to its end if it is not.
+        """Step along the curve, around a closed one, at most to the ends of an open one.
 
         Parameters
         ----------
         s, step : (k,) float64
-            Where from and how far.
+            Start and signed length of each step.
         stop : bool
-            Go no further than to the next kink.
+            Stop at the next kink.
         """
         found = s + step
         if stop and self.stops.size:
@@ -235,26 +235,27 @@ class Curve:
         return np.where(around < self.length, around, 0.0)
 
     def barred(self, s: FloatArray, forward: BoolArray) -> BoolArray:
-        """Where an open curve has come to its end."""
+        """Whether an open curve has ended in the given direction."""
         return np.where(forward, s >= self.length, s <= 0) & (not self.closed)
 
     def corners(self, angle: float) -> FloatArray:
-        """Where the curve turns by at least so many degrees, and its ends if it has any; ascending."""
+        """Ascending lengths at which the curve turns by at least ``angle`` degrees, with the ends of an open curve."""
         marks = self._starts[:-1][(np.abs(self._turn) >= np.radians(angle)) & ~self._within]
         return marks if self.closed else np.unique(np.append(marks, (0.0, self.length)))
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where along the curve points (k, 2) are nearest to it, and how far from it; (k,) float64 each.
+        """Lengths along the curve of the points nearest to (k, 2) points, and the distances; (k,) float64 each.
 
-        Exact for points on the curve up to rounding, where it does not meet itself; for others as near as chords tell.
+        Exact up to rounding for points on a curve that does not meet itself. For other points the chords select the
+        candidate.
         """
         z = as_complex(points)
         chord, share = self._nearest_chord(z)
         here, at = self._chord_piece[chord], self._chord_first[chord] + share * self._chord_width[chord]
         best = np.full(z.size, np.inf)
         piece, t = here, at
-        # Chords stray from the curve, so near a joint the other piece may be the one; not quite from its end, where it
-        # might stand still.
+        # Chords deviate from the curve, so near a joint the next piece may be nearer. Start a little inside that piece,
+        # because its derivative may be zero at its end.
         for other in (0, -1, 1):
             candidate = here + other
             candidate = candidate % self._degree.size if self.closed else np.clip(candidate, 0, self._degree.size - 1)
@@ -264,7 +265,7 @@ class Curve:
             piece, t = np.where(better, candidate, piece), np.where(better, found, t)
             best = np.minimum(best, away)
         s = self._starts[piece] + self._way(piece, t)
-        # A joint is a joint to the last bit.
+        # Return the exact length of a joint for points at a joint.
         joint = np.concatenate([piece, (piece + 1) % self._degree.size if self.closed else piece + 1])
         for s_joint in joint.reshape(2, -1):
             goal = self._starts[s_joint]
@@ -274,7 +275,7 @@ class Curve:
         return np.where(s < self.length, s, 0.0) if self.closed else s, best
 
     def _measure(self) -> None:
-        """The pieces as powers of the parameter, chords to find nearest points on, and where the pieces begin."""
+        """Compute polynomial coefficients of the pieces, chords for the nearest-point search, and start lengths."""
         a, b, c, d = self._control.T
         by_degree = [(a, 0 * a, 0 * a, 0 * a), (a, b - a, 0 * a, 0 * a), (a, 2 * (b - a), a - 2 * b + c, 0 * a)]
         by_degree.append((a, 3 * (b - a), 3 * (a - 2 * b + c), d - a + 3 * (b - c)))
@@ -302,13 +303,13 @@ class Curve:
             return
         self._starts = np.concatenate([[0.0], np.cumsum(lengths)])
         self.length = float(self._starts[-1])
-        # Lengths at which pieces and their parameters are known: piece 3, t = 0.25 is 3.25.
+        # Table of lengths with piece and parameter in one number: piece 3, t = 0.25 is 3.25.
         piece, nth = np.divmod(np.arange(_TABLE * lengths.size), _TABLE)
         way = self._starts[piece] + self._way(piece, nth / _TABLE)
         self._table = np.append(way, self.length), np.append(piece + nth / _TABLE, float(lengths.size))
 
     def _join(self) -> None:
-        """See that pieces meet, whether the curve is closed, and how it turns at its joints."""
+        """Check that pieces meet; determine whether the curve is closed and its turns at joints."""
         m = self._degree.size
         every = np.arange(m)
         heads, tails = self._point(every, np.ones(m)), self._point(every, np.zeros(m))
@@ -328,16 +329,16 @@ class Curve:
         self.stops = self.corners(np.degrees(_KINK))
 
     def place(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Pieces and parameters, from 0 to 1, at lengths along the curve."""
+        """Piece indices and parameters in [0, 1] at lengths along the curve."""
         piece = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, self._degree.size - 1)
         whole = self._starts[piece + 1] - self._starts[piece]
         way = np.clip(s - self._starts[piece], 0.0, whole)
-        # The table is a good guess, but its last bits may lie beyond the piece.
+        # The table gives a good start, but rounding may put it outside the piece.
         guess = np.clip(np.interp(s, *self._table) - piece, 1e-3, 1 - 1e-3)
         t = np.where((self._degree[piece] == 1) | (way <= 0) | (way >= whole), way / whole, guess)
         open_ = np.flatnonzero((self._degree[piece] != 1) & (t > 0) & (t < 1))
         low, high = np.zeros(open_.size), np.ones(open_.size)
-        # Newton's steps, or halves where these leave what is known to hold the parameter.
+        # Newton's method, with bisection if a step leaves the bracket.
         for _ in range(_MOST_STEPS):
             if not open_.size:
                 break
@@ -354,7 +355,7 @@ class Curve:
         return piece, t
 
     def _way(self, piece: IntArray, t: FloatArray) -> FloatArray:
-        """Length of pieces from their beginning to a parameter; by Gauss' formula where they are curved."""
+        """Length of pieces from their start to a parameter, by Gauss' formula for curved pieces."""
         found = np.abs(self._control[piece, 1] - self._control[piece, 0]) * t
         curved = np.flatnonzero(self._degree[piece] != 1)
         if curved.size:
@@ -365,7 +366,7 @@ class Curve:
         return found
 
     def _point(self, piece: IntArray, t: FloatArray) -> ComplexArray:
-        """Points in plain doubles."""
+        """Points in double precision."""
         a, b, c, d = self._powers[piece].T
         found: ComplexArray = a + t * (b + t * (c + t * d))
         for arc, cos, sin in self._on_arcs(piece, t):
@@ -386,7 +387,7 @@ class Curve:
         return first, second
 
     def _on_arcs(self, piece: IntArray, t: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Which of some places are on arcs, if any is, and the cosines and sines there."""
+        """Yield the indices of points on arcs, if there are any, with the cosines and sines there."""
         arc = np.flatnonzero(self._degree[piece] == 0)
         if arc.size:
             angle = angle_at(self._angles[piece[arc]], t[arc])
@@ -396,7 +397,7 @@ class Curve:
         """Unit tangents and curvatures."""
         first, second = self._derivatives(piece, t)
         speed = np.abs(first)
-        # Where handles coincide with ends the speed is 0, and a short chord says where it goes.
+        # If control points coincide with an end, the derivative is 0 there, and a short chord gives the direction.
         slow = speed <= SLOW * np.abs(self._control[piece]).max(axis=1).clip(self.size)
         if slow.any():
             step = np.where(t < 0.5, _CHORD, -_CHORD)
@@ -407,7 +408,7 @@ class Curve:
         return first / np.abs(first), np.where(slow, 0.0, curvature)
 
     def _nearest_chord(self, z: ComplexArray) -> tuple[IntArray, FloatArray]:
-        """The chord nearest to each point, and how far along it that is, from 0 to 1."""
+        """Index of the chord nearest to each point, and the position on the chord in [0, 1]."""
         side = self._chord_head - self._chord_tail
         chord, share = np.empty(z.size, dtype=np.int64), np.empty(z.size)
         portion = max(1, _PAIRS // side.size)
@@ -420,7 +421,7 @@ class Curve:
         return chord, share
 
     def _refined(self, piece: IntArray, t: FloatArray, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """The parameter of the piece's point nearest to each of some points, by Newton's method, and the distance."""
+        """Parameter of the nearest point of a piece to each given point, by Newton's method, and the distance."""
         t, least = t.copy(), np.abs(self._point(piece, t) - z)
         best, going = t.copy(), np.arange(z.size)
         for _ in range(_REFINEMENTS):
@@ -437,7 +438,7 @@ class Curve:
             better = found < least[going]
             best[going[better]], least[going[better]] = there[better], found[better]
             t[going] = there
-            # Most rest after four steps; next to where a piece stands still they take ten times as many.
+            # Most points converge in four steps; near a zero of the derivative it takes ten times as many.
             going = going[np.abs(there - here) > _RESTS]
             if not going.size:
                 break

@@ -1,13 +1,13 @@
-"""How far the boundary's edges stray from the curves that their ends slide along, kept in bounds.
+"""Barrier on the deviation of boundary edges from the curves along which their ends slide.
 
-Vertices that slide would leave a bend that costs energy, and the edge between the last two would cut it off: the
-polygon of the boundary would no longer be the outline. So an edge may stray from its stretch of the curve no further
-than the worst one does at the start, or once every vertex has gone halfway to the next, and a fifth as far again. On K
-points of the stretch, at distances dₖ from the edge's line,
+Sliding vertices tend to leave a bend if it costs energy. The edge across the bend then cuts it off, and the
+boundary polygon no longer follows the outline. So the deviation of every edge from its section of the curve is bounded.
+The bound is 1.2 times the largest initial deviation, or that after all vertices have moved halfway to the next one,
+whichever is larger. With K points of the section at distances dₖ from the edge's line,
 
     m = Σₖ dₖ² / K        barrier = −log(1 − m/M) − m/M        with M the bound,
 
-which is next to nothing until m comes close to M. Second derivatives are those of Gauss and Newton, never negative.
+which is negligible unless m is close to M. Second derivatives are Gauss-Newton approximations, positive semidefinite.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from quasiharmonic.geometry.curves.boundary_curves import Chain, Track
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Where along the stretch, as shares of it.
+# Sample points on a section, as fractions of its length.
 _SHARES = np.arange(1, 8) / 8
-# How far an edge may stray, in units of the worst at the start.
+# Maximum deviation of an edge relative to the largest initial deviation.
 _ALLOWED = 1.2
-# Squares of distances below this share of the curve's size squared are rounding: the curve is straight there.
+# Squared deviations below this fraction of the squared size of the curve are rounding: the curve is straight.
 _STRAIGHT = 1e-18
 
 
 class DeviationBarrier:
-    """The barrier of all edges between neighbours on a curve, by the sliding vertices' lengths.
+    """Barrier of all edges between neighbours on a curve, as a function of the lengths of the sliding vertices.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ class DeviationBarrier:
     loops : sequence of (l,) int64
         Boundary loops.
     exactly : bool
-        Take points of the curves exactly at their lengths, and not quickly at about these: slopes are then the
-        derivatives of values to rounding.
+        Evaluate curves exactly at the given lengths instead of by a fast interpolation. Gradients are then
+        the derivatives of values up to rounding.
 
     Attributes
     ----------
     pairs : (e, 2) int64
-        The sliding vertices at the edges' ends, as positions in ``track.vertices``; -1 for one that is held.
+        Sliding vertices at the ends of the edges, as indices into ``track.vertices``; -1 for a fixed vertex.
     """
 
     def __init__(self, track: Track, loops: Sequence[IntArray], *, exactly: bool = False) -> None:
@@ -75,12 +75,12 @@ class DeviationBarrier:
         self.pairs: IntArray = np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
     def value(self, s: FloatArray) -> float:
-        """The barrier's mean over the edges; ``inf`` where one strays too far."""
+        """Mean barrier over the edges; ``inf`` if an edge exceeds its bound."""
         total = sum(float(_barrier(share)[0].sum()) for share, _, _ in self._shares(s))
         return total / max(len(self.pairs), 1)
 
     def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """First and second derivatives of the mean by the lengths at each edge's ends.
+        """First and second derivatives of the mean barrier by the lengths at the ends of each edge.
 
         Returns
         -------
@@ -99,7 +99,7 @@ class DeviationBarrier:
         return np.concatenate(slopes) / count, np.concatenate(bends) / count
 
     def _shares(self, s: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """``m/M`` of the edges on each curve, and its first and second derivatives by the ends' lengths."""
+        """``m/M`` of the edges on each curve, with first and second derivatives by the lengths of the ends."""
         found, every = [], self._track.every(s)
         for (k, tail, head), bound in zip(self._edges, self._bounds, strict=True):
             share, by_ends, by_both = _strayed(
@@ -110,13 +110,14 @@ class DeviationBarrier:
 
 
 def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
-    """The most that an edge strays, squared: at the start, or with sliding vertices halfway to the next."""
+    """Largest squared deviation of an edge, initially or with sliding vertices halfway to the next."""
     if not tail.size:
         return 0.0
     here, there = chain.s[tail], chain.s[head]
     found = _strayed(chain, here, there)[0].max()
     middle = here + 0.5 * ((there - here) % chain.curve.length)
-    # Only edges that follow each other at a vertex that slides have a middle edge; a corner is not cut off.
+    # Halfway positions are used only for two consecutive edges with a sliding vertex between them, so that no corner is
+    # cut off.
     order = {int(i): k for k, i in enumerate(tail)}
     links = [(order[int(i)], k) for k, i in enumerate(tail) for i in [head[k]] if int(i) in order and chain.sliding[i]]
     if links:
@@ -128,7 +129,7 @@ def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
 def _strayed(
     chain: Chain, begin: FloatArray, end: FloatArray, *, exactly: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean squares of distances between stretches (e,) of a curve and their chords, with derivatives by both ends."""
+    """Mean squared distances between sections (e,) of a curve and their chords, with derivatives by both ends."""
     curve = chain.curve
     gap = (end - begin) % curve.length if curve.closed else end - begin
     shares = np.concatenate([[0.0], _SHARES, [1.0]])

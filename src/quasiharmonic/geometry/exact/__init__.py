@@ -1,5 +1,5 @@
-"""Exact decisions on coordinates as stored: orientation, crossings, the certificate, point location.
+"""Exact tests on coordinates as stored: orientation, crossings, the certificate, point location.
 
-The package builds on `geometry.mesh`. Start reading in `predicates` for the arithmetic, and in `certificate` for
-the verdict on a map.
+The package builds on `geometry.mesh`. Start reading in `predicates` for the arithmetic, and in `certificate` for the
+certificate of a map.
 """

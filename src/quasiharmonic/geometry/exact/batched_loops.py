@@ -1,8 +1,8 @@
-"""Exact verdicts on many small maps at once, for less than each would cost alone.
+"""Exact certificates of many small maps at once, at a lower cost than one by one.
 
-Most maps that are judged are good ones of a surface with one boundary loop. That these are bijective is said by two
-exact tests, of triangles and of pairs of boundary edges, that many maps can share: if all triangles are positive and
-the only loop is simple, there is nothing else to ask (`certify`). What is any different is handed to that, map by map.
+Most maps are valid and have one boundary loop. A map is bijective if all triangles are positive and its only loop is
+simple (`certify`). These two exact tests of triangles and boundary edges run on all maps together. `certify` then
+checks the remaining maps one by one.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, unchangeable
 def certify_each(
     F: Sequence[IntArray], uv: Sequence[FloatArray], loops: Sequence[Sequence[IntArray]]
 ) -> list[Certificate]:
-    """Judge maps exactly, each by itself: what `certify` says of each.
+    """Certify maps exactly; each result equals that of `certify`.
 
     Parameters
     ----------
     F : sequence of (f, 3) int64
         Triangles of each surface.
     uv : sequence of (n, 2) float64
-        Places of its vertices.
+        Positions of the vertices of each surface.
     loops : sequence of sequences of (l,) int64
-        Its boundary loops, as `boundary_loops` gives them; taken on trust.
+        Boundary loops of each surface, as returned by `boundary_loops`; not checked.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def certify_each(
 
 
 def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certificate:
-    """The verdict on a map of which nothing bad is to be said."""
+    """Certificate of a bijective map."""
     none = np.empty(0, dtype=np.int64)
     return Certificate(
         triangles=len(F),

@@ -1,26 +1,26 @@
-"""Exact verdict on a map of a triangle mesh into the plane.
+"""Exact certificate of a map of a triangle mesh into the plane.
 
-A map is *injective* here when every triangle is strictly positive, which is decided exactly on the
-coordinates as stored. It is *bijective* onto its image when, in addition, no two points of the
-surface share a place. That is read off the boundary alone:
+A map is *injective* when every triangle is strictly positive. This is verified exactly on the coordinates as stored.
+It is *bijective* onto its image when, in addition, no two points of the surface have the same image. The boundary
+alone decides this:
 
-    Let all triangles of a compact oriented surface be positive. Around a point of the plane that is
-    on no edge's image, the boundary's image winds as often as the point has preimages: both are the
-    degree of the map there [1]_. So the map is bijective if and only if the images of the boundary
-    loops are simple and mutually disjoint and wind 0 or 1 times around every point off them.
+    Let all triangles of a compact oriented surface be positive. Take a point of the plane that lies on no edge's
+    image. The winding number of the boundary's image around the point equals the number of its preimages, because
+    both are the degree of the map there [1]_. So the map is bijective if and only if the images of the boundary loops
+    are simple and mutually disjoint, and their winding number is 0 or 1 around every point off them.
 
-    (*Only if*: a bijective map keeps loops simple and apart, and no point has two preimages. *If*:
-    almost no point has two preimages. Two points of the surface at one place, of which one is
-    interior, would have neighbourhoods whose images overlap in an open set, all of it covered twice;
-    two boundary points at one place are excluded by the loops being simple and disjoint. For the
-    same reason the triangles around an interior vertex wind around it once: where they wind twice,
-    as positive triangles can, the points nearby are covered twice.)
+    *Only if*: a bijective map keeps loops simple and disjoint, and no point has two preimages.
 
-Nothing in this asks how many components the surface has, nor its genus: a surface that cannot lie in
-the plane fails the test. For loops that are simple and disjoint the winding numbers are a matter of
-nesting: with none or two or four loops around it a loop must run counterclockwise, with one or three
-clockwise. For a connected surface this leaves one counterclockwise loop around all others. Which of
-its loops that is does not matter; an annulus turned inside out is as bijective as before.
+    *If*: almost no point has two preimages. Suppose two points of the surface had the same image. If one of them is
+    interior, the images of their neighbourhoods overlap in an open set, which is covered twice. If both are on the
+    boundary, the loops are not simple and disjoint. For the same reason the triangles around an interior vertex wind
+    around it once: positive triangles can wind twice, but then they cover the points nearby twice.
+
+The criterion does not depend on the number of components or on the genus. A surface that cannot lie in the plane fails
+the test. For simple, disjoint loops the winding numbers follow from the nesting. A loop inside an even number of loops
+must run counterclockwise, and a loop inside an odd number clockwise. For a connected surface this leaves one
+counterclockwise loop around all others. Any of its loops may be the outer one: an annulus turned inside out is still
+bijective.
 
 References
 ----------
@@ -60,38 +60,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(ReadOnly, Displayable):
-    """What was decided exactly about a map; made by `certify`.
+    """Result of the exact test of a map; returned by `certify`.
 
     Attributes
     ----------
     triangles : int
-        Number of triangles judged.
+        Number of triangles.
     inverted, degenerate, nonfinite : (k,) int64
-        Ascending indices of the triangles that are clockwise, that have exactly no area (a repeated
-        vertex included), and that have a NaN or infinite coordinate and so no orientation.
+        Ascending indices of triangles. Inverted triangles are clockwise. Degenerate triangles have exactly zero area;
+        they include those that repeat a vertex. Nonfinite triangles have a NaN or infinite coordinate.
     bijective : bool or None
-        Whether the map is injective and covers no point twice; None when it was not asked for.
+        Whether the map is injective and covers no point twice; None if the boundary was not checked.
     reasons : tuple of Reason
-        Why the map is not bijective. The loops are judged also where triangles are inverted.
+        Why the map is not bijective. The loops are checked even if triangles are inverted.
     loops : tuple of (l,) int64
         Boundary vertices, loop by loop, the surface to the left.
     crossings : (m, 4) int64
         Rows ``i, j, k, l``: the boundary edges ``i → j`` and ``k → l`` share a point that they should
         not share. At most 1000 are listed.
     multiply_wound : (k,) int64
-        Vertices, all triangles around them positive, whose angles add up to more than 2π. Around an interior vertex
-        they then wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
+        Vertices with only positive triangles around them whose angles add up to more than 2π. At an interior vertex the
+        triangles wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
     F : (f, 3) int64
     uv : (n, 2) float64
-        What was judged: the certificate's own copies. No array here is writeable.
+        Triangles and map that were checked, as copies. All arrays are read-only.
 
     Notes
     -----
-    Where all triangles around a vertex are positive, the map is locally injective at it if and only if their angles add
-    up to 2π, around an interior vertex, or to less than 2π, at a boundary vertex. Around an interior vertex the sum is
-    a multiple of 2π. At a boundary vertex it may be 2π exactly: then the two boundary edges there lie on each other,
-    which `crossings` has, and the vertex is not multiply_wound. This is decided exactly; where the boundary was not
-    judged (`bijective` is None), or the mesh is not a surface, `multiply_wound` is empty.
+    Suppose all triangles around a vertex are positive. At an interior vertex the sum of their angles is a multiple of
+    2π, and the map is locally injective if and only if it is 2π. At a boundary vertex the map is locally injective if
+    and only if the sum is less than 2π. A sum of exactly 2π means that the two boundary edges lie on each other. Then
+    `crossings` lists them, and `multiply_wound` does not contain the vertex. The test is exact. `multiply_wound` is
+    empty if the boundary was not checked (`bijective` is None) or if the mesh is not a surface.
     """
 
     triangles: int
@@ -123,11 +123,11 @@ class Certificate(ReadOnly, Displayable):
 
     @property
     def injective(self) -> bool:
-        """Whether there are triangles and every one is strictly positive."""
+        """Whether there is at least one triangle and every triangle is strictly positive."""
         return self.triangles > 0 and not (self.inverted.size or self.degenerate.size or self.nonfinite.size)
 
     def summary(self) -> str:
-        """Say in a sentence or two what is certified, or what is wrong and where."""
+        """Describe in one or two sentences what is certified, or what is wrong and where."""
         further = [r.text for r in self.reasons if r.kind is not Obstacle.NOT_INJECTIVE]
         if self.injective:
             all_of_them = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
@@ -153,12 +153,12 @@ class Certificate(ReadOnly, Displayable):
         return f"injective{also}, {triangles}"
 
     def plot(self) -> Figure:
-        """Draw the map that was judged, triangles that are not positive in red, boundary edges that meet marked."""
+        """Draw the certified map, with non-positive triangles in red and marks on boundary edges that meet."""
         figure: Figure = self._draw("certificate")
         return figure
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything in plain Python types, fit for JSON; of a loop, its first vertex and its length."""
+        """Return the certificate in plain Python types, fit for JSON; each loop as its first vertex and its length."""
         return {
             "injective": self.injective,
             "bijective": self.bijective,
@@ -177,7 +177,7 @@ class Certificate(ReadOnly, Displayable):
 def certify(
     F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[ArrayLike] | None = None
 ) -> Certificate:
-    """Decide whether the map of an array of triangles is injective and bijective; as `quasiharmonic.certify`."""
+    """Verify whether the map of an array of triangles is injective and bijective; as `quasiharmonic.certify`."""
     true_or_false("boundary", boundary)
     F, uv = _taken(F, uv)
     given = None if loops is None else loop_arrays(loops, len(uv))
@@ -198,8 +198,8 @@ def certify(
     if boundary and len(F):
         known, broken = _loops(F, len(uv)) if given is None else (given, [])
         reasons += broken
-        # If all triangles are positive and the only loop is simple, then it encloses the sum of their areas, so it runs
-        # counterclockwise and winds once around what it encloses, and nothing is left to ask.
+        # If all triangles are positive and the only loop is simple, the loop encloses the sum of their areas. So it
+        # runs counterclockwise and winds once around its inside, and no further test is needed.
         plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
         if not broken and not plain:
             multiply_wound = overwound_vertices(F, uv, sign, known)
@@ -231,25 +231,25 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
 
 
 def inverted_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
-    """The triangles of an array that are not strictly positive; as `quasiharmonic.inverted_triangles`."""
+    """Indices of the triangles that are not strictly positive; as `quasiharmonic.inverted_triangles`."""
     return np.flatnonzero(triangle_signs(*_taken(F, uv))[0] <= 0)
 
 
 def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
-    """Triangles as int64 and places as float64, or a ValueError that says what is wrong with them."""
+    """Convert triangles to int64 and positions to float64; raise ValueError if this is not possible exactly."""
     triangles = own_triangles(F)
     given = getattr(uv, "uv", uv)
     places = map_array("uv", given, finite=False)
     rounded = _rounded(given, places)
     if rounded.size:
-        # A vertex that is not there is the plainer mistake.
+        # Report a vertex that does not exist first: it is the simpler mistake.
         check_range("F", triangles, len(places))
         raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rounded)}")
     return triangles, places
 
 
 def _rounded(given: ArrayLike, places: FloatArray) -> IntArray:
-    """Vertices whose places (n, 2) may not be what was given: of other types double does not have all values."""
+    """Indices of vertices whose positions (n, 2) may differ from the input because double precision rounded them."""
     stored = np.asarray(given)
     if stored.dtype.kind == "f" and stored.dtype.itemsize > 8:
         return np.flatnonzero(((places != stored) & ~np.isnan(places)).any(axis=1))
@@ -257,20 +257,20 @@ def _rounded(given: ArrayLike, places: FloatArray) -> IntArray:
         return np.empty(0, dtype=np.int64)
     large = np.argwhere(np.abs(places) >= 2.0**53)
     if stored.dtype.kind == "f":
-        # Of integers and floats in one list NumPy makes doubles, and rounds the integers.
+        # NumPy converts a list of integers and floats to doubles, which rounds large integers.
         kept = [at for at in large.tolist() if _is_rounded(given, places, *at)]
         large = np.array(kept, dtype=np.int64).reshape(-1, 2)
     return np.unique(large[:, 0])
 
 
 def _is_rounded(given: Any, places: FloatArray, vertex: int, axis: int) -> bool:
-    """Whether a number in nested lists is another than the double that was made of it."""
+    """Whether an integer in nested lists differs from the double that it was converted to."""
     number = given[vertex][axis]
     return not isinstance(number, float | np.floating) and int(number) != int(places[vertex, axis])
 
 
 def _counted(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
-    """Count and name the triangles that are not positive, by what is wrong with them."""
+    """Count and list the non-positive triangles by kind."""
     return ", ".join(
         f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({listed(bad.tolist())})"
         for bad, what in ((inverted, "inverted"), (degenerate, "degenerate"), (nonfinite, "not finite"))
@@ -279,9 +279,9 @@ def _counted(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> s
 
 
 def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
-    """Boundary loops, or why there are none to be judged."""
+    """Boundary loops, or the reasons why there are no valid loops."""
     parts, repeated = edges(F, n), np.empty(0, dtype=np.int64)
-    # An edge from a vertex to itself is never between two triangles that traverse it in opposite directions.
+    # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if any((some[:, 0] == some[:, 1]).any() for some in (parts.boundary, parts.inconsistent, parts.nonmanifold)):
         repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
     wrong = (

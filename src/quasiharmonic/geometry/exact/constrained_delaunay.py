@@ -1,12 +1,12 @@
-"""Triangles between given points that have given segments among their edges: constrained Delaunay triangulation.
+"""Constrained Delaunay triangulation: triangles between given points that have given segments among their edges.
 
-    Qhull's Delaunay triangles ──valid, exactly?──▶ yes ──▶ segments that are missing, brought in by flips [1]_
-                                      └──▶ no ──▶ one point after the other [2]_ ──▶ the same
+    Qhull's Delaunay triangles ──exactly valid?──▶ yes ──▶ recover missing segments by edge flips [1]_
+                                      └──▶ no ──▶ insert the points one by one [2]_ ──▶ recover segments
 
-    A polygon without further points: any triangles within it, by a sweep ──▶ flips.
+    A polygon without further points: triangulate by a sweep ──▶ edge flips.
 
-Every triangle handed back is strictly positive, decided exactly. Delaunay's criterion is decided in floating point:
-where it is lost in rounding, either diagonal will do.
+Every returned triangle is strictly positive, which is verified exactly. Delaunay's criterion is tested in floating
+point. If rounding makes it uncertain, either diagonal is accepted.
 
 References
 ----------
@@ -28,7 +28,8 @@ from quasiharmonic.geometry.exact.triangulation import triangulate
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Rounding of an orientation and of an in-circle determinant relative to the sum of their terms' magnitudes, with room.
+# Bounds with a margin on the rounding of an orientation and of an in-circle determinant, relative to the sum of
+# the magnitudes of their terms.
 _FLAT, _ROUND = 4e-16, 2e-15
 
 
@@ -51,23 +52,23 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
     Parameters
     ----------
     points : (n, 2) float64
-        Pairwise distinct, of magnitude about one.
+        Distinct points of magnitude about one.
     segments : (s, 2) int64
-        Pairs of points. They have at most ends in common.
+        Pairs of points. Two segments share at most an end.
     hull : (h,) int64
         Corners of the convex polygon around all other points, counterclockwise, every corner strictly convex.
 
     Returns
     -------
     (t, 3) int64
-        Counterclockwise, every point a corner of at least one.
+        Counterclockwise triangles. Every point is a corner of at least one.
 
     Raises
     ------
     BlockedError
-        When a segment passes through a point.
+        If a segment passes through a point.
     ValueError
-        When points coincide, or one is outside the polygon.
+        If points coincide, or a point is outside the polygon.
     """
     F = by_qhull(points)
     triangulation = None
@@ -90,17 +91,17 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
 def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
     """Triangulate a simple polygon without further points.
 
-    Meant for up to a few hundred corners, all of whose steps are Python's.
+    The algorithm runs in plain Python and suits polygons of up to a few hundred corners.
 
     Parameters
     ----------
     points : (k, 2) float64
-        Its corners.
+        Corners of the polygon.
 
     Returns
     -------
     (k - 2, 3) int64 or None
-        Counterclockwise. None where the polygon runs clockwise.
+        Counterclockwise triangles, or None if the polygon runs clockwise.
     """
     corners = _whole(points)
     if sum(corners[k - 1][0] * y - x * corners[k - 1][1] for k, (x, y) in enumerate(corners)) < 0:
@@ -113,7 +114,7 @@ def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
 
 
 def _whole(points: FloatArray) -> list[tuple[int, int]]:
-    """Points scaled by a power of two such that they are whole numbers, exactly."""
+    """Scale points by a power of two to whole numbers, exactly."""
     ratios = [value.as_integer_ratio() for value in points.ravel().tolist()]
     finest = max(denominator for _, denominator in ratios)
     whole = [numerator * (finest // denominator) for numerator, denominator in ratios]
@@ -121,23 +122,23 @@ def _whole(points: FloatArray) -> list[tuple[int, int]]:
 
 
 def by_qhull(points: FloatArray) -> IntArray:
-    """Delaunay triangles as Qhull finds them, counterclockwise as far as they have a sense."""
+    """Delaunay triangles computed by Qhull, all of them counterclockwise."""
     from scipy.spatial import Delaunay, QhullError
 
     try:
-        # Near the origin it sees more digits; whether it saw right is decided on the points as given.
+        # Qhull is more accurate near the origin. The caller verifies the result on the original points.
         F: IntArray = Delaunay(points - points.mean(axis=0)).simplices.astype(np.int64)
     except QhullError:
         return np.empty((0, 3), dtype=np.int64)
     sign, _ = triangle_signs(F, np.ascontiguousarray(points, dtype=np.float64))
-    # What has no area lies on the hull, between points on a line.
+    # Triangles without area lie on the hull, between points on a line.
     F, sign = F[sign != 0], sign[sign != 0]
     F[sign < 0] = F[sign < 0, ::-1]
     return F
 
 
 def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
-    """Whether positive triangles cover a polygon once, using all points: it is their boundary."""
+    """Whether positive triangles cover a polygon once and use all points; true if their boundary is the polygon."""
     if not len(F) or not np.bincount(F.ravel(), minlength=len(points)).all():
         return False
     found = edges(F, len(points))
@@ -149,7 +150,7 @@ def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
 
 
 class Triangulation:
-    """Triangles of a convex polygon that are inverted one by one.
+    """Triangulation of a convex polygon that is changed by edge flips.
 
     Parameters
     ----------
@@ -162,14 +163,14 @@ class Triangulation:
         self._array = points
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
         tails, heads, apexes = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.roll(F, -2, axis=1).ravel()
-        # The third corner of the triangle to the left of a half-edge, and a half-edge from every point.
+        # The third corner of the triangle to the left of each half-edge, and one half-edge from every point.
         self._apex = dict(zip(zip(tails.tolist(), heads.tolist(), strict=True), apexes.tolist(), strict=True))
         self._some = dict(zip(tails.tolist(), heads.tolist(), strict=True))
         self._kept: set[tuple[int, int]] = set()
 
     @classmethod
     def of_points(cls, points: FloatArray, hull: IntArray) -> Triangulation:
-        """Insert one point after the other into a convex polygon, whose corners are ``hull``."""
+        """Insert the points one by one into the convex polygon with corners ``hull``."""
         fan = np.stack([np.full(len(hull) - 2, hull[0]), hull[1:-1], hull[2:]], axis=1)
         made = cls(points, fan)
         made.legalise()
@@ -181,22 +182,22 @@ class Triangulation:
         return made
 
     def triangles(self) -> IntArray:
-        """All triangles, (t, 3) int64, each from its smallest corner."""
+        """All triangles, (t, 3) int64, each starting at its smallest corner."""
         found = [(a, b, c) for (a, b), c in self._apex.items() if a < b and a < c]
         return np.array(found, dtype=np.int64).reshape(-1, 3)
 
     def keep(self, segments: IntArray) -> None:
-        """Name segments that Delaunay's criterion must not remove again."""
+        """Mark segments that `legalise` must not remove."""
         pairs = [(a, b) for a, b in segments.tolist()]
         self._kept.update(pairs)
         self._kept.update((b, a) for a, b in pairs)
 
     def legalise(self) -> None:
-        """Flip edges until Delaunay's criterion holds everywhere."""
+        """Flip edges until all unmarked edges satisfy Delaunay's criterion."""
         self._legalise(list(self._apex))
 
     def recover(self, tail: int, head: int) -> None:
-        """Make a segment an edge, by flipping what crosses it."""
+        """Make a segment an edge by flipping the edges that cross it."""
         crossing = deque(self._crossed(tail, head))
         made = []
         while crossing:
@@ -215,7 +216,7 @@ class Triangulation:
         self._legalise(made)
 
     def _crossed(self, tail: int, head: int) -> list[tuple[int, int]]:
-        """Edges across a segment, from its tail on, the first end to the right of it."""
+        """Edges that cross a segment, starting at its tail, with the end on its right first."""
         if (tail, head) in self._apex or (head, tail) in self._apex:
             return []
         right = self._some[tail]
@@ -236,11 +237,11 @@ class Triangulation:
         return found
 
     def _insert(self, point: int, at: int) -> None:
-        """Split what a point lies in, a triangle or an edge; the search starts ``at`` another."""
+        """Split the triangle or edge that contains a point; the search starts ``at`` another point."""
         a = at
         b = self._some[a]
         c = self._apex[a, b]
-        # Across any side that has the point on its right; in Delaunay triangles this ends.
+        # Cross any side that has the point on its right. This terminates in Delaunay triangulations.
         while True:
             for tail, head in ((a, b), (b, c), (c, a)):
                 if self._turn(tail, head, point) < 0:
@@ -269,7 +270,7 @@ class Triangulation:
         self._legalise(around)
 
     def _legalise(self, suspects: Iterable[tuple[int, int]]) -> None:
-        """Flip edges, and those around them in turn, until Delaunay's criterion holds as far as one can tell."""
+        """Flip edges and then their neighbours until Delaunay's criterion holds up to rounding."""
         waiting = list(suspects)
         while waiting:
             p, q = waiting.pop()
@@ -280,12 +281,12 @@ class Triangulation:
                 waiting += [(p, right), (right, q), (q, left), (left, p)]
 
     def _flippable(self, p: int, q: int) -> bool:
-        """Whether the triangles on both sides of an edge make a strictly convex quadrangle."""
+        """Whether the two triangles at an edge form a strictly convex quadrilateral."""
         left, right = self._apex[p, q], self._apex[q, p]
         return self._turn(left, right, q) > 0 and self._turn(right, left, p) > 0
 
     def _flip(self, p: int, q: int) -> tuple[int, int]:
-        """Replace an edge by the other diagonal; its ends."""
+        """Replace an edge by the other diagonal and return its ends."""
         left, right = self._apex.pop((p, q)), self._apex.pop((q, p))
         for a, b, c in ((right, q, left), (left, p, right)):
             self._apex[a, b], self._apex[b, c], self._apex[c, a] = c, a, b
@@ -298,7 +299,7 @@ class Triangulation:
         return along > 0
 
     def _turn(self, a: int, b: int, c: int) -> float:
-        """A number with the sign of the orientation of three points, exactly."""
+        """A number with the exact sign of the orientation of three points."""
         x, y = self._x, self._y
         left = (x[a] - x[c]) * (y[b] - y[c])
         right = (y[a] - y[c]) * (x[b] - x[c])
@@ -307,7 +308,7 @@ class Triangulation:
         return float(orientation(self._array[a], self._array[b], self._array[c]))
 
     def _in_circle(self, p: int, q: int) -> bool:
-        """Whether the point across an edge is surely inside the circle around the triangle to the edge's left."""
+        """Whether the point across an edge is certainly inside the circumcircle of the triangle to the edge's left."""
         x, y = self._x, self._y
         a, d = self._apex[p, q], self._apex[q, p]
         px, py, qx, qy, ax, ay = x[p] - x[d], y[p] - y[d], x[q] - x[d], y[q] - y[d], x[a] - x[d], y[a] - y[d]
@@ -320,7 +321,7 @@ class Triangulation:
 
 
 def _along_curve(points: FloatArray) -> IntArray:
-    """An order in which points near each other follow each other: row by row, to and fro."""
+    """Order points row by row in alternating directions, so that neighbours in the order are close."""
     rows = max(int(np.sqrt(len(points) / 2)), 1)
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     row = np.minimum(((points[:, 1] - low[1]) / max(extent[1], 1e-300) * rows).astype(np.int64), rows - 1)

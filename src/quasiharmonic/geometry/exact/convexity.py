@@ -1,4 +1,4 @@
-"""Which polygons are convex in the plane, exactly."""
+"""Exact test of which polygons are convex in the plane."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def not_convex(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntArray:
-    """Find polygons that are not strictly convex, or wound clockwise.
+    """Find polygons that are not strictly convex or not counterclockwise.
 
-    A polygon turns left at every corner, and lies to the left of every line from its first corner to an edge, if and
-    only if it is strictly convex and runs around once: the second rules out those that run around several times. Then
-    all of its triangulations have positive triangles only.
+    A polygon is strictly convex and winds once if and only if two conditions hold. It turns left at every corner, and
+    every edge lies to the left as seen from the first corner. The second condition excludes polygons that wind several
+    times. Then all triangulations of the polygon have only positive triangles.
 
     Parameters
     ----------
     polygons : Polygons or None
-        Rings of corners of the triangles; None where all are triangles.
+        Rings of corners of the triangles; None if all faces are triangles.
     F : (f, 3) int64
     uv : (n, 2) float64
 
     Returns
     -------
     (k,) int64
-        Ascending.
+        Ascending indices.
     """
     if polygons is None:
         polygons = Polygons(np.arange(F.size), 3 * np.arange(len(F) + 1))
@@ -37,7 +37,7 @@ def not_convex(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntArr
     ahead = np.where(at == last, first, at + 1)
     behind = np.where(at == first, last, at - 1)
     turns = orientation_or_nonfinite(uv[ring[behind]], uv[ring], uv[ring[ahead]])[0] > 0
-    # Triangles of the fan from the first corner; those that have it twice are none.
+    # Fan triangles from the first corner. The two that contain it twice are no triangles and count as positive.
     fan = orientation_or_nonfinite(uv[ring[first]], uv[ring], uv[ring[ahead]])[0] > 0
     fan |= (at == first) | (at == last)
     return np.unique(face[~(turns & fan)])

@@ -1,16 +1,17 @@
-"""Which elements are inverted somewhere, decided exactly on the coordinates of their nodes as stored.
+"""Exact test of which elements are inverted somewhere, on the coordinates of their nodes as stored.
 
-- A triangle of three nodes: where it is not counterclockwise.
-- A quadrilateral: where one of the four triangles at its corners is not; the bilinear map onto it has its least
-  Jacobian determinant at a corner, so nothing else is to be asked.
-- A triangle of six nodes: where the Jacobian determinant of its quadratic map is not positive everywhere, sides and
-  corners included.
+- A triangle of three nodes is inverted if it is not counterclockwise.
+- A quadrilateral is inverted if one of the four triangles at its corners is not counterclockwise. The Jacobian
+  determinant of the bilinear map has its minimum at a corner, so no other test is needed.
+- A triangle of six nodes is inverted if the Jacobian determinant of its quadratic map is not positive everywhere,
+  sides and corners included.
 
-That determinant is a quadratic form in barycentric coordinates (`quasiharmonic.geometry.mesh.second_order`), to be
-positive where these are not negative: the symmetric matrix C of its control values has to be *strictly copositive*.
-Positive control values are enough, those at the corners are necessary; what is between is decided too, without
-subdivision [1]_ [2]_: along the sides by ``cᵢⱼ ≥ 0`` or ``cᵢⱼ² < cᵢᵢ cⱼⱼ``, and then C fails if and only if ``det C ≤
-0`` while a column of its adjugate is positive, which points to a minimum inside. All of it is a matter of integers.
+For six nodes the determinant is a quadratic form in barycentric coordinates
+(`quasiharmonic.geometry.mesh.second_order`). It must be positive for all non-negative coordinates, so the symmetric
+matrix C of its control values must be *strictly copositive*. Positive control values are sufficient; positive values at
+the corners are necessary. All other cases are decided without subdivision [1]_ [2]_. On the sides the condition is
+``cᵢⱼ ≥ 0`` or ``cᵢⱼ² < cᵢᵢ cⱼⱼ``. If the sides pass, C fails if and only if ``det C ≤ 0`` and a column of its adjugate
+is positive, which indicates a minimum inside. The undecided cases are computed in integers.
 
 References
 ----------
@@ -29,30 +30,30 @@ from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows
 from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
 from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
 
-# Of the product of the extents: differences of coordinates, products and at most 36 terms lose a unit each, 2⁻⁵³.
+# Relative to the product of the extents. Differences, products and at most 36 terms each lose one unit, 2⁻⁵³.
 _RELATIVE_BOUND = 64 * 2.0**-53 * float(np.abs(FORMS).sum(axis=(1, 2)).max())
-# What products of numbers of magnitude one or less may lose to underflow, and more.
+# Bound, with a margin, on the loss by underflow in products of numbers of magnitude at most one.
 _UNDERFLOW_BOUND = 2.0**-1000
 
 
 def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
-    """Find the elements that are inverted, or have no area, somewhere.
+    """Find the elements that are inverted or degenerate somewhere.
 
     Parameters
     ----------
     F : (f, 3), (f, 4) or (f, 6) array of int
-        As `quasiharmonic.geometry.mesh.elements` has them.
+        Elements, as in `quasiharmonic.geometry.mesh.elements`.
     points : (n, 2) array
 
     Returns
     -------
     (k,) int64
-        Ascending; those with a coordinate that is not finite too.
+        Ascending indices; elements with a non-finite coordinate are included.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape or dtype, or ``F`` refers to nodes that there are not.
+        If an array has the wrong shape or dtype, or ``F`` refers to nodes that do not exist.
     """
     points = map_array("points", points, finite=False)
     F = element_rows(F, len(points))
@@ -64,7 +65,7 @@ def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
 
 
 def _curved(nodes: FloatArray) -> IntArray:
-    """Of second-order triangles (f, 6, 2)."""
+    """Inverted elements among second-order triangles (f, 6, 2); (k,) int64."""
     with np.errstate(all="ignore"):
         place = nodes - nodes[:, :1]
         exponent = np.frexp(np.abs(place).max(axis=(1, 2)))[1]
@@ -73,14 +74,14 @@ def _curved(nodes: FloatArray) -> IntArray:
         values = jacobian_coefficients(place[..., 0], place[..., 1])
         bound = (_RELATIVE_BOUND * extent + _UNDERFLOW_BOUND)[:, None]
         good, bad = (values > bound).all(axis=1), (values[:, :3] < -bound).any(axis=1)
-    # What is not finite is neither.
+    # Elements that are not finite are neither good nor bad here.
     for k in np.flatnonzero(~good & ~bad).tolist():
         bad[k] = not (np.isfinite(nodes[k]).all() and _positive_everywhere(nodes[k]))
     return np.flatnonzero(bad)
 
 
 def _positive_everywhere(nodes: FloatArray) -> bool:
-    """Whether the Jacobian determinant of one element (6, 2) is positive on all of it, in integer arithmetic."""
+    """Whether the Jacobian determinant of one element (6, 2) is positive everywhere, in integer arithmetic."""
     ratios = [value.as_integer_ratio() for value in nodes.ravel().tolist()]
     unit = max(denominator for _, denominator in ratios)  # all are powers of two
     whole = [numerator * (unit // denominator) for numerator, denominator in ratios]

@@ -1,7 +1,7 @@
-"""Closed curves in the plane, such as a map's boundary loops: whether they cross, how they nest and wind.
+"""Closed curves in the plane, such as the boundary loops of a map: crossings, nesting and winding.
 
-Everything is decided exactly. What keeps the curves from bounding a region that is covered once is
-reported as a list of `Reason`.
+All tests are exact. The reasons why the curves do not bound a region that is covered once are reported as a list of
+`Reason`.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from quasiharmonic.util.kernels import compiled
 
 SignArray = NDArray[np.int8]
 
-# Pairs of boundary edges listed at most; a collapsed boundary has billions.
+# Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
 _MOST_CROSSINGS = 1000
-# Pairs of an edge and a point at the same height that are looked at together.
+# Number of pairs of an edge and a point at the same height that are processed together.
 PAIR_CHUNK = 1 << 18
 
 
 class Obstacle(StrEnum):
-    """What keeps a map from being bijective."""
+    """Kinds of reasons why a map is not bijective."""
 
     NO_TRIANGLES = "no triangles"
     NOT_INJECTIVE = "not injective"
@@ -52,9 +52,9 @@ class Reason:
     Attributes
     ----------
     kind : Obstacle
-        What is wrong.
+        Kind of defect.
     text : str
-        What is wrong and where, in words.
+        Description of the defect and its location.
     loops : tuple of int
         The boundary loops concerned, as indices into `Certificate.loops`.
     """
@@ -76,9 +76,9 @@ class Contacts:
     pairs : (c, 2) int64
         Indices of segments, the smaller first.
     relation : (c,) int8
-        Values of `SegmentRelation`, none of them DISJOINT.
+        Values of `SegmentRelation`, never DISJOINT.
     complete : bool
-        False when there are more pairs than were collected.
+        False if there are more pairs than were collected.
     """
 
     pairs: IntArray
@@ -87,21 +87,21 @@ class Contacts:
 
 
 def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
-    """Find all segments that have more in common than an end.
+    """Find all pairs of segments that share more than a common end.
 
     Parameters
     ----------
     positions : (n, 2) float64
         Points; finite where ``ends`` uses them.
     ends : (m, 2) int64
-        Segments as pairs of points. The same point twice is a point.
+        Segments as pairs of points. A segment with two equal ends is a point.
     most : int
-        Pairs to collect at most.
+        Maximum number of pairs to collect.
 
     Returns
     -------
     Contacts
-        Pairs without a common end that meet, and pairs with one that overlap.
+        Pairs without a common end that meet, and pairs with a common end that overlap.
     """
     tail, head = np.array(ends.T, order="C")
     p, q = positions[tail], positions[head]
@@ -124,8 +124,8 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
 def _doubtful(
     places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray
 ) -> Iterable[tuple[IntArray, IntArray]]:
-    """Pairs of segments to decide exactly, in portions: those of `doubtful_pairs`, and more where there are many."""
-    # As a rule there are none or a few; where a boundary has collapsed, billions.
+    """Yield portions of the segment pairs that need an exact test."""
+    # Usually there are few or no such pairs. A collapsed boundary has billions, which are not stored.
     pairs = np.empty((len(tails), 2), dtype=np.int64)
     number = doubtful_pairs(np.ascontiguousarray(places, dtype=np.float64), tails, heads, starts, pairs)
     if number < 0:
@@ -137,9 +137,10 @@ def _doubtful(
 
 @compiled
 def doubtful_pairs(places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray, pairs: IntArray) -> int:
-    """List pairs of segments of the same group that may have more in common than an end, as far as doubles can tell.
+    """List pairs of segments of the same group that may share more than an end, as far as floating point can tell.
 
-    Segments (m,) are group after group, ``starts`` (g + 1,). How many pairs (k, 2) there are, -1 for want of room.
+    Segments (m,) are sorted by group, with starts (g + 1,). Return the number of pairs (k, 2), or -1 if they do not
+    fit.
     """
     p, q = places[tails], places[heads]
     found, number = [np.empty((0, 2), dtype=np.int64)], 0
@@ -169,7 +170,7 @@ def doubtful_pairs(places: FloatArray, tails: IntArray, heads: IntArray, starts:
 
 
 def _may_overlap(start: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether segments from a place to two others may overlap: one of them is a point, or they may run the same way."""
+    """Whether segments from a common start may overlap: one of them is a point, or their directions may be equal."""
     same_way = ((one < start) == (other < start)).all(axis=1) & ((one > start) == (other > start)).all(axis=1)
     same_way[same_way] = sure_orientation(one[same_way], start[same_way], other[same_way]) == 0
     points: BoolArray = (start == one).all(axis=1) | (start == other).all(axis=1)
@@ -177,21 +178,21 @@ def _may_overlap(start: FloatArray, one: FloatArray, other: FloatArray) -> BoolA
 
 
 def _may_meet(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> BoolArray:
-    """Whether the segments pq and rs may have anything in common."""
+    """Whether the segments pq and rs may have a common point."""
     near: BoolArray = sure_orientation(p, q, r) * sure_orientation(p, q, s) <= 0
     near[near] = sure_orientation(r[near], s[near], p[near]) * sure_orientation(r[near], s[near], q[near]) <= 0
     return near
 
 
 def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
-    """Which of many loops are simple, whatever they have in common with the others.
+    """Test which of many loops are simple; contacts between different loops do not matter.
 
     Parameters
     ----------
     loops : list of (l,) int64
         Vertices, at least three each.
     uv : (n, 2) float64
-        Places, finite where the loops use them.
+        Positions, finite where the loops use them.
 
     Returns
     -------
@@ -205,7 +206,7 @@ def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
         relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
         joined = (following[i] == j) | (following[j] == i)
         met = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
-        # An edge without length shares all it is with the edges before and after it.
+        # An edge of zero length lies entirely on the edges before and after it.
         met |= (p.take(i, 0) == q.take(i, 0)).all(axis=1) | (p.take(j, 0) == q.take(j, 0)).all(axis=1)
         simple[np.searchsorted(starts, i[met], side="right") - 1] = False
         if not simple.any():
@@ -225,7 +226,7 @@ def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[I
     Returns
     -------
     winding : (k,) int64
-        Counted counterclockwise: crossings of a ray to the right [1]_. Meaningless where ``on``.
+        Counterclockwise number of turns: signed crossings of a ray to the right [1]_. Undefined where ``on``.
     on : (k,) bool
         Whether the point lies on the curves.
 
@@ -243,14 +244,14 @@ def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[I
 
 
 def _passed(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Iterator[tuple[IntArray, IntArray, SignArray]]:
-    """Edges that rays to the right of points cross, in portions.
+    """Edges that cross rays from points to the right, in portions.
 
     Yields
     ------
     edge, point : (m,) int64
     turn : (m,) int8
-        1 for an edge that crosses the ray upwards, -1 downwards (its lower end counts as on the
-        ray, its upper one does not), 0 for an edge on which the point lies.
+        1 for an edge that crosses the ray upwards, -1 for downwards, 0 for an edge that contains the point.
+        The lower end of an edge counts as on the ray; the upper end does not.
     """
     low, high = np.minimum(tails, heads), np.maximum(tails, heads)
     by_level = np.argsort(points[:, 1], kind="stable")
@@ -278,7 +279,7 @@ def _passed(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Iterato
 
 @dataclass(frozen=True)
 class _Curves:
-    """Boundary loops as one array of edges, loop after loop."""
+    """Boundary loops as one array of edges, loop by loop."""
 
     start: IntArray
     """(l + 1,) Where each loop's edges start."""
@@ -301,7 +302,7 @@ class _Curves:
 
 
 def _in_turn(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
-    """Vertices loop after loop (k,), where each starts and the last ends (l + 1,), and the one after each (k,)."""
+    """Vertices loop by loop (k,), the start of each loop and the end of the last (l + 1,), and successors (k,)."""
     starts = np.cumsum([0, *map(len, loops)])
     following = np.arange(1, starts[-1] + 1)
     following[starts[1:] - 1] = starts[:-1]
@@ -309,11 +310,11 @@ def _in_turn(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
-    """Edges that meet where they should not (m, 4), and what is wrong with the loops."""
+    """Pairs of edges that meet where they should not (m, 4), and the reasons why the loops are not valid."""
     curves = _Curves.of(loops, uv)
     pairs = _meeting_edges(curves, uv)
     if not len(pairs):
-        # Only loops that are simple and apart have an inside to speak of.
+        # Nesting is defined only for simple, disjoint loops.
         return np.empty((0, 4), dtype=np.int64), _misplaced(curves)
     crossings = curves.ends[pairs].reshape(-1, 4)
     owners = curves.owner[pairs]
@@ -329,9 +330,9 @@ def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[R
 
 
 def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
-    """Pairs of edges (m, 2) that share more than the vertex they have in common, if any; sorted."""
+    """Sorted pairs of edges (m, 2) that share more than a common vertex."""
     consecutive = np.stack([np.arange(len(curves.ends)), curves.following], axis=1)
-    # An edge without length shares all it is with the edges before and after it.
+    # An edge of zero length lies entirely on the edges before and after it.
     point = (curves.p == curves.q).all(axis=1)
     swallowed = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)
     pairs = np.concatenate([swallowed, contacts(uv, curves.ends, _MOST_CROSSINGS).pairs])
@@ -339,9 +340,9 @@ def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
 
 
 def _misplaced(curves: _Curves) -> list[Reason]:
-    """Loops, all of them simple and apart, that do not bound a region covered once."""
+    """Reasons why simple, disjoint loops do not bound a region that is covered once."""
     p, q, start = curves.p, curves.q, curves.start
-    # At the lexicographically first vertex of a simple loop the turn is strict and has the loop's sense.
+    # At the lexicographically first vertex of a simple loop the turn is strict and has the orientation of the loop.
     lowest = np.lexsort((p[:, 1], p[:, 0], curves.owner))[start[:-1]]
     before = np.where(lowest == start[:-1], start[1:], lowest) - 1
     sense = orientation(p[before], p[lowest], q[lowest])
@@ -361,7 +362,7 @@ def _misplaced(curves: _Curves) -> list[Reason]:
 
 
 def _containing(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs of loops, the first around the second; ``anchor`` (l, 2) has a vertex of each loop."""
+    """Pairs of loops, the first around the second; ``anchor`` (l, 2) has one vertex position of each loop."""
     number = len(anchor)
     if number == 1:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -377,5 +378,5 @@ def _containing(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray
 
 
 def listed(items: Sequence[object], most: int = 5) -> str:
-    """The first few of some items, in words."""
+    """Join the first few items for a message."""
     return ", ".join(str(item) for item in items[:most]) + (", …" if len(items) > most else "")

@@ -1,11 +1,11 @@
-"""Lists of the triangles near every place of the unit box: a grid whose crowded cells are divided again.
+"""A nested grid on the unit box: lists of the triangles near every position.
 
-The first grid has about as many cells as there are triangles, and each cell lists the triangles that meet it. A
-cell with a long list is divided into 4 × 4, and those again, so that where triangles span many orders of magnitude
-the lists are as short as in an even mesh::
+The first grid has about as many cells as there are triangles. Each cell lists the triangles that meet it. A cell with a
+long list is divided into 4 × 4 parts, recursively. So the lists are short even if the sizes of triangles differ by many
+orders of magnitude::
 
     +-------+-------+-------+
-    |       |+-+-+-+|       |      point ──▶ cell ──▶ its 4 × 4 parts, if it has any ──▶ … ──▶ list of triangles
+    |       |+-+-+-+|       |      point ──▶ cell ──▶ one of its 4 × 4 parts, if divided ──▶ … ──▶ list of triangles
     |   ·   |+-+-+-+|       |
     |       |+-+-+-+|       |
     +-------+-------+-------+
@@ -20,33 +20,33 @@ import numpy as np
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
-# The finest cells have integer coordinates below 2 to this power; a cell ``s`` levels of halving up has them
+# Finest cells have integer coordinates below 2 to this power. A cell ``s`` halvings coarser has these coordinates
 # shifted by ``s`` bits.
 _BITS = 40
-# Triangles in a cell's list from which on dividing the cell is considered. It is divided if one of two things holds:
+# Length of a list above which a division of its cell is considered. The cell is divided in one of two cases:
 _LONG = 12
-# the lists of its parts have together no more than this many times its own triangles;
+# the lists of its parts together have at most this many times its own triangles,
 _MORE = 1.5
-# or the parts that are not empty have on average no more than this fraction of its own.
+# or the non-empty parts have on average at most this fraction of its own triangles.
 _GAIN = 0.75
-# A part that keeps all triangles of its cell is not divided once more if they are no more than this: they have a corner
-# in common, as a rule, and would crowd around it however small the part.
+# A part that keeps all triangles of its cell is not divided again if they are at most this many. Such triangles usually
+# share a corner and would crowd around it at any size.
 _CROWD = 48
-# Triangles in all lists together, for each triangle of the mesh, at most: the limit on memory.
+# Maximum total length of the lists per triangle of the mesh; limits the memory.
 _ENTRIES = 64
-# The same for the cells of the first grid.
+# The same limit for the cells of the first grid.
 _AT_FIRST = 16
-# A cell farther than this outside of an edge's line, in the unit box, is so whatever was rounded.
+# A cell beyond an edge's line by more than this, in the unit box, is outside in spite of rounding.
 _MARGIN = 2.0**-48
-# Added to it, so that this holds too where products underflow.
+# Additional margin for products that underflow.
 _TINY = 2.0**-1000
-# Entries spread over cells at a time: what is in work stays in the cache. Room for their lists, for each of them.
+# Entries spread over cells per block, so that the data stay in the cache; initial list capacity per entry.
 _ROWS, _ROOM = 1 << 14, 4
 
 
 @dataclass(frozen=True)
 class _Level:
-    """The cells that one division made, and their lists one after another."""
+    """The cells made by one division, and their concatenated lists."""
 
     place: IntArray
     """(k, 2) Coordinates of the cells."""
@@ -58,7 +58,7 @@ class _Level:
     """(k,) Whether a cell has all of the few triangles that the one had that it is a part of."""
 
     def without(self, cells: IntArray) -> _Level:
-        """The same cells with empty lists for some."""
+        """Return the level with empty lists for the given cells."""
         kept = np.ones(self.length.size, dtype=np.bool_)
         kept[cells] = False
         triangle = self.triangle[np.repeat(kept, self.length)]
@@ -66,7 +66,7 @@ class _Level:
 
 
 class NestedGrid:
-    """Lists of triangles by place.
+    """Lists of triangles by position.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class NestedGrid:
     Attributes
     ----------
     listed : (m,) int32
-        Triangles, list after list, each list ascending.
+        Triangles, list after list; each list is ascending.
     """
 
     def __init__(self, corners: FloatArray) -> None:
@@ -104,17 +104,17 @@ class NestedGrid:
             room -= finer.triangle.size + levels[-2].triangle.size - level.triangle.size
             level = finer
         del self._low, self._high, self._lines
-        # Cells are numbered level after level. Those of ``_begin`` are where their lists begin; ``_parts`` is the
-        # first of 16 parts, row by row, or -1.
+        # Cells are numbered level after level. ``_begin`` has the start of each cell's list. ``_parts`` has the first
+        # of the 16 parts of a cell, in row order, or -1.
         self.listed = np.concatenate([level.triangle for level in levels]).astype(np.int32)
         self._begin = np.concatenate([[0], np.cumsum(np.concatenate([level.length for level in levels]))])
         self._parts = np.concatenate(parts)
 
     def lists(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        """Where in ``listed`` the triangles are that may contain points of the unit box.
+        """Ranges in ``listed`` of the triangles that may contain points of the unit box.
 
-        The coordinates of points and corners must have been made by the same monotonic arithmetic: then no
-        rounding parts a point from its triangle.
+        Points and corners must have been scaled by the same monotonic arithmetic, so that rounding does not
+        separate a point from its triangle.
 
         Parameters
         ----------
@@ -129,18 +129,18 @@ class NestedGrid:
         return self._begin[cell], self._begin[cell + 1]
 
     def _first_shift(self) -> int:
-        """The size of the first grid's cells."""
+        """Number of halvings from the first grid's cells to the finest cells."""
         f = len(self._low)
         shift = max(_BITS - (f.bit_length() + 1) // 2, 0)
         while True:
             reach = (self._high >> shift) - (self._low >> shift) + 1
-            # Long triangles across the grain of the grid meet many cells: then fewer must do at first.
+            # Long triangles oblique to the grid meet many cells; then use a coarser first grid.
             if int((reach[:, 0] * reach[:, 1]).sum()) <= _AT_FIRST * f or shift >= _BITS:
                 return shift
             shift += 1
 
     def _refined(self, level: _Level, shift: int, room: int) -> tuple[IntArray, _Level]:
-        """The cells of a level that should be divided, and their parts, ``room`` entries more at most."""
+        """Choose the cells of a level to divide, and return them with their parts; adds at most ``room`` entries."""
         split = np.flatnonzero((level.length > _LONG) & ~level.crowded)
         number = np.full(level.length.size, -1, dtype=np.int64)
         number[split] = np.arange(split.size)
@@ -149,9 +149,9 @@ class NestedGrid:
         finer = self._divided(level.triangle[concerned], parent[concerned], 4 * level.place[split], 4, 4, shift)
         parts = finer.length.reshape(-1, 16)
         before, after = level.length[split], parts.sum(axis=1)
-        # Where triangles crowd in a corner of the cell, a few divisions bring nothing and cost nothing.
+        # Divisions around a corner where triangles crowd do not shorten the lists at first, but add few entries.
         chosen = (after <= _MORE * before) | (after <= _GAIN * before * (parts > 0).sum(axis=1))
-        # The longest lists first.
+        # Divide the cells with the longest lists first.
         order = np.argsort(-before, kind="stable")
         more = np.cumsum(np.where(chosen, after - before, 0)[order])
         chosen[order[more > room]] = False
@@ -168,9 +168,9 @@ class NestedGrid:
         Parameters
         ----------
         triangle, parent : (e,) int64
-            Entries of the cells' lists, and which of the cells they are of; by cell, then by triangle.
+            Entries of the lists of cells, and the cell of each entry; sorted by cell, then by triangle.
         corner : (k, 2) int64
-            Coordinates of each cell's first part.
+            Coordinates of the first part of each cell.
         columns, lines, shift : int
         """
         size = len(corner) * columns * lines
@@ -189,7 +189,7 @@ class NestedGrid:
 
 @compiled
 def find_cells(points: FloatArray, columns: int, shift: int, parts: IntArray, cell: IntArray) -> None:
-    """Fill in the numbers of the cells that points of the unit box lie in, (k,)."""
+    """Fill in the cell number (k,) of each point of the unit box."""
     x, y = _coordinates(points).T
     cell[:] = (y >> shift) * columns + (x >> shift)
     deeper = np.flatnonzero(parts[cell] >= 0)
@@ -216,10 +216,10 @@ def divide_cells(
     length: IntArray,
     listed: IntArray,
 ) -> int:
-    """Fill in the lists of the parts of cells, and their lengths; how long they are together.
+    """Fill in the lists of the parts of cells, and their lengths; return the total length.
 
-    Only the lengths where ``listed`` has no room for that. low, high: finest cells between which each triangle lies
-    (f, 2); nx, ny, offset: as `_lines` has them; the others as of `NestedGrid._divided`.
+    If the lists do not fit into ``listed``, only fill in the lengths. low, high: finest cells between which each
+    triangle lies (f, 2); nx, ny, offset: as returned by `_lines`; others as in `NestedGrid._divided`.
     """
     from scipy.sparse import csr_array
 
@@ -239,7 +239,7 @@ def divide_cells(
         owner = p[row]
         cells.append((owner * lines + y - corner[owner, 1]) * columns + x - corner[owner, 0])
         counts.append(np.bincount(row, minlength=t.size))
-    # Turning the table of entries and cells on its side sorts by cell and keeps the order of the entries.
+    # Converting the sparse matrix of entries and cells to columns sorts by cell and keeps the order of the entries.
     where = np.concatenate(cells)
     table = (np.ones(where.size, dtype=np.int8), where, np.cumsum(np.concatenate(counts)))
     turned = csr_array(table, shape=(triangle.size, length.size)).tocsc()
@@ -250,7 +250,7 @@ def divide_cells(
 
 
 def _lines(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Lines through the edges of triangles, for telling which cells lie outside of them; (f, 3) each.
+    """Lines through the edges of triangles, to find the cells outside of them; (f, 3) each.
 
     A point is to the left of an edge where ``x nx + y ny`` exceeds the offset.
     """
@@ -262,7 +262,7 @@ def _lines(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _meet(
     nx: FloatArray, ny: FloatArray, offset: FloatArray, row: IntArray, x: IntArray, y: IntArray, shift: int
 ) -> BoolArray:
-    """Whether triangles, by row, meet cells that their boxes meet; if in doubt, they do."""
+    """Whether triangles, given by row, meet cells that their boxes meet; True if in doubt."""
     size = 2.0 ** (shift - _BITS)
     middle_x, middle_y = (x + 0.5) * size, (y + 0.5) * size
     reach = offset - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _TINY
@@ -273,5 +273,5 @@ def _meet(
 
 
 def _coordinates(points: FloatArray) -> IntArray:
-    """Coordinates of the finest cells that points of the unit box lie in."""
+    """Coordinates of the finest cells that contain points of the unit box."""
     return np.minimum((points * 2.0**_BITS).astype(np.int64), 2**_BITS - 1)

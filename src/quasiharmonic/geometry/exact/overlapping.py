@@ -1,4 +1,4 @@
-"""Which triangles lie on each other in the plane, exactly."""
+"""Exact search for overlapping triangles in the plane."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from quasiharmonic.util.progress import heartbeat
 
 
 def lying_on_others(F: IntArray, uv: FloatArray) -> IntArray:
-    """Find the triangles that share area with another one.
+    """Find the triangles that overlap another one with positive area.
 
-    Two convex sets share none if and only if a line parts them, and of two triangles a side of one of them then does.
+    Two convex sets have no common area if and only if a line separates them. For two triangles a side of one of them
+    then does.
 
     Parameters
     ----------
-    F : (f, 3) int64
+    Triangles, all counterclockwise.
         Triangles, every one of them counterclockwise.
     uv : (n, 2) float64
 
     Returns
     -------
     (k,) int64
-        Ascending. Triangles that merely touch are none of them.
+        Ascending indices. Triangles that only touch do not count.
 
     Examples
     --------
@@ -43,7 +44,7 @@ def lying_on_others(F: IntArray, uv: FloatArray) -> IntArray:
 
 
 def _parted_by_a_side(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether, of pairs of triangles (k, 3, 2), all of the other is to the right of a side of the first."""
+    """Whether the second triangle of each pair (k, 3, 2) lies to the right of a side of the first, or on it."""
     tail, head = one[:, :, None], one[:, (1, 2, 0), None]
     right = np.asarray(orientation(tail, head, other[:, None]) <= 0)
     return np.asarray(np.any(np.all(right, axis=2), axis=1))

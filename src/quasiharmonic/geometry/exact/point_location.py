@@ -1,8 +1,8 @@
-"""In which triangle points of the plane lie, decided exactly.
+"""Exact search for the triangle that contains a point of the plane.
 
-Candidates come from a `NestedGrid`. Corners and points are put into its cells by the same rounded arithmetic, which
-is monotonic; whether a candidate contains the point is decided in floating point where the determinants are clear
-of their error, and by `quasiharmonic.geometry.exact.predicates` where not.
+Candidates come from a `NestedGrid`. Corners and points are assigned to cells by the same rounded arithmetic, which is
+monotonic. Floating point decides whether a candidate contains the point if the determinants exceed their error bound.
+`quasiharmonic.geometry.exact.predicates` decides the remaining cases.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from quasiharmonic.geometry.exact.predicates import orientation, twice_area
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
-# The determinant l − r of differences of up to 1 is off by no more: (3u + O(u²)) · 2 with u = 2⁻⁵³.
+# Error bound of the determinant l − r of differences of up to 1: (3u + O(u²)) · 2 with u = 2⁻⁵³.
 _UNSURE = 2.0**-50
-# What stands for a triangle where that is so.
+# Result for a point whose triangle floating point cannot determine.
 _UNDECIDED = -2
-# The same as a part of |l| + |r|; and below it what underflow may do.
+# The same bound relative to |l| + |r|, and a bound on the loss by underflow.
 _RELATIVE_BOUND, _UNDERFLOW_BOUND = 2.0**-51, 2.0**-1000
-# Barycentric coordinates are taken from determinants whose error is this part of the triangle's own at most.
+# Barycentric coordinates use determinants whose error is at most this fraction of the triangle's determinant.
 _ACCURATE = 2.0**-40
-# Points, and pairs of a point and a candidate, handled at a time: what is in work stays in the cache.
+# Points per block, and pairs of a point and a candidate per block, so that the data stay in the cache.
 _POINTS, _PAIRS = 1 << 13, 1 << 17
 
 
 class PointLocator:
-    """Finds the triangles that points lie in.
+    """Point location in triangles.
 
     Parameters
     ----------
     corners : (f, 3, 2) float64
-        Triangles, at least one, finite and all counterclockwise.
+        Triangles, at least one, all finite and counterclockwise.
     """
 
     def __init__(self, corners: FloatArray) -> None:
         self._corners = corners
         self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-        # Each axis in its own unit, a power of two, so that the box has sides of 1/4 to 1. Halved first: the extent
-        # of numbers near the largest double must not overflow.
+        # Scale each axis by a power of two so that the box has sides of 1/4 to 1. Halve first, so that the extent of
+        # numbers near the largest double does not overflow.
         self._exponent = -1 - np.frexp(self._high / 2 - self._low / 2)[1]
         scaled = np.ldexp(corners, self._exponent)
         self._origin = np.ldexp(self._low, self._exponent)
@@ -50,7 +50,7 @@ class PointLocator:
         self._grid = NestedGrid(scaled - self._origin)
 
     def find(self, points: FloatArray) -> IntArray:
-        """The closed triangle that contains each point, decided exactly for the coordinates as stored.
+        """Find the closed triangle that contains each point, exactly for the coordinates as stored.
 
         Parameters
         ----------
@@ -59,7 +59,7 @@ class PointLocator:
         Returns
         -------
         (k,) int64
-            The smallest index, where several triangles contain a point; -1 where none does, or it is not finite.
+            The smallest index if several triangles contain a point; -1 if none does or the point is not finite.
         """
         found = np.full(len(points), -1, dtype=np.int64)
         for start in range(0, len(points), _POINTS):
@@ -80,12 +80,12 @@ class PointLocator:
         ----------
         points : (k, 2) float64
         triangle : (k,) int64
-            As `find` has it, nowhere -1.
+            Triangles, as returned by `find`, never -1.
 
         Returns
         -------
         (k, 3) float64
-            Never negative; zero exactly where the point lies on the edge opposite (or is within 1e-300 of it).
+            Never negative. Zero exactly if the point lies on the opposite edge, or within 1e-300 of it.
         """
         weights = np.empty((len(points), 3))
         for start in range(0, len(points), _POINTS):
@@ -94,17 +94,17 @@ class PointLocator:
         return weights
 
     def _decided(self, points: FloatArray, begin: IntArray, end: IntArray) -> IntArray:
-        """What `find` returns, for points where floating point does not tell."""
+        """Compute the result of `find` for points that floating point cannot decide."""
         found = np.full(len(points), -1, dtype=np.int64)
         for point, entry in _pairs(begin, end):
             triangle = self._grid.listed[entry].astype(np.int64)
-            # A point's candidates ascend: written backwards, the smallest is the last to be written.
+            # Candidates of a point ascend. Writing them backwards leaves the smallest.
             hits = np.flatnonzero(self._contain(points, point, triangle))[::-1]
             found[point[hits]] = triangle[hits]
         return found
 
     def _contain(self, points: FloatArray, point: IntArray, triangle: IntArray) -> BoolArray:
-        """Whether the closed triangles contain the points paired with them."""
+        """Whether each closed triangle contains the point paired with it."""
         least = _least_determinants(np.ldexp(points, self._exponent)[point], self._rows.take(triangle, axis=0))
         contain: BoolArray = least > _UNSURE
         unsure = np.flatnonzero(np.abs(least) <= _UNSURE)
@@ -114,11 +114,11 @@ class PointLocator:
         return contain
 
     def _weights(self, points: FloatArray, triangle: IntArray) -> FloatArray:
-        """Barycentric coordinates of a few points."""
+        """Barycentric coordinates of one block of points."""
         x, y = np.ldexp(points, self._exponent).T
         corner = self._rows.take(triangle, axis=0).T
         dx, dy = corner[0::2] - x, corner[1::2] - y
-        # Row i belongs to corner i: twice the area of the triangle that the point forms with the edge opposite.
+        # Row i belongs to corner i: twice the area of the triangle formed by the point and the opposite edge.
         left, right = dx[[1, 2, 0]] * dy[[2, 0, 1]], dy[[1, 2, 0]] * dx[[2, 0, 1]]
         area = left - right
         error = _RELATIVE_BOUND * (np.abs(left) + np.abs(right)).max(axis=0) + _UNDERFLOW_BOUND
@@ -129,7 +129,7 @@ class PointLocator:
 
 
 def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of a point and an entry of its list, by point and then by entry, in portions."""
+    """Yield portions of the pairs of a point and an entry of its list, sorted by point, then entry."""
     count = end - begin
     upto = np.cumsum(count)
     start = done = 0
@@ -149,21 +149,21 @@ def sure_hits(
     rows: FloatArray,
     hits: IntArray,
 ) -> None:
-    """Fill in the first of each point's listed triangles that is not surely outside, if it surely contains the point.
+    """Fill in the first candidate of each point that is not surely outside, if it surely contains the point.
 
-    -2 if that is not sure, -1 where all are surely outside. rows: the triangles' corners (f, 6).
+    Fill in -2 if this is not sure, and -1 if the point is surely outside all candidates. rows: corners (f, 6).
     """
     hits[:] = -1
     for point, entry in _pairs(begin, end):
         triangle = listed[entry]
         least = _least_determinants(points[point], rows.take(triangle, axis=0))
         possible = np.flatnonzero(least >= -_UNSURE)[::-1]
-        # Written backwards, the first is the last to be written.
+        # Writing backwards leaves the first candidate.
         hits[point[possible]] = np.where(least > _UNSURE, triangle, _UNDECIDED)[possible]
 
 
 def _least_determinants(points: FloatArray, rows: FloatArray) -> FloatArray:
-    """The least of the determinants of a point with the edges of a triangle, positive inside, for pairs of them."""
+    """Minimum determinant of each point with the edges of its paired triangle; positive inside."""
     x, y = points.T
     ax, bx, cx = (rows[:, i] - x for i in (0, 2, 4))
     ay, by, cy = (rows[:, i] - y for i in (1, 3, 5))
@@ -172,7 +172,7 @@ def _least_determinants(points: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _careful_areas(points: FloatArray, corners: FloatArray) -> FloatArray:
-    """Areas between points and the edges opposite to the corners (k, 3, 2), in any unit of each triangle; (3, k)."""
+    """Areas of points with the edges opposite to the corners (k, 3, 2), in a unit of each triangle; (3, k)."""
     extent = corners.max(axis=1) / 2 - corners.min(axis=1) / 2
     exponent = -1 - np.frexp(extent)[1]
     p, (a, b, c) = np.ldexp(points, exponent), np.ldexp(corners, exponent[:, None]).swapaxes(0, 1)

@@ -1,16 +1,16 @@
 """Exact geometric predicates on arrays of points.
 
-Every predicate here is decided for the coordinates as they are stored, whatever their magnitude:
-doubles are rational numbers, and no answer depends on how arithmetic rounds. All rests on
-`orientation`, which works in three stages, each for what the one before could not decide:
+Every predicate is exact for the coordinates as stored, whatever their magnitude. Doubles are rational numbers, so no
+result depends on rounding. All predicates use `orientation`, which has three stages. Each stage
+processes the cases that the previous one could not decide:
 
-1. the determinant in floating point, with a bound on its error (one pass over the array);
-2. the same after scaling each triple by a power of two to magnitude one, then as a sum of sixteen
-   doubles that equals the determinant exactly [1]_, distilled until its sign shows [2]_ [3]_;
+1. the determinant in floating point, with an error bound (one pass over the array);
+2. the determinant after scaling each triple by a power of two to magnitude one, then as an exact sum of
+   sixteen doubles [1]_, which is distilled until its sign is certain [2]_ [3]_;
 3. integers of any size, for triples whose coordinates span more than 130 orders of magnitude.
 
-IEEE 754 doubles with gradual underflow are assumed, which is what NumPy has unless another library
-in the process has switched its thread to flush subnormal numbers to zero.
+The code requires IEEE 754 doubles with gradual underflow. NumPy has these unless another library in the
+process makes its thread flush subnormal numbers to zero.
 
 References
 ----------
@@ -39,14 +39,14 @@ SignArray = NDArray[np.int8]
 _RELATIVE_BOUND = 2.0**-51
 # Each of the two products, and the bound, may lose up to 2⁻¹⁰⁷⁵ to underflow; sums lose nothing.
 _UNDERFLOW_BOUND = 2.0**-1060
-# After scaling, a coordinate is 0 or at least this (or else stage 3 has it): then all that stage 2
-# forms is a multiple of 2⁻⁹⁸⁴ and no product underflows.
+# After scaling, a coordinate of stage 2 is 0 or at least this; stage 3 takes the other triples. So all
+# intermediate values are multiples of 2⁻⁹⁸⁴, and no product underflows.
 _SMALLEST_SCALED = 2.0**-440
-# Triples that stage 2 takes at a time, so that its sixteen components stay in the cache.
+# Triples per block in stage 2, so that the sixteen components stay in the cache.
 _EXACT_CHUNK = 8192
-# Levels of a tree of boxes that are not gone through one by one.
+# Levels of a box tree, from the root, whose pairs are enumerated directly.
 _SKIPPED = 5
-# Pairs of boxes that `box_pairs` handles at a time.
+# Pairs of boxes per block in `box_pairs`.
 PAIR_CHUNK = 1 << 17
 
 
@@ -61,13 +61,13 @@ def orientation(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> SignArray:
     Returns
     -------
     (k,) int8
-        1 where ``a, b, c`` is counterclockwise, -1 where it is clockwise, 0 where the three points
+        1 if ``a, b, c`` is counterclockwise, -1 if it is clockwise, 0 if the three points
         lie exactly on a line.
 
     Raises
     ------
     ValueError
-        When a coordinate is NaN or infinite.
+        If a coordinate is NaN or infinite.
 
     Examples
     --------
@@ -81,18 +81,19 @@ def orientation(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> SignArray:
 
 
 def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[SignArray, IntArray]:
-    """As `orientation`, but name the triples with NaN or infinite coordinates instead of refusing them.
+    """Compute `orientation`, but report triples with NaN or infinite coordinates instead of raising.
 
     Returns
     -------
     sign : (k,) int8
-        As `orientation` has it, and 0 for the triples in ``nonfinite``.
+        As `orientation`, and 0 for the triples in ``nonfinite``.
     nonfinite : (m,) int64
-        Ascending flat indices of the triples that have no orientation.
+        Ascending flat indices of the triples with NaN or infinite coordinates.
     """
     a, b, c = (np.asarray(p, dtype=np.float64) for p in (a, b, c))
     corners = (a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
-    # An overflow or an invalid operation makes the bound infinite or the determinant NaN: undecided.
+    # An overflow or an invalid operation makes the bound infinite or the determinant NaN, so the triple stays
+    # undecided.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         sign = _filtered(*corners)
         if np.all(sign):
@@ -107,7 +108,7 @@ def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[
 
 
 def sure_orientation(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
-    """As `orientation` where floating point is sure of it, and 0 elsewhere."""
+    """The `orientation` where floating point is certain of it; 0 elsewhere."""
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         return _filtered(a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
 
@@ -115,7 +116,7 @@ def sure_orientation(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
 def _filtered(
     ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray, cx: FloatArray, cy: FloatArray
 ) -> SignArray:
-    """Sign of the orientation where floating point is sure of it, 0 elsewhere."""
+    """Sign of the orientation where floating point is certain of it; 0 elsewhere."""
     left = (ax - cx) * (by - cy)
     right = (ay - cy) * (bx - cx)
     det = left - right
@@ -130,8 +131,8 @@ def _filtered(
 
 def _exact(x: FloatArray) -> SignArray:
     """Orientation of the triples ``x``, (6, k) finite, as rows ax, ay, bx, by, cx, cy."""
-    # Differences have the right sign even where they are rounded, so products of different sign
-    # decide; this settles corners that coincide and lines along an axis at little cost.
+    # Rounded differences have the right sign. So two products of different sign decide the orientation. This covers
+    # coincident corners and lines along an axis at little cost.
     left = np.sign(x[0] - x[4]) * np.sign(x[3] - x[5])
     right = np.sign(x[1] - x[5]) * np.sign(x[2] - x[4])
     sign: SignArray = np.sign(left - right).astype(np.int8)
@@ -143,10 +144,10 @@ def _exact(x: FloatArray) -> SignArray:
 
 
 def _scaled(x: FloatArray) -> SignArray:
-    """As `_exact`, with every triple brought to magnitude one."""
+    """Compute `_exact` after scaling every triple to magnitude one."""
     exponent = np.frexp(np.abs(x).max(axis=0))[1]
     scaled = np.ldexp(x, -exponent)
-    # Scaling may have rounded these, so what follows holds for the others.
+    # Scaling may have rounded the coordinates of these triples; the following code is valid for the others.
     wide = ((np.abs(scaled) < _SMALLEST_SCALED) & (x != 0)).any(axis=0)
     sign = _filtered(*scaled)
     open_ = (sign == 0) & ~wide
@@ -163,10 +164,10 @@ def _expanded(x: FloatArray) -> SignArray:
 
 
 def _components(x: FloatArray) -> FloatArray:
-    """Sixteen doubles, as a rule small ones first, whose sum is the determinant exactly; (16, k)."""
+    """Sixteen doubles, usually smaller ones first, whose exact sum is the determinant; (16, k)."""
     (ax, bx), (ax_tail, bx_tail) = two_sum(x[0:4:2], -x[4])
     (ay, by), (ay_tail, by_tail) = two_sum(x[1:4:2], -x[5])
-    # (ax + ax_tail)(by + by_tail) − (ay + ay_tail)(bx + bx_tail), product by product, small ones first.
+    # Expand (ax + ax_tail)(by + by_tail) − (ay + ay_tail)(bx + bx_tail) into products, small ones first.
     product, error = two_product(
         np.stack([ax_tail, -ay_tail, ax_tail, ax, -ay_tail, -ay, ax, -ay]),
         np.stack([by_tail, bx_tail, by, by_tail, bx, bx_tail, by, bx]),
@@ -175,18 +176,18 @@ def _components(x: FloatArray) -> FloatArray:
 
 
 def _sum(terms: FloatArray) -> FloatArray:
-    """Sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow: off by 2⁻⁴⁸ of itself at most.
+    """Sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow; relative error at most 2⁻⁴⁸.
 
-    Each sweep replaces the terms by others of the same exact sum, the last of which is the rounded
-    sum, the rest what was lost on the way [2]_. A sum is decided when the last outweighs the rest,
-    which it does after at most t - 1 sweeps [3]_ and as a rule after two or three.
+    Each sweep replaces the terms by others with the same exact sum. The last one is the rounded sum, and the
+    others are rounding errors [2]_. A sum is decided when the last term exceeds the rest in magnitude. This takes
+    at most t - 1 sweeps [3]_ and usually two or three.
     """
     total = np.zeros(terms.shape[1])
     left = np.arange(terms.shape[1])
     while left.size:
         for i in range(1, len(terms)):
             terms[i], terms[i - 1] = two_sum(terms[i], terms[i - 1])
-        # Doubled, the computed weight of the rest is surely above the true one.
+        # Doubling makes the computed magnitude of the rest an upper bound.
         rest = 2.0 * np.abs(terms[:-1]).sum(axis=0)
         decided = (np.abs(terms[-1]) > rest) | (rest == 0.0)
         total[left[decided]] = terms[-1, decided] + terms[:-1, decided].sum(axis=0)
@@ -195,14 +196,14 @@ def _sum(terms: FloatArray) -> FloatArray:
 
 
 def two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The rounded sum and its error: ``a + b`` exactly (Knuth)."""
+    """The rounded sum and its rounding error, which together equal ``a + b`` exactly (Knuth)."""
     total = a + b
     b_part = total - a
     return total, (a - (total - b_part)) + (b - b_part)
 
 
 def two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The rounded product and its error: ``a * b`` exactly (Dekker, Veltkamp)."""
+    """The rounded product and its rounding error, which together equal ``a * b`` exactly (Dekker, Veltkamp)."""
     product = a * b
     a_high, a_low = _split(a)
     b_high, b_low = _split(b)
@@ -211,7 +212,7 @@ def two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _split(a: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Halves of at most 26 bits each with exact sum ``a``."""
+    """Two parts of at most 26 bits each with exact sum ``a``."""
     scaled = 134217729.0 * a  # 2²⁷ + 1
     high = scaled - (scaled - a)
     return high, a - high
@@ -227,7 +228,7 @@ def _in_integers(x: FloatArray) -> int:
 
 
 def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Twice the signed area of triangles, accurate however thin they are.
+    """Twice the signed area of triangles, accurate for thin triangles.
 
     Parameters
     ----------
@@ -237,8 +238,8 @@ def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     Returns
     -------
     (k,) float64
-        Off by 2⁻⁴⁸ of itself at most, so zero exactly for corners on a line, as long as no product of
-        differences, or of what was rounded off them, underflows.
+        Relative error at most 2⁻⁴⁸, so zero exactly for corners on a line. This holds if no product of
+        differences, or of their rounding errors, underflows.
     """
     x = np.concatenate([a.T, b.T, c.T])
     area = np.empty(x.shape[1])
@@ -249,7 +250,7 @@ def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
 
 class SegmentRelation(IntEnum):
-    """What two closed segments have in common."""
+    """Kinds of intersections of two closed segments."""
 
     DISJOINT = 0
     """No point."""
@@ -262,7 +263,7 @@ class SegmentRelation(IntEnum):
 
 
 def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> SignArray:
-    """Decide exactly what the closed segments ``pq`` and ``rs`` have in common.
+    """Classify the intersection of the closed segments ``pq`` and ``rs``, exactly.
 
     Parameters
     ----------
@@ -276,7 +277,7 @@ def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray)
     """
     relation = np.zeros(len(p), dtype=np.int8)
     r_side, s_side = orientation(p, q, r), orientation(p, q, s)
-    # Most candidates have rs strictly on one side of pq and need no more than this.
+    # Most candidates have rs strictly on one side of pq and need no further test.
     near = np.flatnonzero(r_side * s_side <= 0)
     p, q, r, s = (array.take(near, axis=0) for array in (p, q, r, s))
     r_side, s_side = r_side[near], s_side[near]
@@ -288,7 +289,7 @@ def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray)
         | ((p_side == 0) & _in_box(p, r, s))
         | ((q_side == 0) & _in_box(q, r, s))
     )
-    # On a common line the lexicographic order is the order along it, and an overlap is that of intervals.
+    # On a common line, lexicographic order is the order along the line, so the overlap is that of two intervals.
     collinear = (r_side == 0) & (s_side == 0) & (p_side == 0) & (q_side == 0)
     p_first, r_first = _before(p, q), _before(r, s)
     p, q = np.where(p_first[:, None], p, q), np.where(p_first[:, None], q, p)
@@ -316,9 +317,9 @@ def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
 def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
     """Pairs of closed boxes that meet, in portions.
 
-    A binary tree over the boxes *in the order given* is descended against itself, all pairs of a
-    level at once. Boxes of consecutive edges of a curve make a tight tree whatever the scale of its
-    parts, so the cost for such boxes is about proportional to their number and the pairs found.
+    A binary tree over the boxes *in the given order* is traversed against itself, all pairs of a level at once. Boxes
+    of consecutive edges of a curve make a tight tree, whatever the scale of the parts of the curve. So the cost for
+    such boxes is about proportional to the number of boxes and of pairs found.
 
     Parameters
     ----------
@@ -336,14 +337,14 @@ def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArr
 
 
 def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of closed boxes that meet and are of the same group; as `box_pairs` of one group after another.
+    """Pairs of closed boxes of the same group that meet; equals `box_pairs` of each group.
 
     Parameters
     ----------
     lo, hi : (k, 2) float64
-        Corners, group after group.
+        Corners, sorted by group.
     starts : (g + 1,) int64
-        Where each group starts, and the last one ends.
+        Start of each group, and the end of the last one.
 
     Yields
     ------
@@ -352,7 +353,7 @@ def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterat
     """
     sizes, groups = np.diff(starts), len(starts) - 1
     depth = int(max(sizes.max(initial=1) - 1, 0)).bit_length()
-    # Each group has a tree of its own, all of one depth.
+    # Each group has its own tree. All trees have the same depth.
     place = np.arange(len(lo)) + np.repeat((np.arange(groups) << depth) - starts[:-1], sizes)
     number = np.full(groups << depth, -1)
     number[place] = np.arange(len(lo))
@@ -366,12 +367,12 @@ def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterat
 def box_pairs_between(
     lo: FloatArray, hi: FloatArray, other_lo: FloatArray, other_hi: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of closed boxes that meet, one of each of two kinds; as `box_pairs`.
+    """Pairs of closed boxes that meet, the first of one set and the second of another; as `box_pairs`.
 
     Yields
     ------
     i, j : (m,) int64
-        Indices of a box (k, 2) and of another (l, 2) that it meets, each pair once.
+        Indices of a box (k, 2) of the first set and of a box (l, 2) of the second, each pair once.
     """
     depth = max(len(lo) - 1, len(other_lo) - 1, 0).bit_length()
     yield from _meeting(_box_tree(lo, hi, depth), _box_tree(other_lo, other_hi, depth))
@@ -381,8 +382,8 @@ _BoxTree = list[tuple[FloatArray, FloatArray]]
 
 
 def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
-    """Boxes, the boxes around each two of them, and so on up to those around 2^depth: one, or one for each group."""
-    # Missing leaves are boxes that nothing meets.
+    """Build a box tree from leaves to roots: each level has boxes around two boxes of the previous level."""
+    # Pad with empty boxes, which do not meet any box.
     padding = ((0, max((1 << depth) - len(lo), 0)), (0, 0))
     tree = [(np.pad(lo, padding, constant_values=np.inf), np.pad(hi, padding, constant_values=-np.inf))]
     for _ in range(depth):
@@ -392,11 +393,11 @@ def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
 
 
 def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArray]]:
-    """Leaves of two trees of the same depth that meet; of a tree with itself, those with ``i ≤ j``.
+    """Pairs of leaves that meet, of two trees of the same depth; for a tree with itself, only ``i ≤ j``.
 
-    Where there are several roots, what is below one meets nothing of what is below the others.
+    With several roots, only leaves below the same root are compared.
     """
-    # The first few levels have so few boxes that all pairs of theirs are looked at sooner than level after level.
+    # The first few levels have so few boxes that testing all pairs is faster than a traversal.
     depth, roots = len(one) - 1, np.arange(len(one[-1][0]))
     skipped = min(depth, _SKIPPED)
     number = np.arange(1 << skipped)
@@ -404,7 +405,7 @@ def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArra
     if one is other:
         i, j = i[i <= j], j[i <= j]
     i, j = ((np.add.outer(roots << skipped, part)).ravel() for part in (i, j))
-    # The deepest portion first, so that what waits stays small however many pairs there are.
+    # Process the deepest portion first, so that the stack stays small for any number of pairs.
     waiting = [(depth - skipped, i, j)]
     while waiting:
         level, i, j = waiting.pop()

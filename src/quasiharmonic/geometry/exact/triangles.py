@@ -1,4 +1,4 @@
-"""All triangles of a mesh at once: which way they turn, and how often they wind around a vertex, decided exactly."""
+"""Exact orientation of the triangles of a mesh, and exact winding around vertices."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from quasiharmonic.util.kernels import compiled
 
 SignArray = NDArray[np.int8]
 
-# Triangles judged at a time: bounds the memory, and is large enough for the overhead not to show.
+# Triangles per block: bounds the memory, and is large enough to hide the overhead of a block.
 TRIANGLE_CHUNK = 1 << 16
 
 
 def triangle_signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
-    """Decide the orientations of triangles (f, 3) int64 among places (n, 2) float64, both contiguous, exactly.
+    """Exact orientations of triangles (f, 3) int64 with positions (n, 2) float64; both arrays are contiguous.
 
     Returns
     -------
     sign : (f,) int8
-        1 for counterclockwise, -1 for clockwise, 0 for no area or a coordinate that is NaN or infinite.
+        1 if counterclockwise, -1 if clockwise, 0 if the area is zero or a coordinate is NaN or infinite.
     nonfinite : (m,) int64
-        Ascending indices of the triangles with such a coordinate.
+        Ascending indices of the triangles with a NaN or infinite coordinate.
 
     Raises
     ------
     ValueError
-        When ``F`` names vertices that are not there.
+        If ``F`` refers to vertices that do not exist.
     """
     sign, nonfinite = np.empty(len(F), dtype=np.int8), np.empty(0, dtype=np.int64)
     number = sure_signs(F, uv, sign)
@@ -48,7 +48,7 @@ def triangle_signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
 
 @compiled
 def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
-    """Fill in orientations (f,), 0 where floating point is not sure; how many of these, -1 for ``F`` out of range."""
+    """Fill in orientations (f,), 0 if floating point cannot decide; return the number of 0, -1 if F is out of range."""
     if F.size and (F.min() < 0 or F.max() >= len(uv)):
         return -1
     for start in range(0, len(F), TRIANGLE_CHUNK):
@@ -59,28 +59,28 @@ def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
 
 
 def overwound_vertices(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
-    """Find the vertices, all triangles around them positive, whose angles add up to more than 2π, exactly.
+    """Find the vertices with only positive triangles around them whose angles add up to more than 2π, exactly.
 
     Parameters
     ----------
     F : (f, 3) int64
     uv : (n, 2) float64
     sign : (f,) int8
-        Orientations, as `triangle_signs` has them.
+        Orientations, as returned by `triangle_signs`.
     loops : list of (l,) int64
         The boundary loops, the surface to their left.
 
     Returns
     -------
     (k,) int64
-        Ascending.
+        Ascending indices.
 
     Notes
     -----
-    Around a vertex the angles add up to ``2π t`` where it is interior, and to ``2π t + φ₁ − φ₀`` where it is on the
-    boundary: t is how often triangles pass the direction of the x axis (`count_turns`), φ₀ and φ₁, from 0 to below 2π,
-    are the directions of the edges to the next vertex of the loop and to the last one, where the fan begins and ends.
-    So at the boundary they add up to more than 2π if t is 2 or more, or t is 1 and φ₁ > φ₀.
+    The angles around an interior vertex add up to ``2π t``, and around a boundary vertex to ``2π t + φ₁ − φ₀``. Here t
+    is the number of triangles that contain the direction of the x axis (`count_turns`). φ₀ and φ₁ in [0, 2π) are the
+    directions to the next and to the previous vertex of the loop, where the fan begins and ends. So at the boundary the
+    sum exceeds 2π if t is at least 2, or if t is 1 and φ₁ > φ₀.
     """
     turns = np.zeros(len(uv), dtype=np.int64)
     count_turns(F, uv, turns)
@@ -93,7 +93,7 @@ def overwound_vertices(F: IntArray, uv: FloatArray, sign: SignArray, loops: list
 
 
 def _comes_before(centre: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether the direction from a centre to one place is smaller than to another, as angles from 0 to below 2π."""
+    """Whether the direction from a centre to ``one`` has a smaller angle in [0, 2π) than the direction to ``other``."""
     lower_one, lower_other = (
         (to[:, 1] < centre[:, 1]) | ((to[:, 1] == centre[:, 1]) & (to[:, 0] < centre[:, 0])) for to in (one, other)
     )
@@ -103,11 +103,11 @@ def _comes_before(centre: FloatArray, one: FloatArray, other: FloatArray) -> Boo
 
 @compiled
 def count_turns(F: IntArray, uv: FloatArray, turns: IntArray) -> None:
-    """Add to every vertex (n,) how often the triangles around it wind around it, if they are positive.
+    """Add to every vertex (n,) the winding number of its triangles, provided that they are positive.
 
-    Positive triangles turn counterclockwise around their vertex by less than half a turn each, so one
-    of them passes the direction of the x axis exactly if its next corner lies below the vertex and
-    its last does not; as many do as there are turns.
+    A positive triangle spans an angle of less than π at its vertex. It contains the direction of the x axis
+    if and only if its next corner lies below the vertex and its last corner does not. The number of such
+    triangles is the winding number.
     """
     y = uv[:, 1].copy()
     for start in range(0, len(F), TRIANGLE_CHUNK):

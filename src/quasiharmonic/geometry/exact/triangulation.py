@@ -1,10 +1,9 @@
-"""Triangulate a simple polygon, exactly.
+"""Exact triangulation of a simple polygon.
 
-A line sweeps the polygon from left to right [1]_. Where it stands, each interval of it inside the
-polygon ends a region to its left that is triangulated but for a chain of corners, from the side below
-the interval to the side above, which bulges to the right: nothing more can be cut off. A corner that
-the sweep comes to joins a chain at one of its ends, or splits or merges chains, and cuts off triangles
-until all chains bulge again.
+A line sweeps the polygon from left to right [1]_. Each interval of the line inside the polygon bounds a region on its
+left. This region is triangulated except for a chain of corners, from the side below the interval to the side above. The
+chain is convex towards the right, so that no more triangles can be cut off. Each new corner extends a chain at one of
+its ends, or splits or merges chains. It cuts off triangles until all chains are convex again.
 
 References
 ----------
@@ -19,12 +18,12 @@ Triangle = tuple[int, int, int]
 
 
 def triangulate(corners: list[Point]) -> list[Triangle]:
-    """Cut a simple polygon into triangles, in O(n log n) steps.
+    """Triangulate a simple polygon in O(n log n) steps.
 
     Parameters
     ----------
     corners : list of (int, int)
-        Counterclockwise, no two equal. Straight angles are allowed.
+        Counterclockwise and distinct. Straight angles are allowed.
 
     Returns
     -------
@@ -39,7 +38,7 @@ def triangulate(corners: list[Point]) -> list[Triangle]:
 
 
 class _Link:
-    """A place in a chain; where a chain is split, its rightmost corner gets two."""
+    """Element of a chain. When a chain is split, its rightmost corner gets two elements."""
 
     __slots__ = ("above", "below", "corner")
 
@@ -50,7 +49,7 @@ class _Link:
 
 
 class _Interval:
-    """Of the sweep line, between two sides of the polygon."""
+    """Interval of the sweep line between two sides of the polygon."""
 
     __slots__ = ("bottom", "last", "side", "top")
 
@@ -64,7 +63,7 @@ class _Interval:
 
 
 class _Sweep:
-    """The intervals of the sweep line, from bottom to top, and the triangles to its left."""
+    """Sweep state: intervals of the sweep line from bottom to top, and the triangles to its left."""
 
     def __init__(self, corners: list[Point]) -> None:
         self._corners = corners
@@ -72,7 +71,7 @@ class _Sweep:
         self.triangles: list[Triangle] = []
 
     def meet(self, v: int) -> None:
-        """Move on to the next corner."""
+        """Process the next corner."""
         before, after = v - 1, (v + 1) % len(self._corners)
         here = self._corners[v]
         from_left, to_right = self._corners[before] < here, here < self._corners[after]
@@ -91,13 +90,13 @@ class _Sweep:
             self._close(at, v)
 
     def _open(self, at: int, v: int, after: int) -> None:
-        """Both sides at a corner go to the right: an interval begins there, or is split."""
+        """Process a corner with both sides to its right: an interval begins or is split."""
         link = _Link(v)
         if self._turn(v - 1, v, after) > 0:
             self._intervals.insert(at + 1, _Interval((v, after), link, link, link))
             return
         lower = self._intervals[at]
-        # The rightmost corner of a chain that bulges to the right is seen from anywhere to its right.
+        # The rightmost corner of a chain that is convex towards the right is visible from every point to its right.
         last, top = lower.last, lower.top
         again = _Link(last.corner)
         again.above, last.above = last.above, None
@@ -110,7 +109,7 @@ class _Sweep:
         self._intervals.insert(at + 1, upper)
 
     def _close(self, at: int, v: int) -> None:
-        """Both sides at a corner come from the left: an interval ends there, or two become one."""
+        """Process a corner with both sides to its left: an interval ends, or two intervals merge."""
         upper = self._intervals.pop(at)
         if self._turn(v - 1, v, (v + 1) % len(self._corners)) > 0:
             link = upper.bottom
@@ -122,7 +121,7 @@ class _Sweep:
         link = _Link(v)
         self._add_below(upper, link)
         self._add_above(lower, _Link(v))
-        # The two places of the corner become one.
+        # Merge the two elements of the corner into one.
         if lower.top.below is not None:
             lower.top.below.above = link
             link.below = lower.top.below
@@ -131,7 +130,7 @@ class _Sweep:
         lower.last, lower.top = link, upper.top
 
     def _add_below(self, interval: _Interval, link: _Link) -> None:
-        """Put a corner at the lower end of a chain and cut off what no longer bulges."""
+        """Add a corner at the lower end of a chain and cut off triangles until the chain is convex."""
         next_ = interval.bottom
         while next_.above is not None and self._turn(link.corner, next_.corner, next_.above.corner) < 0:
             self.triangles.append((link.corner, next_.above.corner, next_.corner))
@@ -140,7 +139,7 @@ class _Sweep:
         interval.bottom = interval.last = link
 
     def _add_above(self, interval: _Interval, link: _Link) -> None:
-        """Put a corner at the upper end of a chain and cut off what no longer bulges."""
+        """Add a corner at the upper end of a chain and cut off triangles until the chain is convex."""
         next_ = interval.top
         while next_.below is not None and self._turn(link.corner, next_.corner, next_.below.corner) > 0:
             self.triangles.append((link.corner, next_.corner, next_.below.corner))
@@ -149,7 +148,7 @@ class _Sweep:
         interval.top = interval.last = link
 
     def _below(self, point: Point) -> int:
-        """Index of the highest interval whose lower side is below a point or ends in it; -1 for none."""
+        """Index of the highest interval whose lower side is below or at a point; -1 if there is no such interval."""
         low, high = 0, len(self._intervals)
         x, y = point
         while low < high:
@@ -163,6 +162,6 @@ class _Sweep:
         return low - 1
 
     def _turn(self, p: int, q: int, r: int) -> int:
-        """Positive where the way from p over q to r turns left, negative where it turns right."""
+        """Twice the signed area of the triangle p, q, r: positive for a left turn, negative for a right turn."""
         (px, py), (qx, qy), (rx, ry) = self._corners[p], self._corners[q], self._corners[r]
         return (qx - px) * (ry - py) - (qy - py) * (rx - px)

@@ -1,4 +1,4 @@
-"""Topology of triangle meshes, reference triangles, rest shapes, operators, seams and refinement.
+"""Mesh topology, reference triangles, rest shapes, operators, seams and refinement.
 
-The package builds on `util`. Start reading in `topology`, then `surface` for what counts as a surface.
+The package builds on `util`. Start reading in `topology`, then `surface` for the definition of a valid surface.
 """

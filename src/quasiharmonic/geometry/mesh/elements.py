@@ -1,8 +1,8 @@
 """Elements of planar meshes: triangles of three and of six nodes, and quadrilaterals.
 
-A row has an element's nodes, corners first, one after another around it. A triangle of six nodes has its mid-side nodes
-behind its corners, between the first and the second, the second and the third, the third and the first, as Gmsh and VTK
-order them. A row of four whose last two are one node is a triangle among quadrilaterals.
+A row lists the nodes of an element, corners first, in order around the element. In a triangle of six nodes the mid-side
+nodes follow the corners: between corners 0 and 1, corners 1 and 2, and corners 2 and 0, as in Gmsh and VTK. A row of
+four nodes whose last two are equal is a triangle among quadrilaterals.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.util.arrays import IntArray, check_range, index_array, named, named_edges
 
-#: Pairs of a six-node triangle's corners, and the mid-side node between each.
+#: Pairs of corners of a six-node triangle, and the mid-side node between each pair.
 SIDES = np.array([(0, 1), (1, 2), (2, 0)])
 MIDDLES = np.array([3, 4, 5])
-# The four triangles of a six-node one, and of a quadrilateral: those on either side of a diagonal, and at its corners.
+# The four triangles of a six-node triangle; the halves of a quadrilateral; its four corner triangles.
 _QUARTERS = np.array([(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)])
 _HALVES = np.array([(0, 1, 2), (0, 2, 3)])
 _CORNERS = np.array([(0, 1, 2), (1, 2, 3), (2, 3, 0), (3, 0, 1)])
-# Nodes of a row, by how many they are: in the other direction around the element.
+# Order of the nodes in the opposite direction around the element, by the number of nodes.
 _TURNED = {3: [0, 2, 1], 4: [0, 3, 2, 1], 6: [0, 2, 1, 5, 4, 3]}
 
 
 def element_array(F: ArrayLike, n: int) -> IntArray:
-    """Elements among ``n`` nodes as (f, 3), (f, 4) or (f, 6) int64; a copy.
+    """Convert elements among ``n`` nodes to (f, 3), (f, 4) or (f, 6) int64; returns a copy.
 
     Raises
     ------
     ValueError
-        When there are none, they are no such elements, refer to nodes that there are not, have a node twice, or a node
-        is between other corners in one element than in another.
+        If there are no elements, the shape is wrong, a node does not exist, or an element repeats a node. Also if
+        a mid-side node lies between different corners in different elements.
     """
     array = element_rows(F, n)
     if array.size == 0:
@@ -50,12 +50,12 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
 
 
 def element_rows(F: ArrayLike, n: int) -> IntArray:
-    """Any number of elements among ``n`` nodes, and be it none, as (f, 3), (f, 4) or (f, 6) int64; a copy.
+    """Convert elements among ``n`` nodes to (f, 3), (f, 4) or (f, 6) int64, where f may be 0; returns a copy.
 
     Raises
     ------
     ValueError
-        When they are no elements by their shape, or refer to nodes that there are not.
+        If the shape is wrong or a node does not exist.
     """
     array = index_array("F", F)
     if array.size == 0:
@@ -70,7 +70,7 @@ def element_rows(F: ArrayLike, n: int) -> IntArray:
 
 
 def _check_middles(F: IntArray) -> None:
-    """Refuse six-node triangles (f, 6) in another order of nodes, as far as neighbours show it."""
+    """Raise if neighbouring six-node triangles (f, 6) place a mid-side node between different corners."""
     ends = np.sort(F[:, SIDES].reshape(-1, 2), axis=1)
     middle, first, number = np.unique(F[:, MIDDLES], return_index=True, return_inverse=True)
     torn = (ends != ends[first][number.ravel()]).any(axis=1)
@@ -83,12 +83,12 @@ def _check_middles(F: IntArray) -> None:
 
 
 def check_spread(F: IntArray, n: int) -> None:
-    """Refuse a planar mesh of ``n`` nodes, its elements made counterclockwise, of which neighbours lie on each other.
+    """Raise if neighbouring elements of a planar mesh of ``n`` nodes overlap; elements are counterclockwise.
 
     Raises
     ------
     ValueError
-        Names the sides on which that is so.
+        If both elements of a side lie on the same side of it; the message names the sides.
     """
     found = edges(covering_triangles(F)[0], n)
     if found.inconsistent.size and not found.nonmanifold.size:
@@ -99,24 +99,24 @@ def check_spread(F: IntArray, n: int) -> None:
 
 
 def joined(blocks: Sequence[IntArray]) -> IntArray:
-    """Blocks of elements (k, 3), (k, 4) or (k, 6), one after another, as rows of one length.
+    """Join blocks of elements (k, 3), (k, 4) or (k, 6) into rows of one length.
 
     Raises
     ------
     ValueError
-        When there are six-node triangles beside others.
+        If there are six-node triangles and other elements.
     """
     sizes = {block.shape[1] for block in blocks if len(block)}
     if len(sizes) > 1 and 6 in sizes:
         raise ValueError("there are six-node triangles beside others: all elements must be of one order")
     width = max(sizes, default=3)
-    # A triangle among quadrilaterals has its last node twice.
+    # A triangle among quadrilaterals repeats its last node.
     whole = [block[:, [*range(block.shape[1]), 2][:width]] for block in blocks if len(block)]
     return np.concatenate([np.empty((0, width), dtype=np.int64), *whole])
 
 
 def name_elements(F: IntArray, which: IntArray) -> str:
-    """Name the first few of some elements: ``quadrilaterals 3, 8``."""
+    """Name the first few of the given elements: ``quadrilaterals 3, 8``."""
     if F.shape[1] == 4:
         return named("quadrilateral", "quadrilaterals", which)
     return named("triangle", "triangles", which)
@@ -128,9 +128,9 @@ def covering_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
     Returns
     -------
     triangles : (t, 3) int64
-        Of a six-node triangle four, of a quadrilateral two.
+        Four for a six-node triangle, two for a quadrilateral.
     of : (t,) int64
-        The element of each.
+        Index of the element of each triangle.
     """
     if F.shape[1] == 3:
         return F, np.arange(len(F))
@@ -142,24 +142,24 @@ def covering_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def nets_of(F: IntArray) -> list[IntArray]:
-    """Sets of triangles to search for a map on, one after the other until a map will do.
+    """Triangle sets on which to search for a map, in the order to try them.
 
-    Of six-node triangles those between the corners, which see no curved side, and then those that cover them.
+    For six-node triangles the first set joins the corners and ignores curved sides; the second covers the elements.
     """
     covering, _ = covering_triangles(F)
     return [F[:, :3], covering] if F.shape[1] == 6 else [covering]
 
 
 def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
-    """The triangles at the corners of quadrilaterals (f, 4), which are all positive just where these are convex.
+    """Corner triangles of quadrilaterals (f, 4); all are positive if and only if the quadrilaterals are convex.
 
     Returns
     -------
     triangles : (t, 3) int64
-        Four of each quadrilateral, and where it is a triangle that one twice, so that all are covered twice. The
-        corner is the node in the middle.
+        Four for each quadrilateral. A triangle among quadrilaterals occurs twice, so every element is covered twice.
+        The corner is the middle node.
     of : (t,) int64
-        The element of each.
+        Index of the element of each triangle.
     """
     triangles, of = _parts(F, _CORNERS)
     at = np.arange(len(of)) % len(_CORNERS)
@@ -168,7 +168,7 @@ def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def rim(F: IntArray) -> IntArray:
-    """Nodes on sides that one element alone has, however elements are wound; ascending."""
+    """Ascending nodes on sides that belong to one element only; the orientation of elements does not matter."""
     triangles, _ = covering_triangles(F)
     pairs = np.sort(triangles[:, SIDES].reshape(-1, 2), axis=1)
     found, count = np.unique(pairs, axis=0, return_counts=True)
@@ -176,7 +176,7 @@ def rim(F: IntArray) -> IntArray:
 
 
 def turned_over(F: IntArray) -> IntArray:
-    """The same elements with their nodes in the other direction around them, beginning at the same one."""
+    """The same elements with their nodes in the opposite direction, starting at the same node."""
     turned: IntArray = F[:, _TURNED[F.shape[1]]]
     if F.shape[1] == 4:
         triangles = F[:, 2] == F[:, 3]

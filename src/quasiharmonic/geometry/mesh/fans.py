@@ -1,4 +1,4 @@
-"""Fans: the triangles around a vertex that are joined by edges. Where there are several, the vertex can be split."""
+"""Fans: sets of triangles around a vertex that are joined by edges. A vertex with several fans can be split."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from quasiharmonic.util.arrays import BoolArray, IntArray
 
 
 def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Split vertices at which triangles touch without being joined by edges.
+    """Split vertices at which triangles touch without a common edge.
 
     Parameters
     ----------
     F : (f, 3) int64
-        Triangles, of any kind.
+        Any triangles.
     cut : (f, 3) bool, optional
-        At which sides, from each corner to the next, triangles are not joined whatever they share.
+        Sides, from each corner to the next, at which triangles are never joined.
 
     Returns
     -------
     split : (f, 3) int64
-        The same triangles with a vertex of its own for every fan around one: now a surface, with a boundary where
-        an edge was not shared by exactly two triangles that are wound alike.
+        The same triangles with a separate vertex for every fan. They form surfaces. An edge becomes a boundary unless
+        exactly two triangles share it with opposite directions.
     component : (f,) int64
-        The component of each triangle; both are numbered by first appearance.
+        Component of each triangle. Vertices and components are numbered by first appearance.
     """
     corner = np.arange(F.size).reshape(-1, 3)
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
@@ -38,30 +38,31 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     if cut is not None:
         opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
     one, other = one[opposed], other[opposed]
-    # The half-edge of a corner begins there: a joined pair identifies begin with end and end with begin.
+    # The half-edge of a corner begins there. Joining two half-edges identifies the start of each with the end of the
+    # other.
     split = linked(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
     component = linked(one // 3, other // 3, len(F))
-    # What is called by its smallest element is in the order of appearance.
+    # Labels are smallest elements, so their rank is the order of appearance.
     split, component = ((np.cumsum(label == np.arange(label.size)) - 1)[label] for label in (split, component))
     return split.reshape(-1, 3), component
 
 
 def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
-    """Give the vertices of some triangles numbers without gaps.
+    """Number the vertices of some triangles without gaps.
 
     Parameters
     ----------
     split : (k, 3) int64
-        Triangles, as `fans` has them.
+        Triangles, as returned by `fans`.
     F : (k, 3) int64
-        The same triangles by the vertices that were split. These decide the order: one that was not split and has
-        no gap keeps its numbers.
+        The same triangles by the original vertices. New numbers follow their order, so a mesh without split vertices
+        and without gaps keeps its numbers.
 
     Returns
     -------
     renumbered : (k, 3) int64
     first : (m,) int64
-        For every vertex a corner that it is at, as an index into the flattened triangles.
+        One corner of every vertex, as an index into the flattened triangles.
     """
     _, first, own = np.unique(split.ravel(), return_index=True, return_inverse=True)
     order = np.argsort(F.ravel()[first], kind="stable")
@@ -69,23 +70,23 @@ def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def numbered(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Give every fan a vertex: of several around one the first keeps its number, the others come after all vertices.
+    """Give every fan a vertex: the first fan around a vertex keeps its number, further fans follow all vertices.
 
     Parameters
     ----------
     F : (f, 3) int64
         Triangles.
     split : (f, 3) int64
-        Their fans, as `fans` numbers them.
+        Their fans, as numbered by `fans`.
     n : int
         Number of vertices.
 
     Returns
     -------
     FT : (f, 3) int64
-        The triangles, by fans: `F` where a vertex was not split.
+        The triangles by fans; equals ``F`` where a vertex was not split.
     origin : (n + c,) int64
-        The vertex that each fan is around: ``origin[FT]`` is ``F``, and the first ``n`` are themselves.
+        The vertex of each fan: ``origin[FT]`` is ``F``, and the first ``n`` entries are ``0 … n - 1``.
     """
     # Fans are numbered by first appearance.
     vertex = F.ravel()[np.unique(split.ravel(), return_index=True)[1]]

@@ -1,21 +1,21 @@
-"""Distances along a surface, as chains of straight segments.
+"""Distances along a surface, as lengths of chains of straight segments.
 
-A shortest path on a triangle mesh is straight wherever it crosses an edge: laid flat, the triangles that it passes
-form a strip, and the path is a straight line in it. It bends at vertices only, at saddles and around the boundary.
-So a graph is built of all straight segments from vertex to vertex that cross only so many edges, and Dijkstra's
-algorithm joins them into chains::
+A shortest path on a triangle mesh is straight wherever it crosses an edge: if the triangles of its strip are laid into
+the plane, it is a straight line. It bends only at vertices, which are saddles or on the boundary. The graph here has
+all straight segments between vertices that cross at most a given number of edges. Dijkstra's algorithm joins them into
+chains::
 
-              o                o ───────── o      From every vertex windows, bounded by vertices seen before, are
-            ╱ │ ╲            ╱ ·  ╲       ╱       followed from triangle to triangle [1]_. A vertex that comes up
-          ╱   │   ╲        ╱     ·  ╲   ╱         inside of a window is seen: it gives a segment, and splits the
-        o ····┼···· o     o ───────── o           window in two.
+              o                o ───────── o      Start with windows at every vertex, bounded by vertices seen
+            ╱ │ ╲            ╱ ·  ╲       ╱       before, and follow them from triangle to triangle [1]_. A
+          ╱   │   ╲        ╱     ·  ╲   ╱         vertex inside a window is seen: it gives a segment and splits
+        o ····┼···· o     o ───────── o           the window in two.
           ╲   │   ╱
             ╲ │ ╱          1 and 2 edges crossed
               o
 
-Every chain is a path on the surface, so no distance comes out too short, but for rounding. The more edges a segment
-may cross, the less are they too long. On a folded surface of 18,654 triangles (a human cortex), out to 20 edges away,
-against exact distances: 2.0 % on average for 1 crossing, 0.55 % for 3, 0.23 % for 5 and 0.05 % for 10. Odd numbers pay.
+Every chain is a path on the surface, so no distance is too short, except for rounding. The excess decreases with the
+number of crossings allowed. On a human cortex of 18,654 triangles, up to 20 edges away, the average excess over exact
+distances is 2.0 % for 1 crossing, 0.55 % for 3, 0.23 % for 5 and 0.05 % for 10. Odd numbers are most efficient.
 
 References
 ----------
@@ -33,14 +33,14 @@ from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
 from quasiharmonic.util.progress import heartbeat
 
-# From so many vertices together distances are taken in what is around them all, ...
+# Number of sources in one Dijkstra run, on the subgraph around them.
 _AT_A_TIME = 64
-# ... and from those that have not got to all of their targets so many times as far.
+# Growth of the search radius for sources that have not reached all of their targets.
 _FARTHER = 1.25
 
 
 def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: float = 0.0) -> csr_array:
-    """All straight segments between vertices of a surface that cross few of its edges.
+    """Lengths of all straight segments between vertices of a surface that cross few of its edges.
 
     Parameters
     ----------
@@ -49,9 +49,10 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
     F : (f, 3) int64
         Triangles of a surface, consistently oriented, none of zero area.
     crossings : int
-        The number of edges that a segment may cross; with 0 there are but the edges themselves.
+        Maximum number of edges that a segment may cross; 0 gives only the edges themselves.
     lowest : float
-        Triangles lower than this share of their longest side are taken as being so high, and may have no area.
+        Minimum height of a triangle as a fraction of its longest side. Lower triangles are raised to this height, so
+        with a positive value triangles may have no area.
 
     Returns
     -------
@@ -61,7 +62,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
     Raises
     ------
     ValueError
-        When triangles have no area.
+        If triangles have no area after ``lowest`` is applied.
     """
     shapes = rest_shapes(V, F, lowest=lowest)
     if shapes.flat.size:
@@ -69,17 +70,17 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
             f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: it cannot be laid flat there"
         )
     n, f = len(V), len(F)
-    # Half-edges, corner by corner; the one after is f further on.
+    # Half-edges, corner by corner; the next half-edge of a triangle is f further.
     side = shapes.sides.ravel()
     tail, head, apex = (np.roll(F.T, -k, axis=0).ravel() for k in range(3))
     number = np.arange(3 * f)
     after, before = (number + f) % (3 * f), (number + 2 * f) % (3 * f)
-    # The apex, where the half-edge leads from 0 to 1.
+    # The apex, in the frame where the half-edge leads from 0 to 1.
     height = 1 + side[after] / side
     twin = _twins(tail, head, n)
 
-    # A window is seen from its source, which is at 0: the half-edge leads from ``a`` to ``b`` counterclockwise around
-    # it, on the near side, and what is seen through it lies between the directions ``low`` and ``high``.
+    # Each window has its source at 0. Its half-edge leads from ``a`` to ``b`` counterclockwise around the source, on
+    # the near side. The visible directions lie between ``low`` and ``high``.
     edge, source = number, apex
     a, b = -height * side, (1 - height) * side
     low, high = a, b
@@ -89,12 +90,12 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
         inner = edge >= 0
         edge, source, a, b, low, high = edge[inner], source[inner], a[inner], b[inner], low[inner], high[inner]
         heartbeat()
-        # Across the edge, which is traversed from ``b`` to ``a`` there.
+        # Cross the edge. The triangle on the other side traverses it from ``b`` to ``a``.
         c = b + height[edge] * (a - b)
         left, right = _cross(low, c) > 0, _cross(c, high) > 0
         seen = left & right
         found.append((source[seen], apex[edge[seen]], np.abs(c[seen])))
-        # Through the side from a to c, and through that from c to b.
+        # Continue through the side from a to c, and through the side from c to b.
         edge = np.concatenate([after[edge[left]], before[edge[right]]])
         source = np.concatenate([source[left], source[right]])
         low, high = (
@@ -107,9 +108,9 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
 
 
 def edge_graph(F: IntArray, n: int) -> csr_array:
-    """Which of ``n`` vertices are joined by an edge; (n, n) with ones."""
+    """Adjacency of ``n`` vertices by edges; (n, n) sparse matrix of ones."""
     tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
-    # SciPy's walks in graphs took indices of 32 bits alone before 1.17.
+    # SciPy before 1.17 accepts only 32-bit indices in graph searches.
     ends = tuple(np.concatenate(both).astype(np.int32) for both in ((tail, head), (head, tail)))
     graph = csr_array((np.ones(2 * tail.size), ends), shape=(n, n))
     graph.data[:] = 1
@@ -117,20 +118,21 @@ def edge_graph(F: IntArray, n: int) -> csr_array:
 
 
 def neighbours_within(edges: csr_array, sources: IntArray, rings: int) -> tuple[IntArray, IntArray]:
-    """Vertices at most so many edges away from each of some sources, these themselves excepted.
+    """Vertices at most ``rings`` edges away from each source, without the source itself.
 
     Parameters
     ----------
     edges : (n, n) csr_array
-        As `edge_graph` makes it.
+        Result of `edge_graph`.
     sources : (s,) int64
-        Quickest if those near each other in this order are near each other on the surface.
+        Vertices. The search is fastest if neighbours in this order are close on the surface.
     rings : int
+        Maximum number of edges.
 
     Returns
     -------
     row, vertex : (k,) int64
-        Which source, ascending, and the vertex.
+        Index of the source, ascending, and the vertex.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -145,18 +147,18 @@ def neighbours_within(edges: csr_array, sources: IntArray, rings: int) -> tuple[
 
 
 def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target: IntArray, reach: float) -> FloatArray:
-    """Lengths of the shortest chains of segments from each of some sources to targets of its own.
+    """Lengths of the shortest chains of segments from each source to its own targets.
 
     Parameters
     ----------
     segments : (n, n) csr_array
-        As `straight_segments` makes it.
+        Result of `straight_segments`.
     sources : (s,) int64
-        As of `neighbours_within`.
+        Vertices, ordered as for `neighbours_within`.
     row, target : (k,) int64
-        Which source, ascending, and the vertex to get to; there must be a way.
+        Index of the source, ascending, and the target vertex. The target must be reachable.
     reach : float
-        About how far the farthest is. Sources with further ones are asked again, farther and farther.
+        Initial search radius. The radius grows for sources that do not reach all of their targets.
 
     Returns
     -------
@@ -183,14 +185,14 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
 
 
 def _portions(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
-    """Sources in portions, and where each portion begins."""
+    """Yield portions of the sources, each with its start."""
     for start in range(0, sources.size, _AT_A_TIME):
         heartbeat()
         yield start, sources[start : start + _AT_A_TIME]
 
 
 def _around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:
-    """The vertices that can be reached from some sources, the part of the graph between them, and the sources in it."""
+    """Return the vertices within reach of any source, the graph among them, and the sources' indices in it."""
     from scipy.sparse.csgraph import dijkstra
 
     near = dijkstra(graph, indices=sources, limit=reach, min_only=True)
@@ -199,7 +201,7 @@ def _around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray
 
 
 def _twins(tail: IntArray, head: IntArray, n: int) -> IntArray:
-    """The half-edge between the same vertices in the opposite direction; -1 on the boundary."""
+    """Index of the opposite half-edge of each half-edge; -1 on the boundary."""
     key, opposite = tail * n + head, head * n + tail
     order = np.argsort(key)
     place = np.minimum(np.searchsorted(key, opposite, sorter=order), key.size - 1)
@@ -208,7 +210,7 @@ def _twins(tail: IntArray, head: IntArray, n: int) -> IntArray:
 
 
 def _shortest(row: IntArray, column: IntArray, length: FloatArray, n: int) -> csr_array:
-    """A matrix with the least of all lengths given for an entry."""
+    """Sparse matrix with the minimum of all lengths of each entry."""
     key = row * n + column
     order = np.argsort(key, kind="stable")
     key = key[order]

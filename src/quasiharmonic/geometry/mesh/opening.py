@@ -1,7 +1,7 @@
-"""A mesh opened along edges, its own vertices and triangles left as they are.
+"""Open a mesh along edges without changing its vertices and triangles.
 
-What is cut gets corners of its own: a second set of triangles, ``FT``, whose indices tell apart what lies on either
-side of a cut. It is to ``F`` what texture corners are to vertices.
+The result is a second set of triangles, ``FT``, whose indices differ on the two sides of a cut. ``FT`` relates to ``F``
+as texture corners relate to vertices.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from quasiharmonic.util.arrays import IntArray, check_range, named_edges
 
 
 class Corners(NamedTuple):
-    """The corners of triangles once a mesh is open along edges.
+    """Corners of the triangles of a mesh that was opened along edges.
 
     Attributes
     ----------
     FT : (f, 3) int64
-        The triangles, by copies of vertices. It is ``F`` where a vertex was not split; of a vertex that was, one copy
-        keeps its number and the others come after all vertices.
+        The triangles, by copies of vertices. It equals ``F`` where a vertex was not split. One copy of a split vertex
+        keeps its number; the others follow all vertices.
     origin : (n + c,) int64
-        The vertex that each copy is of: ``origin[FT]`` is ``F``, and the first ``n`` are themselves.
+        The vertex of each copy: ``origin[FT]`` is ``F``, and the first ``n`` entries are ``0 … n - 1``.
     """
 
     FT: IntArray
@@ -37,10 +37,10 @@ def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     Parameters
     ----------
     F : (f, 3) int64
-        Triangles, of any kind. Where they touch at a vertex without being joined by edges they come apart, too.
+        Any triangles. Where they touch at a vertex without a common edge, the vertex is split, too.
     cut : (k, 2) int64
-        Edges of the mesh, either end first. Those on the boundary are open already, and one alone, with both ends
-        inside, opens nothing.
+        Edges of the mesh, either end first. Boundary edges have no effect. A single edge with two interior ends opens
+        nothing.
     n : int
         Number of vertices.
 
@@ -51,7 +51,7 @@ def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     Raises
     ------
     ValueError
-        When a cut is no edge of the mesh; the message names the first.
+        If a cut is not an edge of the mesh; the message names the first ones.
     """
     check_range("edges", cut, n)
     sides, wanted = edge_keys(F, np.roll(F, -1, axis=1), n), edge_keys(cut[:, 0], cut[:, 1], n)

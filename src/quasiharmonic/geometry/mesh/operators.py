@@ -1,7 +1,7 @@
-"""The operators of §6.2 as sparse matrices, for study, tests and the reader's own experiments.
+"""The operators of §6.2 as sparse matrices, for study, tests and experiments.
 
-The solver never forms them: it assembles from the triangles (§F.1). What is here ties its formulas to
-the paper's.
+The solver assembles from the triangles (§F.1) and does not use these matrices. They relate its formulas to
+those of the paper.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Operators:
     C: csr_array
 
     def laplacian(self, a: FloatArray | None = None) -> csr_array:
-        """``Gᵀ A G`` for a tensor field; the cotangent Laplacian without one.
+        """``Gᵀ A G`` for a tensor field; the cotangent Laplacian by default.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Refere
     F : (f, 3) int
         Triangles, consistently oriented.
     reference : {"rest", "equilateral", "corrected"}
-        The triangles in which gradients and areas are taken.
+        The reference triangles of gradients and areas.
 
     Returns
     -------

@@ -1,7 +1,8 @@
-"""Faces of any number of corners, and the triangles that stand for them.
+"""Polygonal faces and their triangulation.
 
-A triangulation has no vertex that the polygons do not have, and is chosen by their shape. A polygon then is a ring of
-corners of triangles, so what a triangle's corner says of its vertex and of its place holds for the polygon's.
+The triangulation adds no vertices and depends on the shape of the polygons. A polygon is a ring of corners of
+triangles. So data at the corners of triangles, such as vertex and texture position, also describe the polygon's
+corners.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, named
 
-# Ears whose shapes differ by less are alike, and the first one is taken: noise in the last digits shall not decide.
+# Ears whose scores differ by less count as equal, and the first one is cut, so that rounding does not decide.
 _ALIKE = 1e-9
 
 
@@ -20,15 +21,15 @@ _ALIKE = 1e-9
 class Polygons:
     """Faces as rings of corners of triangles.
 
-    The triangles are numbered polygon by polygon; one of k corners has k - 2 of them.
+    The triangles are numbered polygon by polygon; a polygon of k corners has k - 2 triangles.
 
     Attributes
     ----------
     corners : (c,) int64
-        The rings, one after another: indices into the flattened triangles. A corner of several of the polygon's
-        triangles is there as one of them.
+        The rings, one after another: indices into the flattened triangles. A corner that belongs to several of
+        the polygon's triangles is listed as a corner of one of them.
     starts : (p + 1,) int64
-        Where each ring begins, and the end of the last one.
+        Start of each ring, and the end of the last one.
     """
 
     corners: IntArray
@@ -39,21 +40,21 @@ class Polygons:
 
     @property
     def sizes(self) -> IntArray:
-        """How many corners each has; (p,) int64."""
+        """Number of corners of each polygon; (p,) int64."""
         return np.diff(self.starts)
 
     @property
     def first_triangle(self) -> IntArray:
-        """The first triangle of each, and the number of triangles; (p + 1,) int64."""
+        """Index of the first triangle of each polygon, and the number of triangles; (p + 1,) int64."""
         return self.starts - 2 * np.arange(len(self.starts))
 
     @property
     def of_triangle(self) -> IntArray:
-        """The polygon that each triangle is a part of; (f,) int64."""
+        """Index of the polygon of each triangle; (f,) int64."""
         return np.repeat(np.arange(len(self)), self.sizes - 2)
 
     def diagonals(self, F: IntArray) -> IntArray:
-        """Edges (d, 2) of the triangles ``F`` inside polygons, at which nothing can be cut; by vertices."""
+        """Edges (d, 2) of the triangles ``F`` inside polygons, by vertices; a mesh cannot be cut there."""
         inside = np.repeat(self.sizes > 3, self.sizes - 2)
         parent = self.of_triangle[inside]
         tail = F[inside]
@@ -66,33 +67,34 @@ class Polygons:
 def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[IntArray, Polygons]:
     """Triangulate polygons by their shape.
 
-    Ears are cut off, the best-shaped one first, seen along the polygon's mean normal; an ear is a corner that is convex
-    and whose triangle has no other corner inside or on it. Of the last four corners the better diagonal is taken.
+    Each polygon is projected along its mean normal. Then ears are cut off, best shape first. An ear is a convex corner
+    whose triangle has no other corner inside or on it. For the last four corners the better diagonal is used.
 
     Parameters
     ----------
     V : (n, 3) float64
         Positions.
     vertices : (c,) int64
-        The polygons' vertices, ring after ring.
+        Vertices of the polygons, ring after ring.
     starts : (p + 1,) int64
-        Where each ring begins, and the end of the last one.
+        Start of each ring, and the end of the last one.
 
     Returns
     -------
     T : (f, 3) int64
-        Triangles by corners, that is, by indices into ``vertices``; polygon by polygon, wound as these are. One that is
-        a triangle stays as it is.
+        Triangles as indices into ``vertices``, polygon by polygon, with the orientation of the polygons. A polygon of
+        three corners is unchanged.
     polygons : Polygons
 
     Raises
     ------
     ValueError
-        When a polygon has fewer than three corners, or one of more than three a vertex twice; names the first ones.
+        If a polygon has fewer than three corners, or a polygon of more than three corners repeats a vertex. The message
+        names the first ones.
     """
     sizes = np.diff(starts)
     _check_rings(vertices, sizes)
-    # Of about unit size, so that no square overflows or vanishes.
+    # Scale to about unit size, so that no square overflows or underflows.
     V = np.ldexp(V, -int(np.frexp(np.abs(V).max(initial=0.0))[1]))
     T = np.empty((len(vertices) - 2 * len(sizes), 3), dtype=np.int64)
     first = starts[:-1] - 2 * np.arange(len(sizes))
@@ -101,7 +103,7 @@ def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[I
         rings = starts[alike, None] + np.arange(size)
         cut = rings[:, None] if size == 3 else _ears(V[vertices[rings]], rings)
         T[first[alike, None] + np.arange(size - 2)] = cut
-    # Every corner of a polygon is one of its triangulation's; the first of them is written last.
+    # Assign triangle corners to polygon corners in reverse order, so that the first one is kept.
     corner = np.empty(len(vertices), dtype=np.int64)
     corner[T.ravel()[::-1]] = np.arange(T.size)[::-1]
     return T, Polygons(corner, starts)
@@ -122,14 +124,14 @@ def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
 
 
 def _ears(points: FloatArray, rings: IntArray) -> IntArray:
-    """Triangulate polygons (p, k, 3) of equally many corners, whose numbers are ``rings`` (p, k); (p, k - 2, 3)."""
-    # Corners that are not finite, or whose products are not, are triangulated in any way.
+    """Triangulate polygons (p, k, 3) with k corners each, numbered ``rings`` (p, k); (p, k - 2, 3)."""
+    # If coordinates or their products are not finite, any triangulation is accepted.
     with np.errstate(all="ignore"):
         return _cut(_projected(points), rings)
 
 
 def _cut(flat: ComplexArray, rings: IntArray) -> IntArray:
-    """Cut ears off polygons in the plane (p, k), the best first."""
+    """Cut ears off plane polygons (p, k), best first."""
     triangles = []
     while rings.shape[1] > 3:
         ear = _best_ears(flat)
@@ -142,25 +144,25 @@ def _cut(flat: ComplexArray, rings: IntArray) -> IntArray:
 
 
 def _projected(points: FloatArray) -> ComplexArray:
-    """Polygons (p, k, 3) as complex numbers (p, k), seen against the mean normal by Newell's formula."""
+    """Project polygons (p, k, 3) along their mean normal (Newell's formula) to complex numbers (p, k)."""
     ahead = np.roll(points, -1, axis=1)
     normal = np.cross(points, ahead).sum(axis=1)
-    # The two directions in the plane: the axis least along the normal, made perpendicular, and what completes it.
+    # Two directions in the plane: the axis least aligned with the normal gives the first, a cross product the second.
     least = np.eye(3)[np.abs(normal).argmin(axis=1)]
     across = np.cross(normal, least)
     along = np.cross(across, normal)
     across, along = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (across, along))
-    # A polygon without area has no normal, and is seen as well from anywhere.
+    # A polygon without area has no normal, so any direction is used.
     plane = np.nan_to_num(along + 1j * across, nan=1.0)
     return np.einsum("pkd,pd->pk", points, plane)
 
 
 def _best_ears(flat: ComplexArray) -> IntArray:
-    """The best corner to cut off each of some polygons (p, k), k > 3; (p,) int64."""
+    """Index of the best corner to cut off each polygon (p, k), k > 3; (p,) int64."""
     before, after = np.roll(flat, 1, axis=1), np.roll(flat, -1, axis=1)
     score = _shape(before, flat, after)
     if flat.shape[1] == 4:
-        # The triangle that is left counts as much.
+        # Score the remaining triangle, too.
         score = np.minimum(score, _shape(after, np.roll(flat, -2, axis=1), before))
     rows = np.arange(len(flat))
     best = np.argmax(score >= score.max(axis=1, keepdims=True) - _ALIKE, axis=1)
@@ -173,21 +175,21 @@ def _best_ears(flat: ComplexArray) -> IntArray:
         again = row[blocked]
         most = untried[again].max(axis=1, keepdims=True)
         chosen[again] = np.argmax(untried[again] >= most - _ALIKE, axis=1)
-        # No ear at all: a polygon that crosses itself, of which any triangulation is as bad.
+        # A polygon without any ear crosses itself. Any triangulation is equally bad, so cut the best-scored corner.
         hopeless = again[most[:, 0] <= 0]
         chosen[hopeless], open_[hopeless] = best[hopeless], False
     return chosen
 
 
 def _shape(a: ComplexArray, b: ComplexArray, c: ComplexArray) -> FloatArray:
-    """Twice the signed area over the sum of the squared sides; 0 for a triangle that is a point."""
+    """Twice the signed area over the sum of the squared sides; 0 if the triangle is a point."""
     doubled = ((b - a).conj() * (c - a)).imag
     sides = np.abs(b - a) ** 2 + np.abs(c - b) ** 2 + np.abs(a - c) ** 2
     return np.divide(doubled, sides, out=np.zeros_like(sides), where=sides > 0)
 
 
 def _contains_another(flat: ComplexArray, ear: IntArray) -> BoolArray:
-    """Whether the triangle at a corner of each polygon (p, k) has another corner inside or on it."""
+    """Whether the triangle at corner ``ear`` of each polygon (p, k) has another corner inside or on it; (p,) bool."""
     rows, k = np.arange(len(flat)), flat.shape[1]
     a, b, c = (flat[rows, (ear + step) % k][:, None] for step in (-1, 0, 1))
     inside = np.ones(flat.shape, dtype=np.bool_)

@@ -1,8 +1,8 @@
-"""Reference triangles: the shapes in which gradients are taken (§9.3, §F.1).
+"""Reference triangles: the triangles in which gradients are computed (§9.3, §F.1).
 
-Whether an injective map exists depends on how the triangles are joined, not on their shapes, so the
-triangle in which ``G`` and ``m`` are computed may be chosen. Each reference triangle lies in a frame
-of its own: vertex 0 at the origin and vertex 1 on the positive x axis, written as complex numbers::
+Whether an injective map exists depends on the connectivity of the triangles and not on their shapes. So the triangle in
+which ``G`` and ``m`` are computed is a free choice. Each reference triangle has its own frame, with vertex 0 at
+the origin and vertex 1 on the positive x axis, written as complex numbers::
 
                  z₂
                  ╱╲          γᵢ = gradient of the hat function of vertex i, as gₓ + i·g_y
@@ -27,12 +27,12 @@ from quasiharmonic.util.kernels import compiled
 
 Reference = Literal["equilateral", "rest", "corrected"]
 
-# Triangles in a block: a complex number for each takes 128 KiB, and a dozen such arrays fit into a core's own cache.
+# Triangles in a block: a complex array of one block takes 128 KiB, so about 12 of them fit into a core's cache.
 _BLOCK = 8192
 
 
 def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray]:
-    """Lay every triangle of a mesh into the plane.
+    """Isometrically map every triangle of a mesh to a frame in the plane.
 
     Parameters
     ----------
@@ -46,22 +46,22 @@ def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, Comp
     z1 : (f,) float64
         Vertex 1, on the real axis (vertex 0 is the origin).
     z2 : (f,) complex128
-        Vertex 2. Its imaginary part is signed for planar meshes and not negative for curved ones.
+        Vertex 2. Its imaginary part is signed for planar meshes and non-negative for curved ones.
     """
     return _frames(V, F)[:2]
 
 
 def flat_triangles(V: FloatArray, F: NDArray[np.integer]) -> IntArray:
-    """Ascending indices (k,) of the triangles of a mesh that have no area, as `rest_frames` computes it."""
+    """Ascending indices (k,) of the triangles with zero area, as computed by `rest_frames`."""
     z1, z2, flat = _frames(V, F)
     return np.flatnonzero((z1 == 0) | (z2.imag == 0)) if flat else np.empty(0, dtype=np.int64)
 
 
 def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray, int]:
-    """As `rest_frames`, and how many triangles have no area."""
+    """Return the frames of `rest_frames` and the number of triangles with zero area."""
     T = own_triangles(F)
     check_range("F", T, len(V))
-    # In units near the mesh's own, a power of two, so that products neither overflow nor vanish.
+    # Scale by a power of two near the size of the mesh, so that products neither overflow nor underflow.
     exponent = math.frexp(max(V.max(initial=0), -V.min(initial=0)))[1]
     z1, z2 = np.empty(len(T)), np.empty(len(T), dtype=np.complex128)
     return z1, z2, lay_flat(V, T, exponent, z1, z2)
@@ -69,7 +69,7 @@ def _frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexA
 
 @compiled
 def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: ComplexArray) -> int:
-    """Fill in `rest_frames` (f,), computed in units of 2^exponent; how many triangles have no area."""
+    """Fill in the frames (f,) of `rest_frames`, computed in units of 2^exponent; return the number of zero areas."""
     coordinates = np.ldexp(V.T, -exponent, order="C")
     for part in blocks(len(F)):
         z1[part], z2.real[part], z2.imag[part] = _laid_flat(coordinates, F[part])
@@ -79,7 +79,7 @@ def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: Comp
 
 
 def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Vertex 1 on the axis and both coordinates of vertex 2 in each triangle's frame; (f,) each."""
+    """Vertex 1 on the axis, and both coordinates of vertex 2, in each triangle's frame; (f,) each."""
     corners = [along.take(F) for along in coordinates]
     e1 = [corner[:, 1] - corner[:, 0] for corner in corners]
     e2 = [corner[:, 2] - corner[:, 0] for corner in corners]
@@ -87,7 +87,7 @@ def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatAr
     safe = np.where(length > 0, length, 1.0)
     normal = [e1[i] * e2[j] - e1[j] * e2[i] for i, j in ((0, 1), (1, 2), (2, 0))[: 1 if len(e1) == 2 else 3]]
     across = normal[0] if len(normal) == 1 else np.sqrt(_dot(normal, normal))
-    # Where vertices 0 and 1 coincide any direction is as good as another.
+    # If vertices 0 and 1 coincide, the direction is arbitrary.
     along = np.where(length > 0, _dot(e1, e2), np.sqrt(_dot(e2, e2)))
     return length, along / safe, across / safe
 
@@ -101,9 +101,9 @@ def _dot(a: list[FloatArray], b: list[FloatArray]) -> FloatArray:
 
 
 def blocks(count: int) -> Iterator[slice]:
-    """Consecutive triangles, as many at a time as let what is computed of them stay in the processor's cache.
+    """Yield slices of consecutive triangles, small enough for their intermediate arrays to stay in the cache.
 
-    Where a formula takes many steps, taking them all for one block before the next halves the time.
+    Formulas with many steps take half the time if all steps are computed for one block before the next.
     """
     return (slice(start, start + _BLOCK) for start in range(0, count, _BLOCK))
 
@@ -118,22 +118,22 @@ class ReferenceMesh:
     F : (f, 3) int
         Triangles.
     kind : {"equilateral", "rest", "corrected"}
-        The triangles' shape. ``"rest"``: as they lie in ``V``. ``"equilateral"``: all alike, ``V`` is
-        not looked at. ``"corrected"``: as in ``V``, but angles below π/6 raised to π/6 and the three
-        scaled to sum to π, so that none stays below π/8 (§F.1).
+        Shape of the reference triangles. ``"rest"``: the triangles of ``V``. ``"equilateral"``: all equilateral; ``V``
+        is used only for its length. ``"corrected"``: as in ``V``, with angles below π/6 raised to π/6 and all three
+        scaled to sum to π. Every angle is then at least π/8 (§F.1).
 
     Attributes
     ----------
     m : (f,) float64
-        Areas. Equilateral and corrected triangles have an arbitrary scale (which cancels in all of
-        the functionals).
+        Areas. Equilateral and corrected triangles have an arbitrary scale, which cancels in all of
+        the functionals.
     gamma : (3, f) complex128
-        Gradients of the hat functions. For equilateral triangles these arrays are one number seen
-        f times (stride 0), which keeps them out of memory.
+        Gradients of the hat functions. For equilateral triangles this is a broadcast view with stride 0,
+        which saves memory.
     half_gamma : (2, f) complex128
-        Half of those of the last two corners; the three sum to zero.
+        Half the gradients of the last two corners. The gradients of all three corners sum to zero.
     stiffness_by_entry : (9, f) float64
-        How the stiffness of each edge depends on a11, a12, a22 of the tensor, edge after edge.
+        Coefficients of a11, a12, a22 of the tensor in the stiffness of each edge, edge by edge.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, kind: Reference) -> None:
@@ -155,7 +155,7 @@ class ReferenceMesh:
         self.stiffness_by_entry: FloatArray = np.broadcast_to(per_entry.reshape(9, -1), (9, f))
 
     def __getitem__(self, part: slice) -> ReferenceMesh:
-        """Some of the triangles, among the same vertices."""
+        """Restrict to a slice of the triangles, with the same vertices."""
         some = copy(self)
         some.F, some.m, some.gamma = self.F[part], self.m[part], self.gamma[:, part]
         some.half_gamma, some.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
@@ -182,7 +182,7 @@ class ReferenceMesh:
         Parameters
         ----------
         w : (n,) complex128
-            Places u + iv.
+            Positions u + iv.
 
         Returns
         -------
@@ -191,7 +191,7 @@ class ReferenceMesh:
         Raises
         ------
         ValueError
-            When there is not a place for every vertex.
+            If ``w`` does not have one position for each vertex.
         """
         if w.shape != (self.n,):
             raise ValueError(f"w must have shape ({self.n},), a place for every vertex, not {w.shape}")
@@ -205,7 +205,7 @@ class ReferenceMesh:
 def wirtinger(
     w: ComplexArray, F: IntArray, half_gamma: ComplexArray, p: ComplexArray, q: ComplexArray, area: FloatArray
 ) -> None:
-    """Fill in ``∂w/∂z``, ``∂w/∂z̄`` and signed areas of a map (n,); half_gamma: of the last two corners (2, f)."""
+    """Fill in ``∂w/∂z``, ``∂w/∂z̄`` and signed areas of a map (n,); half_gamma (2, f) is for the last two corners."""
     corners = w.take(F)
     d1, d2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     g1, g2 = half_gamma
@@ -215,17 +215,17 @@ def wirtinger(
 
 
 class Derivatives(NamedTuple):
-    """Wirtinger derivatives of a complex map, by triangle.
+    """Wirtinger derivatives of a complex map, one value per triangle.
 
-    ``det J = |p|² - |q|²``, the singular values are ``|p| ± |q|`` in absolute value, and the map's own
-    Beltrami coefficient is ``q / p``.
+    ``det J = |p|² - |q|²``, the singular values are ``|p| ± |q|`` in absolute value, and the
+    Beltrami coefficient of the map is ``q / p``.
 
     Attributes
     ----------
     p, q : (f,) complex128
         ``∂w/∂z`` and ``∂w/∂z̄`` in the reference triangle's frame.
     area : (f,) float64
-        Signed areas of the images, ``m det J`` computed from the images alone.
+        Signed areas of the images, ``m det J``, computed from the images alone.
     """
 
     p: ComplexArray
@@ -239,11 +239,11 @@ def _equilateral() -> tuple[FloatArray, ComplexArray, FloatArray]:
 
 
 def _tables(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    """Areas (f,), gradients of the hat functions (3, f), and stiffness of edges by the tensor's entries (3, 3, f)."""
+    """Areas (f,), gradients of the hat functions (3, f), and edge stiffness per entry of the tensor (3, 3, f)."""
     opposite = np.stack([z2 - z1, -z2, z1 + 0j])
     m = 0.5 * z1 * z2.imag
-    # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22): m ∇hᵢᵀ 𝒜 ∇hⱼ. It has
-    # no scale, so tiny and huge triangles are on a par.
+    # Stiffness of the three edges (0,1), (1,2), (2,0), linear in the tensor's (a11, a12, a22): m ∇hᵢᵀ 𝒜 ∇hⱼ. It does
+    # not depend on the scale of the triangle.
     gx, gy = (1j * opposite).real, (1j * opposite).imag
     gx1, gy1 = np.roll(gx, -1, axis=0), np.roll(gy, -1, axis=0)
     per_entry = np.stack([gx * gx1, gx * gy1 + gy * gx1, gy * gy1], axis=1) / (4 * m)
@@ -251,11 +251,11 @@ def _tables(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray,
 
 
 def _corrected(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray]:
-    """The triangles of §F.1, with side 0-1 of unit length."""
+    """The corrected triangles of §F.1, with side 0-1 of unit length."""
 
     def angle(at: ComplexArray, to: ComplexArray) -> FloatArray:
         turn = np.conj(at) * to
-        # Adding zero turns -0 into 0: between coincident points the angle is 0, not π.
+        # Adding zero turns -0 into 0, so that the angle between coincident points is 0 and not π.
         return np.arctan2(np.abs(turn.imag), turn.real + 0.0)
 
     base = z1.astype(np.complex128)

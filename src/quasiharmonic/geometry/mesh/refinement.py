@@ -1,4 +1,4 @@
-"""Split named edges of a mesh at their midpoints and nothing else."""
+"""Split given edges of a mesh at their midpoints."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from quasiharmonic.util.arrays import (
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A mesh some of whose edges were split, and how it came from the old one.
+    """A mesh after some of its edges were split, with its relation to the old mesh.
 
     Attributes
     ----------
     V : (n + s, d) float64
-        Vertices: the old ones first, at their old indices, then the new ones.
+        Vertices: the old ones with their old indices, then the new ones.
     F : (f + …, 3) int64
-        Triangles. Every old one keeps its index, or leaves it to its first part; further parts follow.
+        Triangles. An old triangle that is not split keeps its index. The first part of a split triangle takes its
+        index; further parts follow all old triangles.
     parent : (f + …,) int64
-        The old triangle each new one is a part of.
+        Index of the old triangle that contains each triangle.
     parents : (s, k) int64
-        The old vertices between which each new one lies, ascending: the two ends of the edge that was
-        split, or, after several rounds, up to three corners of the old triangle that was. Where there
-        are fewer than k the last one is repeated.
+        Old vertices between which each new vertex lies, ascending. After one round these are the two ends of the split
+        edge; after several rounds, up to three corners of an old triangle. The last index is repeated to fill the row.
     weights : (s, k) float64
-        Their shares in it; 0 for what is repeated.
+        Weights of the parents; 0 for repeated ones.
     """
 
     V: FloatArray
@@ -48,7 +48,7 @@ class Refined:
     weights: FloatArray
 
     def extend(self, values: ArrayLike) -> FloatArray:
-        """Carry values at the old vertices over to the new ones, linear on the old triangles.
+        """Interpolate values at the old vertices to all vertices, linearly on the old triangles.
 
         Parameters
         ----------
@@ -62,7 +62,7 @@ class Refined:
         Raises
         ------
         ValueError
-            When there are not as many rows as old vertices.
+            If the number of rows differs from the number of old vertices.
         """
         old = np.asarray(values, dtype=np.float64)
         if not old.ndim or len(old) != len(self.V) - len(self.parents):
@@ -72,7 +72,7 @@ class Refined:
 
 
 def composed(first: Refined, second: Refined) -> Refined:
-    """Two refinements, one after the other, as one; with three parents for each vertex."""
+    """Compose two successive refinements into one, with three parents for each vertex."""
     n = len(first.V) - len(first.parents)
 
     def shares(vertex: int) -> dict[int, float]:
@@ -88,7 +88,7 @@ def composed(first: Refined, second: Refined) -> Refined:
             for parent, share in shares(vertex).items():
                 total[parent] = total.get(parent, 0.0) + weight * share
         combined.append(total)
-    # What is split lies in one old triangle, so that there are three at most.
+    # Every new vertex lies in one old triangle, so it has at most three parents.
     parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in combined], dtype=np.int64).reshape(-1, 3)
     shared = [[*(row[parent] for parent in sorted(row)), 0.0, 0.0][:3] for row in combined]
     weights_ = np.array(shared, dtype=np.float64).reshape(-1, 3)
@@ -96,7 +96,7 @@ def composed(first: Refined, second: Refined) -> Refined:
 
 
 def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
-    """Split edges at their midpoints; `quasiharmonic.refine` on arrays."""
+    """Split edges at their midpoints; array version of `quasiharmonic.refine`."""
     V, F = vertex_array(V), triangle_rows(F)
     n = len(V)
     check_range("F", F, n)
@@ -119,7 +119,7 @@ def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool 
 
 
 def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, IntArray]:
-    r"""Replace triangles by their parts; ``middle`` (f, 3) has the midpoints opposite to the corners.
+    r"""Replace triangles by their parts; ``middle`` (f, 3) has the midpoint opposite to each corner, or -1.
 
     Drawn with the midpoints p, q, r opposite to a, b, c:
 
@@ -139,7 +139,7 @@ def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, 
             of.append(t)
 
     def turned(number: int, to: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        # Corners and midpoints, cyclically so that corner `to` is the last.
+        # Corners and midpoints of triangles, rotated so that corner `to` is the last.
         t = np.flatnonzero(count == number)
         columns = (to[t, None] + [1, 2, 0]) % 3
         return t, F[t[:, None], columns].T, middle[t[:, None], columns].T
@@ -158,7 +158,7 @@ def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, 
 
 
 def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
-    """A quarter of the distances of vertices, which no coordinates make overflow."""
+    """A quarter of the distances between vertices; the scale prevents overflow."""
     lengths: FloatArray = np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
     return lengths
 

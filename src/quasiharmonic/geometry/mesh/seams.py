@@ -1,9 +1,9 @@
-"""Maps with seams: the islands into which they cut a surface.
+"""Maps with seams, and the islands into which seams cut a surface.
 
-A map that is cut along seams gives a vertex several places, so its triangles refer to places by indices of their
-own. What counts here is how the triangles are joined in the plane: two are, along an edge, if they share it on the
-surface and put both of its ends at the same places, by whatever index. A vertex of an island is a fan of triangles
-joined in that way; an island is a component, and always a surface.
+A vertex on a seam has several positions in the plane, so triangles refer to positions by indices of their own. Two
+triangles are joined along an edge if they share it on the surface and have the same positions at both of its ends,
+whatever their indices. A vertex of an island is a fan of triangles joined in this way. An island is a connected
+component and is always a surface.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from quasiharmonic.util.arrays import (
 
 @dataclass(frozen=True, eq=False)
 class Island:
-    """A part of a map between its seams, numbered on its own.
+    """A part of a map between its seams, with its own vertex numbers.
 
     Attributes
     ----------
     F : (k, 3) int64
-        Its triangles, by its own vertices.
+        Triangles of the island, by the island's vertices.
     triangles : (k,) int64
-        Which triangles of the mesh they are, ascending.
+        Their indices in the mesh, ascending.
     vertices : (m,) int64
-        Which vertex of the mesh each of its own is, ascending. A seam may run to both sides of a vertex, which is
-        then there repeatedly.
+        Index in the mesh of each vertex of the island, ascending. If a seam has the island on both sides of a vertex,
+        the mesh vertex occurs several times.
     V : (m, 2) or (m, 3) float64
-        Where its vertices are on the surface.
+        Positions of the island's vertices on the surface.
     uv : (m, 2) float64
-        Where they are in the plane; NaN where that is not known.
+        Positions in the plane; NaN if unknown.
     """
 
     F: IntArray
@@ -59,7 +59,7 @@ class Island:
 
 
 def which_island(triangles: IntArray) -> str:
-    """Name an island in a message by the mesh's triangles (k,), ascending, that it has."""
+    """Name an island in a message by its triangles (k,), ascending indices in the mesh."""
     return f"island at triangle {triangles[0]} ({counted('triangle', 'triangles', len(triangles))})"
 
 
@@ -73,23 +73,23 @@ class SeamedMesh:
     F : (f, 3) array of int
         Triangles.
     FT : (f, 3) array of int, optional
-        For every corner the row of ``uv`` it is at; a triangle with a corner at -1 has no place. By default ``F``.
+        Row of ``uv`` of every corner. A triangle with a corner at -1 has no position. By default ``F``.
     uv : (m, 2) array, optional
-        Places in the plane, NaN where there is none; left out of a surface that is cut but not yet mapped.
+        Positions in the plane, NaN if unknown. Leave it out for a surface that is cut but not yet mapped.
 
     Raises
     ------
     ValueError
-        When the shapes do not fit, or there is no such vertex or row; the message names them.
+        If the shapes do not fit, or a vertex or row does not exist; the message names them.
 
     Attributes
     ----------
     V, F, FT, uv : arrays
-        As given, as float64 and int64; ``uv`` None if left out. Not writeable.
+        The arguments as float64 and int64; ``uv`` is None if left out. Read-only.
 
     Examples
     --------
-    A sheet cut along the line through its middle:
+    A sheet cut along its centre line:
 
     >>> from quasiharmonic.surfaces import grid
     >>> V, F = grid(2, 2)
@@ -113,11 +113,11 @@ class SeamedMesh:
 
     @cached_property
     def _welded(self) -> IntArray:
-        """For every corner of a triangle that has a place, vertex and place in one number of 0, 1, …; (g, 3) int64."""
+        """Number of the (vertex, position) pair at every corner of the mapped triangles, from 0; (g, 3) int64."""
         if self.uv is None:
             place: IntArray = np.arange(int(self.FT.max(initial=-1)) + 1)
         else:
-            # Equal numbers are one place, those that are none included.
+            # Equal coordinates are one position. All NaN positions also count as one.
             with np.errstate(invalid="ignore"):  # a signalling NaN
                 pairs = np.ascontiguousarray(self.uv + 0.0).view(np.complex128).ravel()
             place = np.unique(pairs, return_inverse=True)[1].ravel()
@@ -126,21 +126,21 @@ class SeamedMesh:
 
     @cached_property
     def mapped(self) -> IntArray:
-        """Triangles that have a place, ascending; (g,) int64."""
+        """Ascending indices of the triangles that have positions; (g,) int64."""
         return np.flatnonzero((self.FT >= 0).all(axis=1))
 
     @cached_property
     def seamless(self) -> bool:
-        """Whether every triangle and no vertex has more than one place."""
+        """Whether every triangle has positions and no vertex has more than one position."""
         if len(self.mapped) < len(self.F):
             return False
         return bool(self._welded.max(initial=-1) + 1 == np.count_nonzero(np.bincount(self.F.ravel())))
 
     @cached_property
     def islands(self) -> tuple[Island, ...]:
-        """The parts into which the seams cut the surface, by their first triangle.
+        """The parts into which the seams cut the surface, ordered by their first triangle.
 
-        Edges at which three or more triangles meet, or two that are wound differently, are seams.
+        Edges of three or more triangles, or of two triangles with opposite orientation, count as seams.
         """
         places = np.full((int(self.FT.max(initial=-1)) + 1, 2), np.nan) if self.uv is None else self.uv
         split, island = fans(self._welded)
@@ -155,12 +155,12 @@ class SeamedMesh:
 
     @property
     def seams(self) -> IntArray:
-        """Edges (k, 2) along which triangles meet on the surface, and not in the plane; by vertices, ascending."""
+        """Seam edges (k, 2), by vertices, ascending: triangles meet here on the surface and not in the plane."""
         count, owner = self._owner()
         tail, head = self.F, self.F[:, (1, 2, 0)]
         here, there = owner, owner[:, (1, 2, 0)]
         upwards = tail < head
-        # An edge whose ends are at other places for one of its triangles than for another.
+        # Find edges whose ends have different positions in two of their triangles.
         places = np.where(upwards, here, there) * (count + 1) + np.where(upwards, there, here)
         key = edge_keys(tail, head, len(self.V)).ravel()
         order = np.argsort(key, kind="stable")
@@ -172,18 +172,18 @@ class SeamedMesh:
         return np.unique(np.sort(ends, axis=1), axis=0)
 
     def opened(self) -> SeamedMesh:
-        """Return the mesh with a vertex for each of a vertex's places: the same map without seams.
+        """Return the same map as a mesh without seams, with one vertex for each position of a vertex.
 
         Returns
         -------
         SeamedMesh
-            Its vertices are this one's own, then a further one for each further place of one; its triangles these, in
-            their order. Where there are no seams, nothing is changed. Places of vertices that no triangle uses are NaN.
+            The vertices of this mesh come first, then one copy for each further position. The triangles keep their
+            order. A mesh without seams is unchanged. Positions of vertices that no triangle uses are NaN.
 
         Raises
         ------
         ValueError
-            When a triangle has no place; names the first ones.
+            If a triangle has no position; the message names the first ones.
         """
         bare = np.flatnonzero((self.FT < 0).any(axis=1))
         if bare.size:
@@ -199,23 +199,23 @@ class SeamedMesh:
         return SeamedMesh(self.V[origin], FT, FT, uv)
 
     def cut(self, edges: ArrayLike) -> SeamedMesh:
-        """Cut along further edges; what comes out has no places yet.
+        """Return the mesh with further edges cut, without positions.
 
         Parameters
         ----------
         edges : (k, 2) array of int
-            Vertices at both ends of each.
+            The two vertices of each edge.
 
         Returns
         -------
         SeamedMesh
-            Of the same ``V`` and ``F``, without ``uv``. Its rows are numbered as the vertices are, then one for each
-            further place of one.
+            Mesh with the same ``V`` and ``F``, without ``uv``. Rows have the numbers of the vertices; copies of cut
+            vertices follow.
 
         Raises
         ------
         ValueError
-            When one is no edge of the mesh; names the first ones.
+            If the mesh does not have one of the edges; the message names the first ones.
         """
         pairs = index_array("edges", edges).reshape(-1, 2)
         check_range("edges", pairs, len(self.V))
@@ -228,18 +228,19 @@ class SeamedMesh:
         return SeamedMesh(self.V, self.F, FT)
 
     def with_places(self, places: Sequence[FloatArray]) -> SeamedMesh:
-        """Return the mesh with its islands in other places.
+        """Return the mesh with new positions of its islands.
 
         Parameters
         ----------
         places : sequence of (m_i, 2) float64
-            For each of `islands`, where its vertices are.
+            Positions of the vertices of each of `islands`.
 
         Returns
         -------
         SeamedMesh
-            Rows of ``uv`` stay what they are, unless a vertex moved from a row that others use and do not leave: then
-            it has a new one at the end. Where there was no ``uv``, there is a row for each place.
+            Rows of ``uv`` keep their numbers. If a vertex moves and other users of its row do not move to the same
+            position, the vertex gets a new row at the end. Without ``uv``, the result has one row for each used row of
+            ``FT``.
         """
         if self.uv is not None:
             return self._moved(self.uv, places)
@@ -252,9 +253,9 @@ class SeamedMesh:
         return SeamedMesh(self.V, self.F, FT, uv)
 
     def _owner(self) -> tuple[int, IntArray]:
-        """A number for each vertex of each island, how many there are, and for every corner which it is.
+        """Return the number of island vertices, and the number of the island vertex at every corner.
 
-        Corners of triangles without a place have the number beyond the last.
+        Corners of triangles without positions have the number after the last.
         """
         start = np.cumsum([0, *(len(island.vertices) for island in self.islands)])
         owner = np.full(self.F.shape, start[-1])
@@ -263,13 +264,13 @@ class SeamedMesh:
         return int(start[-1]), owner
 
     def _numbered(self, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-        """A vertex for each fan of triangles around one: the old numbers for the first, further ones at the end.
+        """Give each fan of triangles a vertex: the first fan around a vertex keeps its number, further fans follow.
 
         Returns
         -------
         FT : (f, 3) int64
         origin : (n + c,) int64
-            The old vertex that each is.
+            The original vertex of each vertex.
         """
         F = self.F[self.mapped]
         FT = np.full(self.F.shape, -1)
@@ -279,16 +280,16 @@ class SeamedMesh:
         return FT, origin
 
     def _moved(self, uv: FloatArray, places: Sequence[FloatArray]) -> SeamedMesh:
-        """Bring the islands' places into the rows of the map, new rows where others use the same."""
+        """Write new positions of the islands into the rows of the map; add rows where a shared row must split."""
         _, owner = self._owner()
         nowhere = np.full((1, 2), np.nan)
         before = np.concatenate([*(island.uv for island in self.islands), nowhere])
         now = np.concatenate([*places, nowhere])
         given = self.FT >= 0
-        # Row and vertex in one number, ascending.
+        # Combine row and vertex into one number, ascending.
         row, vertex = np.divmod(np.unique(self.FT[given] * len(now) + owner[given]), len(now))
         moved = (now[vertex] != before[vertex]).any(axis=1) & np.isfinite(now[vertex]).all(axis=1)
-        # A row goes along where all that use it go to the same place.
+        # A row moves in place if all vertices that use it move to the same position.
         first = np.searchsorted(row, row)
         apart = (now[vertex] != now[vertex[first]]).any(axis=1)
         together = ~np.isin(row, row[apart])

@@ -1,13 +1,13 @@
 """The Jacobian determinant of second-order triangles, in Bernstein form.
 
-A triangle of six nodes ``X`` is the image of the reference triangle under a quadratic map. Its derivatives towards the
-second and the third corner are linear in the barycentric coordinates λ, so that the determinant is a quadratic form,
+A triangle of six nodes ``X`` is the image of the reference triangle under a quadratic map. The derivatives towards the
+second and the third corner are linear in the barycentric coordinates λ, so the determinant is a quadratic form,
 
-    2 J(λ) = Σᵢⱼ λᵢ λⱼ cᵢⱼ,        cᵢⱼ = xᵀ Sᵢⱼ y,
+    2 J(λ) = Σᵢⱼ λᵢ λⱼ cᵢⱼ,        cᵢⱼ = xᵀ Sᵢⱼ y.
 
-whose six coefficients, at the corners and for the sides between them, are its Bézier control values: bilinear in the
-nodes' coordinates x and y, by antisymmetric matrices Sᵢⱼ of integers. Of a triangle with straight sides and the nodes
-in their middles all of them are four times its area.
+The six coefficients are its Bézier control values, one for each corner and each side. They are bilinear in the
+coordinates x and y of the nodes, with antisymmetric integer matrices Sᵢⱼ. If the sides are straight and the mid-side
+nodes lie at their midpoints, all coefficients equal four times the area.
 
 References
 ----------
@@ -21,13 +21,13 @@ import numpy as np
 
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: What each coefficient is for: a corner twice, or two corners.
+#: The corners of each coefficient: a corner twice, or two corners.
 PAIRS = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0)])
 
 
 def _forms() -> IntArray:
     """The matrices Sᵢⱼ of the six coefficients; (6, 6, 6) int64."""
-    # Bézier points of the element, twice, by its nodes: corners, and 2 · middle − half of either end.
+    # Twice the Bézier points of the element by its nodes: corners, and 2 · middle − half of either end.
     net = np.zeros((3, 3, 6), dtype=np.int64)
     for corner in range(3):
         net[corner, corner, corner] = 2
@@ -45,34 +45,34 @@ FORMS = _forms()
 
 
 def jacobian_coefficients(x: FloatArray, y: FloatArray) -> FloatArray:
-    """The control values of Jacobian determinants, in floating point.
+    """Control values of Jacobian determinants, in floating point.
 
     Parameters
     ----------
     x, y : (f, 6) float64
-        Coordinates of each element's nodes.
+        Coordinates of the nodes of each element.
 
     Returns
     -------
     (f, 6) float64
-        In the order of `PAIRS`: at the three corners, then for the sides 01, 12 and 20. Twice the determinant's own.
+        Control values of twice the determinant in the order of `PAIRS`: three corners, then the sides 01, 12 and 20.
     """
     return np.asarray(np.einsum("fa,kab,fb->fk", x, FORMS.astype(np.float64), y, optimize=True))
 
 
 def least_jacobian(values: FloatArray) -> FloatArray:
-    """The least value of quadratic forms on the triangle where barycentric coordinates are not negative.
+    """Minimum of quadratic forms on the triangle where barycentric coordinates are non-negative.
 
     Parameters
     ----------
     values : (f, 6) float64
-        As of `jacobian_coefficients`.
+        Control values, as returned by `jacobian_coefficients`.
 
     Returns
     -------
     (f,) float64
-        In floating point, to rounding relative to the largest of the values: at a corner, or where a side or the inside
-        has a point at which the form is at rest.
+        Minimum in floating point, up to rounding relative to the largest control value. It is attained at a corner, or
+        at a critical point on a side or in the interior.
     """
     scale = np.abs(values).max(axis=1)
     values = values / np.where(scale > 0, scale, 1.0)[:, None]
@@ -83,8 +83,9 @@ def least_jacobian(values: FloatArray) -> FloatArray:
         within = (fall > 0) & (rise > 0)
         share = fall / np.where(within, fall + rise, 1.0)
         least = np.where(within, np.minimum(least, start - fall * share), least)
-    # Towards the second and the third corner: slopes at the first, and half the second derivatives. Where sides are
-    # straight these are noise, and so is the point found: the form's value there is taken, which noise cannot lower.
+    # Slopes at the first corner towards the second and the third, and half the second derivatives. For straight sides
+    # these are noise, and so is the critical point. The form is evaluated there, so noise cannot give too low a
+    # minimum.
     second, third, bb, cc, cross = ab - a, ca - a, a + b - 2 * ab, a + c - 2 * ca, a + bc - ab - ca
     det = bb * cc - cross**2
     convex = (det > 0) & (bb > 0)

@@ -1,8 +1,8 @@
-"""The triangles of a surface as they lie in space, for measuring what a map does to them.
+"""Rest triangles of a surface, laid into the plane to measure the distortion of a map.
 
-Unlike a `ReferenceMesh`, which may choose its triangles, these are the mesh's own; and unlike the frames of
-a planar mesh they have no sign: a planar mesh is a surface seen from the side on which its triangles are
-counterclockwise. So the image of a triangle is inverted exactly when the certificate says so.
+A `ReferenceMesh` may choose its triangles; these are always the triangles of the mesh. They have no sign, because a
+planar mesh counts as a surface seen from the side on which its triangles are counterclockwise. So the image of a
+triangle is inverted exactly if the certificate lists it as inverted.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, vertex_array
 
 @dataclass(frozen=True, eq=False)
 class RestShapes:
-    """Triangles laid into the plane, counterclockwise, vertex 0 at 0 and vertex 1 on the positive x axis.
+    """Triangles laid into the plane counterclockwise, vertex 0 at 0 and vertex 1 on the positive x axis.
 
     Attributes
     ----------
     unit : float
-        The unit of length: a power of two near the mesh's size, so that areas and their inverses stay
-        within the numbers' range.
+        Unit of length: a power of two near the size of the mesh, so that areas and their inverses neither
+        overflow nor underflow.
     sides : (3, f) complex128
-        From vertex 0 to 1, 1 to 2 and 2 to 0, in units.
+        Sides from vertex 0 to 1, 1 to 2 and 2 to 0, in units.
     m : (f,) float64
         Areas in square units.
     """
@@ -37,16 +37,16 @@ class RestShapes:
 
     @property
     def flat(self) -> NDArray[np.int64]:
-        """Triangles of zero area (that is, whose area vanishes in floating point), ascending."""
+        """Ascending indices of the triangles whose area is zero in floating point."""
         return np.flatnonzero(~(self.m > 0))
 
     def half_gradients(self) -> ComplexArray:
-        """Half the gradients ``γᵢ/2`` of the hat functions, ``∂w/∂z = Σ conj(gᵢ) wᵢ`` and ``∂w/∂z̄ = Σ gᵢ wᵢ``.
+        """Half the gradients ``γᵢ/2`` of the hat functions: ``∂w/∂z = Σ conj(gᵢ) wᵢ`` and ``∂w/∂z̄ = Σ gᵢ wᵢ``.
 
         Returns
         -------
         (3, f) complex128
-            Per unit; NaN for flat triangles.
+            In inverse units; NaN for triangles without area.
         """
         m = np.where(self.m > 0, self.m, np.nan)
         return 0.25j * self.sides[(1, 2, 0), :] / m
@@ -62,12 +62,12 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) ->
     F : (f, 3) int
         Triangles.
     lowest : float
-        Triangles lower than this share of their longest side are made so high.
+        Minimum height as a fraction of the longest side; lower triangles are raised to this height.
 
     Raises
     ------
     ValueError
-        When ``V`` has another shape.
+        If ``V`` has another shape.
     """
     positions = vertex_array(V, finite=False)
     exponent = int(np.frexp(np.abs(positions).max(initial=0))[1]) - 1

@@ -1,4 +1,4 @@
-"""Are these triangles a surface? Every check that needs to know how they are joined, each naming what is wrong."""
+"""Checks whether triangles form a valid surface. Each check names the offending elements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from quasiharmonic.util.arrays import IntArray, named, named_edges
 
 
 def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
-    """The edges of triangles that form one connected, consistently oriented surface.
+    """Edges of triangles that form one connected, consistently oriented surface.
 
     Parameters
     ----------
@@ -18,7 +18,7 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
     n : int
         Number of vertices.
     closed : bool
-        Whether the surface may be without boundary.
+        Whether the surface may have no boundary.
 
     Returns
     -------
@@ -27,8 +27,9 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
     Raises
     ------
     ValueError
-        With the first offending elements: triangles that use a vertex twice or are repeated, vertices without
-        triangle, non-manifold edges, mixed winding, no boundary, several components.
+        If the triangles do not form such a surface. The message names the first offending elements. Causes: a
+        triangle that uses a vertex twice or is repeated, a vertex without triangle, non-manifold edges, mixed winding,
+        no boundary, several components.
     """
     label = components(F, n)
     connected = not label.any()
@@ -53,7 +54,7 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
 
 
 def manifold_edges(F: IntArray, n: int) -> Edges:
-    """The edges of triangles that form any number of surfaces, each consistently oriented.
+    """Edges of triangles that form any number of surfaces, each consistently oriented.
 
     Parameters
     ----------
@@ -69,11 +70,11 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
     Raises
     ------
     ValueError
-        With the first offending elements: triangles that use a vertex twice or are repeated, non-manifold edges,
-        mixed winding.
+        If the triangles do not form surfaces. The message names the first offending elements. Causes: a triangle that
+        uses a vertex twice or is repeated, non-manifold edges, mixed winding.
     """
     found = edges(F, n)
-    # An edge from a vertex to itself is never between two triangles that traverse it in opposite directions.
+    # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if found.nonmanifold.size or found.inconsistent.size or np.any(found.boundary[:, 0] == found.boundary[:, 1]):
         _collapsed(F)
         _repeated(F)

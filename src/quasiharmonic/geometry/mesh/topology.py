@@ -1,7 +1,7 @@
-"""How the triangles of a mesh are joined: edges, boundary loops, components.
+"""Connectivity of triangle meshes: edges, boundary loops, components.
 
-Everything is read off one sort of the half-edges by their undirected edges. It says at once which edges are shared by
-two triangles, which lie on the boundary, and which are not a surface's at all.
+One sort of the half-edges by their undirected edges gives all edges. It separates edges shared by two triangles,
+boundary edges, and edges that do not occur in a surface.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, named, own_triangles, unchangeable
 from quasiharmonic.util.kernels import compiled
 
-# Half-edges from which on a sparse matrix sorts them sooner than a sort does.
+# Number of half-edges from which the sparse matrix is faster than a sort.
 _MANY = 10_000
 
 
 @dataclass(frozen=True)
 class Edges:
-    """The edges of a triangle mesh, by the part they play.
+    """The edges of a triangle mesh, by kind.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Edges:
 
 
 def edges(F: NDArray[np.integer], n: int) -> Edges:
-    """Sort the half-edges of ``F`` and tell the kinds of edges apart.
+    """Sort the half-edges of ``F`` and classify the edges.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     pairs, sizes = np.empty((T.size, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
     if not sort_edges(T, n, pairs, sizes):
         check_range("F", T, n)
-    # Most edges have two half-edges: the rest of the memory is given back, none of it touched yet.
+    # Most edges have two half-edges. Release the rest of the memory, which was never touched.
     pairs.resize((int(sizes.sum()), 2), refcheck=False)
     end = np.cumsum(sizes).tolist()
     rest = (pairs[start:stop].copy() for start, stop in pairwise(end))
@@ -70,12 +70,12 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
 
 @compiled
 def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
-    """Fill in edges, one kind of `Edges` after another, and how many there are of each; 0 where F is out of range."""
+    """Fill in the edges, kind after kind as in `Edges`, and their numbers; return 0 if F is out of range, else 1."""
     if F.size and (F.min() < 0 or F.max() >= n):
         return 0
     T = np.ascontiguousarray(F.T, dtype=np.int32)
     tail, head = T.ravel(), T[(1, 2, 0), :].ravel()
-    # SciPy halves the time, where there are many, but to import it for this alone takes longer.
+    # SciPy halves the time for large meshes, but importing it for this alone takes longer.
     by_edge = _by_rows if tail.size >= _MANY and "scipy.sparse" in sys.modules else _by_keys
     low, high, direction = by_edge(tail, head, n)
     del T, tail, head
@@ -102,7 +102,7 @@ _Integers = NDArray[np.integer]
 
 
 def _by_keys(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
-    """Half-edges sorted by their edges: smaller end, larger end, and whether they run from the larger one."""
+    """Sort half-edges by edge: smaller end, larger end, and whether the half-edge starts at the larger end."""
     key = edge_keys(tail, head, n)
     key *= 2
     key += tail > head
@@ -113,11 +113,11 @@ def _by_keys(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[
 
 
 def _by_rows(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
-    """As `_by_keys`, but for the order of half-edges of the same edge: by the rows of a sparse matrix."""
+    """As `_by_keys`, by a sparse matrix; half-edges of the same edge may come in another order."""
     from scipy.sparse import csr_array
 
     table = (tail > head, np.minimum(tail, head), np.arange(tail.size + 1))
-    # A table of half-edges and smaller ends, turned on its side, has them by these.
+    # Converting the matrix of half-edges and smaller ends to columns sorts the half-edges by their smaller ends.
     turned = csr_array(table, shape=(tail.size, n)).tocsc()
     del table
     by_low = csr_array((turned.data, np.maximum(tail, head).take(turned.indices), turned.indptr), shape=(n, n))
@@ -127,8 +127,8 @@ def _by_rows(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[
 
 
 def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> IntArray:
-    """One integer for each undirected edge between vertices below ``n``, whichever way it is given."""
-    # 64 bits even of 32-bit numbers, whose products they do not hold.
+    """One integer for each undirected edge between vertices below ``n``, in either direction."""
+    # Use 64 bits even for 32-bit indices, because products overflow 32 bits.
     keys: IntArray = np.minimum(tail, head, dtype=np.int64)
     keys *= n
     keys += np.maximum(tail, head)
@@ -136,7 +136,7 @@ def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> I
 
 
 def boundary_edges(F: NDArray[np.integer], n: int) -> IntArray:
-    """Half-edges ``i → j`` on the boundary, their triangle to the left.
+    """Half-edges ``i → j`` on the boundary, with their triangle to the left.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def boundary_edges(F: NDArray[np.integer], n: int) -> IntArray:
 
 
 def boundary_loops(F: NDArray[np.integer], n: int) -> list[IntArray]:
-    """Boundary vertices, loop by loop, the surface to the left.
+    """Boundary vertices, loop by loop, with the surface to the left.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def boundary_loops(F: NDArray[np.integer], n: int) -> list[IntArray]:
     Returns
     -------
     list of (k,) int64
-        Each loop once around, in the order of `trace_loops`.
+        Each loop once, in the order of `trace_loops`.
     """
     return trace_loops(boundary_edges(F, n))
 
@@ -175,19 +175,19 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
     Parameters
     ----------
     boundary : (k, 2) int64
-        Half-edges ``i → j`` as `Edges.boundary` has them.
+        Half-edges ``i → j``, as in `Edges.boundary`.
 
     Returns
     -------
     list of (l,) int64
         Each loop in order with the surface to its left: counterclockwise around the outside of a
-        planar mesh, clockwise around its holes (the sense of eq. 15). Loops start at their smallest
-        vertex and are listed by it.
+        planar mesh, clockwise around its holes (the direction of eq. 15). Each loop starts at its smallest
+        vertex. Loops are sorted by their first vertex.
 
     Raises
     ------
     ValueError
-        When the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
+        If the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
         not a consistently oriented surface.
     """
     vertices, lengths = np.empty(len(boundary), dtype=np.int64), np.empty(len(boundary), dtype=np.int64)
@@ -204,7 +204,7 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
 
 @compiled
 def follow_loops(boundary: IntArray, vertices: IntArray, lengths: IntArray) -> int:
-    """Fill in loop after loop (k,) and as many lengths, as `trace_loops` orders them; how many loops, -1 for none."""
+    """Fill in the loops (k,) and their lengths in the order of `trace_loops`; return their number, or -1 on failure."""
     tails, heads = np.sort(boundary, axis=0).T
     if (tails[1:] == tails[:-1]).any() or not np.array_equal(tails, heads):
         return -1
@@ -236,7 +236,7 @@ def components(F: NDArray[np.integer], n: int) -> IntArray:
     Returns
     -------
     (n,) int64
-        The smallest vertex of the component. A vertex without triangle is a component of its own.
+        Smallest vertex of the component. A vertex without triangle is a component of its own.
     """
     T = own_triangles(F)
     # Two edges of a triangle connect its three vertices.
@@ -256,7 +256,7 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
     Returns
     -------
     (n,) int64
-        The smallest node of the component.
+        Smallest node of the component.
     """
     label = np.empty(n, dtype=np.int64)
     tail, head = unchangeable(tail), unchangeable(head)
@@ -268,15 +268,15 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
 
 @compiled
 def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> int:
-    """Fill in the smallest node of every node's component (n,); 0 where a link is out of range, else 1."""
-    # SciPy's csgraph would do, but importing it takes longer than all else that a small mesh needs. Every edge
-    # hooks the larger of its ends' labels onto the smaller, and labels follow their labels to the root
-    # (Shiloach and Vishkin 1982): a number of rounds that grows with the logarithm of the size.
+    """Fill in the smallest node of every node's component (n,); return 0 if a link is out of range, else 1."""
+    # Importing SciPy's csgraph takes longer than all other work on a small mesh, so this is done here. Every edge
+    # attaches the larger label of its ends to the smaller one, and labels follow their labels to the root
+    # (Shiloach and Vishkin 1982). The number of rounds grows with the logarithm of the size.
     tail, head = tail.ravel(), head.ravel()
     here, low, high = np.arange(label.size), np.minimum(tail, head), np.maximum(tail, head)
     if low.min(initial=0) < 0 or high.max(initial=-1) >= label.size:
         return 0
-    # Any smaller neighbour will do to begin with, and there is nothing to look up yet.
+    # Any smaller neighbour is a valid first label.
     here[high] = low
     del low, high
     while True:

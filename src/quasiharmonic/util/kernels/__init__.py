@@ -1,24 +1,24 @@
-"""Loops in C, where a compiler was at hand when the package was built, each with a twin in NumPy that says the same.
+"""Compiled loops in C, each with an equivalent NumPy function.
 
-A kernel is a function that fills arrays handed to it. Its NumPy text stands where it is used, defines what it does, and
-is decorated by `compiled`; the function of that name in the extension, made of the C files of this folder, takes its
-place where there is one.
+A kernel is a function that fills arrays passed to it. Its NumPy version stands in the module that uses it, defines the
+result, and has the decorator `compiled`. If the extension was built, the C function of the same name replaces it. The
+extension is built from the C files of this folder.
 
-*What a kernel checks itself*, and refuses with a TypeError or a ValueError: that it was given as many arguments as it
-takes, by position; that arrays are of the very types, aligned, and contiguous unless its C text says otherwise; that
-those it fills are writeable; that the arrays' sizes fit together (`fit` in `arguments.h`). Where its C text says so,
-also that indices are in range; it then answers by a number that says that they are not, for its caller to raise.
+*Checks in a kernel*: a kernel raises a TypeError or ValueError for a wrong number of arguments. It also checks the type
+and alignment of arrays, and that they are contiguous unless its C code says otherwise. Output arrays must be writeable,
+and the sizes of the arrays must fit together (`fit` in `arguments.h`). Some kernels also check that indices are in
+range, as their C code says. They return a number that reports the error, and the caller raises.
 
-*What it relies on*: that all other indices are in range, that floats which become integers are finite and within the
-bounds that its text names, and that no array changes while it runs. It lets other threads run meanwhile, so every
-check, its own included, is worth nothing for an array that somebody else can write to. Its callers see to this: a
-public function copies its index arrays once, at the border, checks the copy, and hands on nothing else. `index_array`,
-`triangle_array`, `vertex_array` and their like in `quasiharmonic.util.arrays` copy always; `own_triangles` and
-`unchangeable` do not copy what they made before, such as the triangles of a `Domain` or a `Certificate`. An array that
-is merely not writeable may be a view of one that is, and is copied.
+*Preconditions*: all other indices are in range. Floats that become integers are finite and within the bounds stated in
+the C code. No array changes during the call. A kernel lets other threads run, so no check is reliable for an array that
+other code can write to. The callers ensure this: a public function copies its index arrays once, checks the copies, and
+passes only these on. `index_array`, `triangle_array`, `vertex_array` and similar functions in
+`quasiharmonic.util.arrays` always copy. `own_triangles` and `unchangeable` do not copy arrays that they made before,
+such as the triangles of a `Domain` or a `Certificate`. A read-only array may be a view of a writeable one, so it is
+copied.
 
-``QUASIHARMONIC_PURE=1`` in the environment has the NumPy texts run. Both give the same results but for rounding, and in
-the room `exact` the same in every bit.
+Set ``QUASIHARMONIC_PURE=1`` in the environment to run the NumPy versions. Both versions give the same results up to
+rounding, and identical results in the package `exact`.
 
 The C files are in `c`; `_compiled.pyi` lists their functions. Start reading in `c/module.c`.
 """
@@ -38,17 +38,17 @@ except ImportError:
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-#: The NumPy texts by name, of the modules that have been imported.
+#: NumPy versions of the kernels by name, for the modules that have been imported.
 TWINS: dict[str, Callable[..., Any]] = {}
 
 
 def compiled(twin: Kernel) -> Kernel:
-    """The function of this name in the extension, or the function as it is where there is no extension.
+    """Return the function of this name in the extension, or the NumPy function if there is no extension.
 
     Raises
     ------
     ImportError
-        The extension was built of other C files than those beside these Python files, and has no such function.
+        If the extension has no such function, because it was built from older C files.
     """
     TWINS[twin.__name__] = twin
     if extension is None:
