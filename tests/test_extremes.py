@@ -23,6 +23,7 @@ from quasiharmonic import (
     polish_derivative,
     refine_problem,
 )
+from quasiharmonic.linsolve import available
 from quasiharmonic.problem.diagnosis import Kind
 from quasiharmonic.surfaces import cat, disk, grid, random_delaunay
 from quasiharmonic.targets import boundary_to
@@ -340,6 +341,12 @@ class TestFlatteningAtScales:
         thin = np.column_stack([V * [1, flat], np.zeros(len(V))])
         assert flatten(thin, F, energy=energy).certificate.bijective
         assert keep_distances(thin, F, thin[:, :2]).certificate.bijective
+
+    def test_thin_disks_where_two_solvers_fail(self):
+        if "rslab" not in available():
+            pytest.skip("rslab is not installed")
+        V, F = disk(4)
+        assert flatten(V * [2.1837492746569184e-09, 1], F, linear_solver="rslab").certificate.bijective
 
 
 @pytest.mark.parametrize("scale", [1e-310, 1e-200, 1e-100, 1e100, 1e200, 1e300])

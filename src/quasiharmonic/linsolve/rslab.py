@@ -109,12 +109,15 @@ class Rslab(LinearSolver):
             self._second.close()
 
     def _factor_by_another(self) -> None:
-        """Factor the matrix at hand by the backend that stands in for this one."""
-        self._numeric = None
+        """Factor the matrix at hand by the backend that stands in for this one.
+
+        If that fails too, a factor of rslab's is kept, so that the next solve fails in the same way as this one.
+        """
         if self._second is None:
             other = Qdldl if Qdldl.present() else SuperLU
             self._second = other(self._indptr, self._indices)
         self._second.factor(self._values)
+        self._numeric = None
 
     def _tried(self, step: Callable[[], _Made]) -> _Made | None:
         """What a step of rslab's comes to; None where it fails for no reason that lies in the matrix."""
