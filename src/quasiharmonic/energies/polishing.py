@@ -120,7 +120,7 @@ def polish(
         the message names the triangles. When the boundary is not on the curves that it is to slide along (see
         `BoundaryCurves`), or triangles are inverted once it is on them. When the energy is not known, not a barrier or
         without second derivatives, or another option has no such value. When there is no step to take as an energy of
-        one's own, or a derivative of it, is NaN: the message names which, and the triangles.
+        one's own, or a derivative of it, is NaN or infinite: the message names which, and the triangles.
 
     Examples
     --------

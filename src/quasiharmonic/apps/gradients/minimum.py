@@ -59,6 +59,11 @@ class Minimum:
     forces : Forces
         At it.
     doubts : list of Doubt
+
+    Raises
+    ------
+    ValueError
+        When the energy or a derivative of it is NaN or infinite at the map.
     """
 
     def __init__(self, energy: DeformationEnergy, w: ComplexArray, freedom: Freedom, *, settle: bool = True) -> None:
@@ -70,6 +75,7 @@ class Minimum:
         with np.errstate(all="ignore"):
             left = self._settle(_STEPS if settle else 0)
             self.forces = self._forces(self._deformation)
+            self._check_numbers()
             if not self._exact:
                 self._by_lu()
             self._judge(left)
@@ -153,6 +159,19 @@ class Minimum:
         form = energy.energy.curvature(d, negative=1.0)
         corners = np.ascontiguousarray(energy.F.T)
         return Forces(corners, self.w.size, energy.g, energy.share, d.p, d.q, by_p, by_q, form)
+
+    def _check_numbers(self) -> None:
+        """Raise a ValueError where the energy or a derivative of it is NaN or infinite."""
+        forces = self.forces
+        value = self._energy.value_of(self._deformation)
+        parts = value, forces.by_p, forces.by_q, *vars(forces.form).values()
+        if all(np.isfinite(part).all() for part in parts):
+            return
+        self._energy.check_numbers(self._deformation)
+        raise ValueError(
+            "the energy or its derivatives leave the range of doubles at uv: its triangles are too large or too small, "
+            "compared with those of the surface"
+        )
 
     def _by_lu(self) -> None:
         """Factor the second derivatives as they are although they have a negative direction."""

@@ -160,6 +160,8 @@ class NewtonDescent:
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step; a status where there is no other to take."""
+        if not np.isfinite(self.value):
+            self._check_numbers()
         gradient = self.gradient()
         # While steps are cut short, reflect negative eigenvalues; a step in full says that clamping will do.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
@@ -185,7 +187,7 @@ class NewtonDescent:
         return Status.EXHAUSTED
 
     def _check_numbers(self) -> None:
-        """Raise a ValueError where there is no step to take, or no factorisation, as an energy has no numbers."""
+        """Raise a ValueError if the energy at hand, or a derivative of it, is NaN or infinite for no good reason."""
         if isinstance(self.energy, DeformationEnergy):
             self.energy.check_numbers(self._deformation)
 
