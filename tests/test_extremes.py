@@ -363,3 +363,16 @@ def test_derivatives_are_finite_or_refused(scale):
         else:
             with pytest.raises(ValueError, match="triangle 0 at rest leave the range of doubles"):
                 derivative_of()
+
+
+def test_derivatives_next_to_the_largest_double():
+    """Each triangle's area is a double, and their sum is not."""
+    V, F = disk(2)
+    rim = boundary_of(F)
+    for map_scale in (1.0, 1e154):
+        derivative = polish_derivative(1e154 * V, F, map_scale * V, fixed=rim)
+        assert np.isfinite(derivative.jvp(rest=1e151 * V)).all()
+    derivative = flatten_derivative(1e154 * V, F, 1e154 * V, energy="mips")
+    np.testing.assert_allclose(derivative.jvp(rest=1e151 * V), 1e151 * derivative.uv / 1e154, rtol=1e-9, atol=1e140)
+    with pytest.raises(ValueError, match="the energy or its derivatives leave the range of doubles at uv"):
+        flatten_derivative(1e154 * V, F, V)

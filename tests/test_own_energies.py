@@ -17,10 +17,10 @@ from quasiharmonic import (
     polish,
     polish_derivative,
 )
-from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.energies import QuadraticForm, SymmetricDirichlet
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.problem.result import Status
-from quasiharmonic.surfaces import disk
+from quasiharmonic.surfaces import disk, grid
 
 UV, F = disk(4)
 V = np.column_stack([UV, 0.4 * UV[:, 0] ** 2 - 0.3 * UV[:, 1] ** 2 + 0.3 * UV[:, 0]])
@@ -89,3 +89,21 @@ def test_an_energy_that_no_barrier_is_and_no_number_where_triangles_are_inverted
     uv[0] = 0.6, 0
     with pytest.raises(ValueError, match=r"NoLogarithm: the energy is no number \(NaN\) at triangles 0, "):
         harmonise(V, F, uv, fixed=RIM, energy=NoLogarithm())
+
+
+def test_no_derivative_where_the_second_derivative_is_singular():
+    square, right = grid(8, 8)
+    corners = boundary_loops(right, len(square))[0]
+    inside = np.flatnonzero(~np.isin(right, corners).any(axis=1))[0]
+
+    class Area(SymmetricDirichlet):
+        """With the second derivative of one triangle's area, which does not change where the triangle is shifted."""
+
+        def curvature(self, d, *, negative=0.0):
+            factor = np.zeros(len(d.det))
+            factor[inside] = 2.0**20
+            none = np.zeros(len(d.det), dtype=complex)
+            return QuadraticForm(factor, -factor, none, none, none, none)
+
+    with pytest.raises(ValueError, match="the second derivative of the energy at uv is singular"):
+        polish_derivative(square, right, square, fixed=corners, energy=Area())

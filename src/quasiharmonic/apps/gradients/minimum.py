@@ -63,7 +63,7 @@ class Minimum:
     Raises
     ------
     ValueError
-        When the energy or a derivative of it is NaN or infinite at the map.
+        When the energy or a derivative of it is NaN or infinite at the map, or its second derivative is singular.
     """
 
     def __init__(self, energy: DeformationEnergy, w: ComplexArray, freedom: Freedom, *, settle: bool = True) -> None:
@@ -183,7 +183,14 @@ class Minimum:
         matrix = system.matrix()
         # Unknowns that there are none of, across a line, have empty rows.
         empty = (abs(matrix) @ np.ones(matrix.shape[0])) == 0
-        self._lu = splu((matrix + dia_array((empty[None].astype(np.float64), [0]), shape=matrix.shape)).tocsc())
+        filled = matrix + dia_array((empty[None].astype(np.float64), [0]), shape=matrix.shape)
+        try:
+            self._lu = splu(filled.tocsc())
+        except RuntimeError:  # as SciPy reports a singular matrix
+            raise ValueError(
+                "there is no derivative: the second derivative of the energy at uv is singular, so that other maps "
+                "have the same energy; choose another energy, or fix more vertices"
+            ) from None
         self.doubts.append(Doubt.NOT_LEAST)
 
     def _judge(self, left: float) -> None:
