@@ -342,6 +342,23 @@ class TestFlatteningAtScales:
         assert flatten(thin, F, energy=energy).certificate.bijective
         assert keep_distances(thin, F, thin[:, :2]).certificate.bijective
 
+    @pytest.mark.parametrize("flat", [1.2e-16, 1e-17, 1e-30, 1.2e-124, 1e-153])
+    @pytest.mark.parametrize("axis", [0, 1])
+    @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "mips", "distances"])
+    def test_disks_too_thin_for_doubles_stay_as_they_lie(self, flat, axis, energy):
+        """Their energy is all rounding, and leads to maps that have collapsed."""
+        V, F = disk(4)
+        V[:, axis] *= flat
+        for start in ({}, {"start": V}):
+            result = flatten(V, F, energy=energy, **start)
+            assert result.status is Status.EXHAUSTED
+            assert result.certificate.bijective
+            laid = result.uv[:, np.argmax(np.ptp(result.uv, axis=0))]
+            laid = np.abs(laid - laid[0])
+            reach = np.abs(V[:, 1 - axis] - V[0, 1 - axis])
+            np.testing.assert_allclose(laid, reach, rtol=0, atol=1e-12)
+            assert np.ptp(result.uv, axis=0).min() == pytest.approx(np.ptp(V[:, axis]), rel=1e-9)
+
     def test_thin_disks_where_two_solvers_fail(self):
         if "rslab" not in available():
             pytest.skip("rslab is not installed")

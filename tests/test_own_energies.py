@@ -17,7 +17,8 @@ from quasiharmonic import (
     polish,
     polish_derivative,
 )
-from quasiharmonic.energies.energies import QuadraticForm, SymmetricDirichlet
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Deformation, QuadraticForm, SymmetricDirichlet
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import disk, grid
@@ -107,3 +108,10 @@ def test_no_derivative_where_the_second_derivative_is_singular():
 
     with pytest.raises(ValueError, match="the second derivative of the energy at uv is singular"):
         polish_derivative(square, right, square, fixed=corners, energy=Area())
+
+
+def test_what_overflows_where_a_triangle_is_all_rounding_is_no_fault_of_the_energy():
+    """A triangle shrunk to 1e-85 whose area, taken to be its rounding, is too large for that."""
+    energy = DeformationEnergy(V, F, SymmetricDirichlet())
+    tiny = np.full(len(F), 1e-85 + 0j)
+    energy.check_numbers(Deformation(tiny, tiny, np.full(len(F), 1e-100)))

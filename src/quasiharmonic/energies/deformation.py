@@ -155,7 +155,7 @@ class DeformationEnergy:
             Which of them, and at which triangles.
         """
         larger, det = np.abs(d.p) + np.abs(d.q), d.det if self.energy.barrier else np.abs(d.det)
-        ordinary = (larger < _ORDINARY) & (det > larger / _ORDINARY)
+        ordinary = (larger < _ORDINARY) & (larger > 1 / _ORDINARY) & (det > larger / _ORDINARY)
         with np.errstate(all="ignore"):
             found = {"energy": (self.energy.density(d),), "first derivative": self.energy.gradient(d)}
             if second:
