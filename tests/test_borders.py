@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
+import pickle
 import subprocess
 import sys
 import traceback
@@ -33,6 +35,7 @@ from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
 from quasiharmonic.energies.measures import mean_ratio
+from quasiharmonic.geometry.exact.batched_loops import certify_each
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.geometry.mesh.operators import operators
@@ -280,6 +283,16 @@ def test_nobody_can_write_to_what_was_certified():
         with pytest.raises(ValueError, match="cannot set WRITEABLE"):
             array.flags.writeable = True
     assert LOOPS[0].flags.writeable
+
+
+@pytest.mark.parametrize("again", [lambda c: c, copy.copy, copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
+@pytest.mark.parametrize("uv", [UV, UV * [-1, 1], np.where(np.arange(len(UV))[:, None] == RIM[0], np.nan, UV)])
+@pytest.mark.parametrize("by", ["certify", "certify_each"])
+def test_no_array_of_a_certificate_can_be_made_writeable(by, uv, again):
+    c = again(certify(F, uv, loops=LOOPS) if by == "certify" else certify_each([F], [uv], [LOOPS])[0])
+    for array in found(c).values():
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            array.flags.writeable = True
 
 
 def test_triangles_that_nobody_can_change_are_not_copied():

@@ -23,6 +23,7 @@ from quasiharmonic import (
     polish_derivative,
     refine_problem,
 )
+from quasiharmonic.linsolve import available
 from quasiharmonic.problem.diagnosis import Kind
 from quasiharmonic.surfaces import cat, disk, grid, random_delaunay
 from quasiharmonic.targets import boundary_to
@@ -341,6 +342,29 @@ class TestFlatteningAtScales:
         assert flatten(thin, F, energy=energy).certificate.bijective
         assert keep_distances(thin, F, thin[:, :2]).certificate.bijective
 
+    @pytest.mark.parametrize("flat", [1.2e-16, 1e-17, 1e-30, 1.2e-124, 1e-153])
+    @pytest.mark.parametrize("axis", [0, 1])
+    @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "mips", "distances"])
+    def test_disks_too_thin_for_doubles_stay_as_they_lie(self, flat, axis, energy):
+        """Their energy is all rounding, and leads to maps that have collapsed."""
+        V, F = disk(4)
+        V[:, axis] *= flat
+        for start in ({}, {"start": V}):
+            result = flatten(V, F, energy=energy, **start)
+            assert result.status is Status.EXHAUSTED
+            assert result.certificate.bijective
+            laid = result.uv[:, np.argmax(np.ptp(result.uv, axis=0))]
+            laid = np.abs(laid - laid[0])
+            reach = np.abs(V[:, 1 - axis] - V[0, 1 - axis])
+            np.testing.assert_allclose(laid, reach, rtol=0, atol=1e-12)
+            assert np.ptp(result.uv, axis=0).min() == pytest.approx(np.ptp(V[:, axis]), rel=1e-9)
+
+    def test_thin_disks_where_two_solvers_fail(self):
+        if "rslab" not in available():
+            pytest.skip("rslab is not installed")
+        V, F = disk(4)
+        assert flatten(V * [2.1837492746569184e-09, 1], F, linear_solver="rslab").certificate.bijective
+
 
 @pytest.mark.parametrize("scale", [1e-310, 1e-200, 1e-100, 1e100, 1e200, 1e300])
 def test_derivatives_are_finite_or_refused(scale):
@@ -356,3 +380,16 @@ def test_derivatives_are_finite_or_refused(scale):
         else:
             with pytest.raises(ValueError, match="triangle 0 at rest leave the range of doubles"):
                 derivative_of()
+
+
+def test_derivatives_next_to_the_largest_double():
+    """Each triangle's area is a double, and their sum is not."""
+    V, F = disk(2)
+    rim = boundary_of(F)
+    for map_scale in (1.0, 1e154):
+        derivative = polish_derivative(1e154 * V, F, map_scale * V, fixed=rim)
+        assert np.isfinite(derivative.jvp(rest=1e151 * V)).all()
+    derivative = flatten_derivative(1e154 * V, F, 1e154 * V, energy="mips")
+    np.testing.assert_allclose(derivative.jvp(rest=1e151 * V), 1e151 * derivative.uv / 1e154, rtol=1e-9, atol=1e140)
+    with pytest.raises(ValueError, match="the energy or its derivatives leave the range of doubles at uv"):
+        flatten_derivative(1e154 * V, F, V)

@@ -160,3 +160,13 @@ def test_a_short_boundary_asks_for_stretch():
     assert stretch_of_boundary(V, [loop], area) == pytest.approx(np.sqrt(4 * np.pi * area) / (2 + np.sqrt(2)))
     V, F = disk(4)
     assert stretch_of_boundary(V, boundary_loops(F, len(V)), np.pi) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("flat", [1e-30, 1.2e-124])
+def test_stretch_of_triangles_too_thin_for_doubles_is_that_of_their_sides(flat):
+    V, F = disk(4)
+    V = np.column_stack([V * [flat, 1], np.zeros(len(V))])
+    for angles_alone in (False, True):
+        assert worst_stretch(V, F, V[:, :2], angles_alone=angles_alone) == pytest.approx(1)
+        shorter = worst_stretch(V, F, V[:, :2] * [1, 2.0**-10], angles_alone=angles_alone)
+        assert shorter == pytest.approx(2.0**10 if angles_alone else 2.0**5)

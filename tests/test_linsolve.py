@@ -27,6 +27,7 @@ from quasiharmonic.linsolve import (
     mkl,
     qdldl,
     rslab,
+    superlu,
 )
 from quasiharmonic.linsolve.dissection import nested_dissection
 
@@ -677,6 +678,21 @@ def test_what_rslab_solves_wrong_another_solves_right(damaged, damage):
         solver.factor(A.data)
         for rhs in (np.ones(144), np.random.default_rng(0).standard_normal((144, 2))):
             np.testing.assert_allclose(both(A) @ solver.solve(rhs), rhs, rtol=0, atol=1e-10)
+
+
+def test_each_solve_says_so_where_the_backend_that_stands_in_fails_too(damaged, monkeypatch):
+    """The first failure must not leave a solver without a factor, for which the next solve would blame its caller."""
+    damaged(solve=np.zeros_like)
+    A = stiffness(4)
+    with solver_for(A, "rslab") as solver:
+        solver.factor(A.data)
+        with monkeypatch.context() as during:
+            for other in (qdldl.Qdldl, superlu.SuperLU):
+                during.setattr(other, "factor", raising(NotPositiveDefinite("singular")))
+            for _ in range(2):
+                with pytest.raises(NotPositiveDefinite, match="singular"):
+                    solver.solve(np.ones(16))
+        np.testing.assert_allclose(both(A) @ solver.solve(np.ones(16)), 1, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("error", [MemoryError("no memory"), KeyboardInterrupt(), ValueError("wrong length")])

@@ -140,32 +140,38 @@ class DeformationEnergy:
             return self.energy.curvature(d, negative=negative).scaled(self.share)
         return curvature_of_mixture(mixture, d, self.share, negative)
 
-    def check_numbers(self, d: Deformation) -> None:
-        """Raise a ValueError if the energy or a derivative is NaN on triangles where overflow cannot be the cause.
+    def check_numbers(self, d: Deformation, *, second: bool = True) -> None:
+        """Raise a ValueError if the energy or a derivative is NaN or infinite on triangles without extreme stretch.
+
+        Parameters
+        ----------
+        d : Deformation
+        second : bool
+            Check second derivatives too.
 
         Raises
         ------
         ValueError
             The message names the quantity and the triangles.
         """
-        larger = np.abs(d.p) + np.abs(d.q)
-        ordinary = (larger < _ORDINARY) & (d.det > larger / _ORDINARY)
+        larger, det = np.abs(d.p) + np.abs(d.q), d.det if self.energy.barrier else np.abs(d.det)
+        ordinary = (larger < _ORDINARY) & (larger > 1 / _ORDINARY) & (det > larger / _ORDINARY)
         with np.errstate(all="ignore"):
-            form = self.energy.curvature(d, negative=1.0)
-            found = {
-                "energy": (self.energy.density(d),),
-                "first derivative": self.energy.gradient(d),
-                "second derivative": (form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc),
-            }
+            found = {"energy": (self.energy.density(d),), "first derivative": self.energy.gradient(d)}
+            if second:
+                form = self.energy.curvature(d, negative=1.0)
+                found["second derivative"] = form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
         for what, parts in found.items():
-            wrong = np.zeros(len(self.F), dtype=bool)
+            wrong, not_a_number = np.zeros((2, len(self.F)), dtype=bool)
             for part in parts:
-                wrong |= np.isnan(part)
+                wrong |= ~np.isfinite(part)
+                not_a_number |= np.isnan(part)
             bad = np.flatnonzero(wrong & ordinary)
             if bad.size:
                 where = named("triangle", "triangles", bad)
+                how = "no number (NaN)" if not_a_number[bad[0]] else "infinite"
                 raise ValueError(
-                    f"{type(self.energy).__name__}: the {what} is no number (NaN) at {where}, "
+                    f"{type(self.energy).__name__}: the {what} is {how} at {where}, "
                     f"where |p| = {abs(d.p[bad[0]]):.6g} and |q| = {abs(d.q[bad[0]]):.6g} at the first; "
                     "quasiharmonic.energies.derivatives.check_energy tries an energy"
                 )

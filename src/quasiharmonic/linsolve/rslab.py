@@ -110,12 +110,15 @@ class Rslab(LinearSolver):
             self._second.close()
 
     def _factor_by_another(self) -> None:
-        """Factor the current matrix with the fallback backend."""
-        self._numeric = None
+        """Factor the current matrix with the fallback backend.
+
+        If that fails too, rslab's factor is kept, so that later solves fail in the same way.
+        """
         if self._second is None:
             other = Qdldl if Qdldl.present() else SuperLU
             self._second = other(self._indptr, self._indices)
         self._second.factor(self._values)
+        self._numeric = None
 
     def _tried(self, step: Callable[[], _Made]) -> _Made | None:
         """Run a step of rslab; return None if it fails for a reason other than the matrix."""

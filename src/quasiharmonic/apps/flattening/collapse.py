@@ -12,18 +12,56 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 # A map has collapsed if its worst stretch is this many times the required one. Measured: at most 4 for maps limited by
 # their own boundary, 10 to 10¹² for collapsed maps.
 _TIMES = 10.0
+# A triangle whose longest side is so many times its height: rounding of its corners changes its stretch by one or more.
+_THIN = 2.0**52
 
 
 def worst_stretch(V: FloatArray, F: IntArray, uv: FloatArray, *, angles_alone: bool) -> float:
     """The worst isometric distortion of a map of the surface's area; with ``angles_alone`` the conformal one."""
     measured = distortion(V, F, uv)
-    return float(np.max(measured.conformal if angles_alone else measured.isometric))
+    stretch = measured.conformal if angles_alone else measured.isometric
+    thin = thin_triangles(V, F)
+    if thin.any():
+        stretch = np.where(thin, _stretch_of_sides(V, F, uv, angles_alone=angles_alone), stretch)
+    return float(np.max(stretch))
+
+
+def thin_triangles(V: FloatArray, F: IntArray) -> BoolArray:
+    """Which triangles (f,) are so thin at rest that doubles cannot express their stretch."""
+    z1, z2 = rest_frames(V, F)
+    with np.errstate(all="ignore"):
+        return _sides(z1, z2).max(axis=0) ** 2 >= _THIN * z1 * np.abs(z2.imag)
+
+
+def _stretch_of_sides(V: FloatArray, F: IntArray, uv: FloatArray, *, angles_alone: bool) -> FloatArray:
+    """How much, or how unevenly, a map of the surface's area stretches the sides of each triangle; (f,).
+
+    Never more than the stretch of the triangle, and right to rounding however thin it is.
+    """
+    z1, z2 = rest_frames(V, F)
+    w = in_units(uv, 0)
+    w1, w2 = w[F[:, 1]] - w[F[:, 0]], w[F[:, 2]] - w[F[:, 0]]
+    with np.errstate(all="ignore"):
+        ratio = _sides(w1, w2) / _sides(z1, z2)
+        most, least = ratio.max(axis=0), ratio.min(axis=0)
+        if angles_alone:
+            return most / least
+        scale = np.sqrt(0.5 * np.sum(z1 * np.abs(z2.imag)) / signed_areas(F, w).sum())
+        return np.maximum(scale * most, 1 / (scale * least))
+
+
+def _sides(first: FloatArray | ComplexArray, second: ComplexArray) -> FloatArray:
+    """Lengths (3, f) of the sides of triangles with a corner at the origin."""
+    return np.abs([first, second, second - first])
 
 
 def stretch_of_boundary(V: FloatArray, loops: Sequence[IntArray], area: float) -> float:

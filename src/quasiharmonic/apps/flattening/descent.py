@@ -227,6 +227,11 @@ class GuardedDescent(FreeDescent):
         (self._weight, self._slack), self._idle = following, 0
         return True
 
+    def _check_numbers(self) -> None:
+        """As of `NewtonDescent`, of the surface's energy."""
+        if isinstance(self.surface, DeformationEnergy):
+            self.surface.check_numbers(self._deformation.surface)
+
     def step(self, tolerance: float) -> Status | None:
         """Take one step with the current contacts."""
         known, strangers = self._near.split(self._known, self.w.size)

@@ -269,7 +269,7 @@ def _with_distances(piece: Piece, start: FloatArray | None, rings: int, settings
         if by_coarse is not None:
             return by_coarse
     found = Flattening(piece, settings, None).run(start)
-    if found.status is Status.INTERRUPTED:
+    if found.status is Status.INTERRUPTED or piece.only_as_it_lies() is not None:
         return found
     try:
         then = kept(piece, found.uv, rings, sampled, first=len(found.history))

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.flattening.collapse import has_collapsed
+from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.descent import FreeDescent, GuardedDescent, descend
 from quasiharmonic.apps.flattening.layout import in_given_unit
@@ -139,6 +139,18 @@ class Piece:
         euler = domain.n - len(found.interior) - len(found.boundary) + len(domain.F)
         return 2 - len(domain.loops) - euler
 
+    def as_it_lies(self) -> FloatArray | None:
+        """Return the surface itself if it is planar and does not overlap itself, as no map is better."""
+        if np.ptp(self.V[:, 2]) > 0:
+            return None
+        # Seen from the side on which its triangles are counterclockwise.
+        uv = self.V[:, :2] * [np.sign(signed_areas(self.F, in_units(self.V[:, :2], 0)).sum()) or 1.0, 1.0]
+        return uv if certify(self.F, uv, loops=self.loops).bijective else None
+
+    def only_as_it_lies(self) -> FloatArray | None:
+        """Return `as_it_lies` if all triangles are so thin that energies are dominated by rounding errors."""
+        return self.as_it_lies() if thin_triangles(self.V, self.F).all() else None
+
     def energy(self, density: Energy, weights: FloatArray | None) -> DeformationEnergy:
         """Return the energy of the piece's maps."""
         return DeformationEnergy(self.V, self.F, density, weights=weights)
@@ -193,9 +205,12 @@ class Flattening:
         """
         began = time.perf_counter()
         try:
-            status = self._descended(start)
-            if self._collapsed(status):
-                status = self._begun_otherwise(status)
+            if (flat := self._piece.only_as_it_lies()) is not None:
+                status = self._kept(flat)
+            else:
+                status = self._descended(start)
+                if self._collapsed(status):
+                    status = self._begun_otherwise(status)
         except KeyboardInterrupt:
             if self._bijective is None:
                 raise
@@ -214,6 +229,12 @@ class Flattening:
             linear_solver=self._solver,
             seconds=time.perf_counter() - began,
         )
+
+    def _kept(self, uv: FloatArray) -> Status:
+        """Use a bijective map without descending."""
+        self._settings = replace(self._settings, max_iterations=0)
+        self._descent(self._in_scale(uv), guarded=False, near=True)
+        return Status.EXHAUSTED
 
     def _descended(self, start: FloatArray | None) -> Status:
         """Descend with a free boundary; if the result overlaps itself, descend again with a guarded boundary."""
@@ -337,7 +358,7 @@ class Flattening:
         surface = piece.V, piece.F, piece.loops
         disk = "disk", partial(disk_start, *surface, solver)
         large = len(piece.F) >= COARSE_FROM
-        yield "as it lies", self._as_it_lies
+        yield "as it lies", piece.as_it_lies
         if not large:
             yield disk
         yield "coarse mesh", partial(coarse_start, *surface, solver)
@@ -347,15 +368,6 @@ class Flattening:
         for other in [name for name in available() if name != self._solver][:1]:
             self._settings = replace(self._settings, linear_solver=other)
             yield f"coarse mesh, {other}", partial(coarse_start, *surface, other)
-
-    def _as_it_lies(self) -> FloatArray | None:
-        """Return the surface itself if it is planar and does not overlap itself, as no map is better."""
-        V, F, loops = self._piece.V, self._piece.F, self._piece.loops
-        if np.ptp(V[:, 2]) > 0:
-            return None
-        # Seen from the side on which the triangles are counterclockwise.
-        uv = V[:, :2] * [np.sign(signed_areas(F, in_units(V[:, :2], 0)).sum()) or 1.0, 1.0]
-        return uv if certify(F, uv, loops=loops).bijective else None
 
     def _blind_to_scale(self, uv: FloatArray) -> bool:
         """Whether the energy does not depend on the map's scale."""

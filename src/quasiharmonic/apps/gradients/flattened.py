@@ -93,7 +93,7 @@ def flatten_derivative(
     if gauge is not None and gauge.keeps_area:
         # First converge at any scale, then scale to the surface's area.
         w = _minimum(measure, w, gauge, domain.fixed, linear_solver).w
-        size = float(strain.m.sum()) * 4.0**-exponent
+        size = float(np.ldexp(strain.m, -2 * exponent).sum())
         w = (w - w.mean()) * np.sqrt(size / signed_areas(domain.F, w).sum()) + w.mean()
     minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver), []
     if _overlaps(domain, minimum.w) and not _overlaps(domain, w):

@@ -60,6 +60,11 @@ class Minimum:
     forces : Forces
         Forces at ``w``.
     doubts : list of Doubt
+
+    Raises
+    ------
+    ValueError
+        When the energy or a derivative of it is NaN or infinite at the map, or its second derivative is singular.
     """
 
     def __init__(self, energy: DeformationEnergy, w: ComplexArray, freedom: Freedom, *, settle: bool = True) -> None:
@@ -71,6 +76,7 @@ class Minimum:
         with np.errstate(all="ignore"):
             left = self._settle(_STEPS if settle else 0)
             self.forces = self._forces(self._deformation)
+            self._check_numbers()
             if not self._exact:
                 self._by_lu()
             self._judge(left)
@@ -156,6 +162,19 @@ class Minimum:
         corners = np.ascontiguousarray(energy.F.T)
         return Forces(corners, self.w.size, energy.g, energy.share, d.p, d.q, by_p, by_q, form)
 
+    def _check_numbers(self) -> None:
+        """Raise a ValueError where the energy or a derivative of it is NaN or infinite."""
+        forces = self.forces
+        value = self._energy.value_of(self._deformation)
+        parts = value, forces.by_p, forces.by_q, *vars(forces.form).values()
+        if all(np.isfinite(part).all() for part in parts):
+            return
+        self._energy.check_numbers(self._deformation)
+        raise ValueError(
+            "the energy or its derivatives leave the range of doubles at uv: its triangles are too large or too small, "
+            "compared with those of the surface"
+        )
+
     def _by_lu(self) -> None:
         """Factor the exact second derivatives by LU although they have a negative direction."""
         from scipy.sparse import dia_array
@@ -166,7 +185,14 @@ class Minimum:
         matrix = system.matrix()
         # Unused unknowns, across the line of a sliding vertex, have empty rows.
         empty = (abs(matrix) @ np.ones(matrix.shape[0])) == 0
-        self._lu = splu((matrix + dia_array((empty[None].astype(np.float64), [0]), shape=matrix.shape)).tocsc())
+        filled = matrix + dia_array((empty[None].astype(np.float64), [0]), shape=matrix.shape)
+        try:
+            self._lu = splu(filled.tocsc())
+        except RuntimeError:  # as SciPy reports a singular matrix
+            raise ValueError(
+                "there is no derivative: the second derivative of the energy at uv is singular, so that other maps "
+                "have the same energy; choose another energy, or fix more vertices"
+            ) from None
         self.doubts.append(Doubt.NOT_LEAST)
 
     def _judge(self, left: float) -> None:

@@ -120,7 +120,9 @@ def surface_strain(domain: Domain) -> RestStrain:
 
 def log_surface(strain: RestStrain) -> FloatArray:
     """The derivative (n, d) of half the logarithm of the surface's area with respect to the rest positions."""
-    share = (strain.m / strain.m.sum()).astype(np.complex128)
+    # The largest area may be near the largest double.
+    relative = strain.m / strain.m.max()
+    share = (relative / relative.sum()).astype(np.complex128)
     return strain.pull(share, np.zeros_like(share))
 
 

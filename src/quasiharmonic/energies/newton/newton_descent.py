@@ -159,6 +159,8 @@ class NewtonDescent:
 
     def step(self, tolerance: float) -> Status | None:
         """Take one step; return a status if no further step is possible."""
+        if not np.isfinite(self.value):
+            self._check_numbers()
         gradient = self.gradient()
         # While steps are shortened, reflect negative eigenvalues. After a full step, clamp them.
         for negative in (-1.0, 0.0) if self._cut else (0.0, -1.0):
@@ -184,7 +186,7 @@ class NewtonDescent:
         return Status.EXHAUSTED
 
     def _check_numbers(self) -> None:
-        """Raise a ValueError if the energy or a derivative is NaN, which prevents a step or a factorisation."""
+        """Raise a ValueError if the energy or a derivative is NaN or infinite without extreme stretch."""
         if isinstance(self.energy, DeformationEnergy):
             self.energy.check_numbers(self._deformation)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.certificate import Certificate, certify, inverted_triangles
 from quasiharmonic.geometry.exact.loops import simple_loops
-from quasiharmonic.util.arrays import FloatArray, IntArray, unchangeable
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def certify_each(
@@ -57,13 +57,13 @@ def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certif
     return Certificate(
         triangles=len(F),
         inverted=none,
-        degenerate=none.copy(),
-        nonfinite=none.copy(),
+        degenerate=none,
+        nonfinite=none,
         bijective=True,
         reasons=(),
-        loops=tuple(loop.copy() for loop in loops),
+        loops=tuple(loops),
         crossings=np.empty((0, 4), dtype=np.int64),
-        multiply_wound=none.copy(),
-        F=unchangeable(F),
-        uv=uv.copy(),
+        multiply_wound=none,
+        F=F,
+        uv=uv,
     )

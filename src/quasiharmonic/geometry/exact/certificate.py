@@ -51,6 +51,7 @@ from quasiharmonic.util.arrays import (
     named,
     own_triangles,
     true_or_false,
+    unchangeable,
 )
 from quasiharmonic.util.display import Displayable
 
@@ -83,7 +84,7 @@ class Certificate(ReadOnly, Displayable):
         triangles wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
     F : (f, 3) int64
     uv : (n, 2) float64
-        Triangles and map that were checked, as copies. All arrays are read-only.
+        Triangles and map that were checked, as copies. All arrays are read-only and cannot be made writeable.
 
     Notes
     -----
@@ -108,6 +109,13 @@ class Certificate(ReadOnly, Displayable):
 
     def __post_init__(self) -> None:
         self._seal()
+
+    def _seal(self) -> None:
+        """Keep every array in memory that nobody can write to, whatever flags they set."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, unchangeable(value))
+        object.__setattr__(self, "loops", tuple(unchangeable(loop) for loop in self.loops))
 
     def _read_only(self) -> tuple[NDArray[Any], ...]:
         return (

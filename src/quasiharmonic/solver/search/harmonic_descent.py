@@ -90,6 +90,7 @@ class HarmonicDescent:
         objective = self._objective.descending(self._energy(eta))
         with self._stage(name):
             start = self._restart(objective)
+            self._measure.check_numbers(start)
             if not np.isfinite(start.value):
                 return False
             lowest, left = self._probe(objective, start, iterations)

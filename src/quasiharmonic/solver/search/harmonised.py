@@ -81,6 +81,11 @@ class Harmonised(Functional):
         """The same with R₁ taken at the map's own tensors: a property of the map alone, ``inf`` if it is inverted."""
         return self._energy(at) + self.conformal * self.regulariser.of_map(at.dw)
 
+    def check_numbers(self, at: QuasiHarmonicMap) -> None:
+        """Raise a ValueError if E or its first derivative is NaN or infinite where stretch is not extreme."""
+        if self.energy is not None:
+            self.energy.check_numbers(self._deformation(self.energy, at), second=False)
+
     def _energy(self, at: QuasiHarmonicMap) -> float:
         return 0.0 if self.energy is None else self.energy.value_of(self._deformation(self.energy, at))
 

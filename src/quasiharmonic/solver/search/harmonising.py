@@ -134,7 +134,8 @@ def harmonise(
     ------
     ValueError
         When the input is malformed (see `Problem`), a rest triangle has no area, or the energy is a barrier and
-        ``uv`` not injective; the message names the triangles. When an option has no such value.
+        ``uv`` not injective; the message names the triangles. When an option has no such value. When a user's energy,
+        or its first derivative, is NaN or infinite at the start of a round: the message names which, and the triangles.
 
     Examples
     --------

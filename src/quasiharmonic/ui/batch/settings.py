@@ -127,7 +127,7 @@ def _contents(path: Path) -> bytes:
 @cache
 def sources_digest() -> str:
     """Return a digest of the sources, without those that only present results; computed once per process."""
-    package = Path(__file__).parent.parent
+    package = Path(__file__).parents[2]
     digest = blake2b(digest_size=16)
     for path in sorted([*package.rglob("*.py"), *package.rglob("*.[ch]")]):
         place = path.relative_to(package).as_posix()

@@ -1,0 +1,117 @@
+"""A user's energy that is NaN or infinite: every function that takes one names what is wrong, and where."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import (
+    Problem,
+    animate,
+    flatten,
+    flatten_derivative,
+    harmonise,
+    injective_map,
+    injective_maps,
+    morph,
+    polish,
+    polish_derivative,
+)
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Deformation, QuadraticForm, SymmetricDirichlet
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.problem.result import Status
+from quasiharmonic.surfaces import disk, grid
+
+UV, F = disk(4)
+V = np.column_stack([UV, 0.4 * UV[:, 0] ** 2 - 0.3 * UV[:, 1] ** 2 + 0.3 * UV[:, 0]])
+RIM = boundary_loops(F, len(UV))[0]
+PROBLEM = Problem(V, F, RIM, UV[RIM])
+FUNCTIONS = {
+    "polish": lambda energy: polish(V, F, UV, fixed=RIM, energy=energy),
+    "slide": lambda energy: polish(V, F, UV, fixed=RIM, energy=energy, slide=True),
+    "flatten": lambda energy: flatten(V, F, energy=energy),
+    "start": lambda energy: flatten(V, F, energy=energy, start=UV),
+    "harmonise": lambda energy: harmonise(V, F, UV, fixed=RIM, energy=energy),
+    "polish_derivative": lambda energy: polish_derivative(V, F, UV, fixed=RIM, energy=energy),
+    "flatten_derivative": lambda energy: flatten_derivative(V, F, UV, energy=energy),
+    "animate": lambda energy: animate(PROBLEM, [UV[RIM], 1.1 * UV[RIM]], polish=energy),
+    "morph": lambda energy: morph(UV, F, RIM, 1.1 * UV[RIM], energy=energy),
+    "injective_map": lambda energy: injective_map(V, F, RIM, UV[RIM], polish=energy),
+    "injective_maps": lambda energy: list(injective_maps([PROBLEM, PROBLEM], polish=energy)),
+}
+WORDS = {"density": "energy", "gradient": "first derivative", "curvature": "second derivative"}
+
+
+class Spoilt(SymmetricDirichlet):
+    """Right but for one of its parts at two triangles."""
+
+    def __init__(self, part, value):
+        self.part, self.value = part, value
+
+    def density(self, d):
+        return self.at_two("density", super().density(d))
+
+    def gradient(self, d):
+        by_p, by_q = super().gradient(d)
+        return self.at_two("gradient", by_p), by_q
+
+    def curvature(self, d, *, negative=0.0):
+        form = super().curvature(d, negative=negative)
+        self.at_two("curvature", form.pp)
+        return form
+
+    def at_two(self, part, values):
+        if part == self.part:
+            values[[3, 50]] = self.value
+        return values
+
+
+@pytest.mark.parametrize(("value", "how"), [(np.nan, r"no number \(NaN\)"), (np.inf, "infinite")])
+@pytest.mark.parametrize("part", WORDS)
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_an_energy_that_is_no_number_is_named(function, part, value, how):
+    if (function, part) == ("harmonise", "curvature"):
+        # Harmonising reads no second derivatives.
+        assert FUNCTIONS[function](Spoilt(part, value)).status is Status.POLISHED
+        return
+    with pytest.raises(ValueError, match=rf"Spoilt: the {WORDS[part]} is {how} at triangles 3, 50, where \|p\| = "):
+        FUNCTIONS[function](Spoilt(part, value))
+
+
+def test_an_energy_that_no_barrier_is_and_no_number_where_triangles_are_inverted_is_named():
+    class NoLogarithm(SymmetricDirichlet):
+        barrier = False
+
+        def density(self, d):
+            return np.log(d.det) ** 2
+
+    uv = UV.copy()
+    uv[0] = 0.6, 0
+    with pytest.raises(ValueError, match=r"NoLogarithm: the energy is no number \(NaN\) at triangles 0, "):
+        harmonise(V, F, uv, fixed=RIM, energy=NoLogarithm())
+
+
+def test_no_derivative_where_the_second_derivative_is_singular():
+    square, right = grid(8, 8)
+    corners = boundary_loops(right, len(square))[0]
+    inside = np.flatnonzero(~np.isin(right, corners).any(axis=1))[0]
+
+    class Area(SymmetricDirichlet):
+        """With the second derivative of one triangle's area, which does not change where the triangle is shifted."""
+
+        def curvature(self, d, *, negative=0.0):
+            factor = np.zeros(len(d.det))
+            factor[inside] = 2.0**20
+            none = np.zeros(len(d.det), dtype=complex)
+            return QuadraticForm(factor, -factor, none, none, none, none)
+
+    with pytest.raises(ValueError, match="the second derivative of the energy at uv is singular"):
+        polish_derivative(square, right, square, fixed=corners, energy=Area())
+
+
+def test_what_overflows_where_a_triangle_is_all_rounding_is_no_fault_of_the_energy():
+    """A triangle shrunk to 1e-85 whose area, taken to be its rounding, is too large for that."""
+    energy = DeformationEnergy(V, F, SymmetricDirichlet())
+    tiny = np.full(len(F), 1e-85 + 0j)
+    energy.check_numbers(Deformation(tiny, tiny, np.full(len(F), 1e-100)))
