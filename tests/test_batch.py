@@ -22,6 +22,7 @@ from quasiharmonic.surfaces import annulus, cat, disk, grid, refine
 from quasiharmonic.targets import outline, outline_curves, signed_area
 from quasiharmonic.ui.batch import driver, records, supervisor
 from quasiharmonic.ui.batch import settings as settings_module
+from quasiharmonic.ui.batch.settings import sources
 from quasiharmonic.ui.batch.supervisor import Finished
 from quasiharmonic.ui.cli import main
 from shared.datasets import record_of, star_of, write_problem, write_stars
@@ -680,3 +681,9 @@ class TestCommand:
         lines = done.stderr.splitlines()
         assert lines[-1].startswith("4/4 done")
         assert "\r" not in done.stderr
+
+
+def test_records_depend_on_every_source_that_changes_results():
+    names = [name for name, _ in sources()]
+    assert {"solver/field/tensor.py", "util/kernels/c/field.c", "ui/batch/worker.py"} <= {*names}
+    assert not [name for name in names if name.startswith("ui/cli/")]

@@ -123,8 +123,8 @@ def polish(
         - When the boundary is not on the curves it should slide along (see `BoundaryCurves`), or moving it onto them
           inverts triangles.
         - When the energy is unknown, is not a barrier or has no second derivatives, or when another option is invalid.
-        - When a user-defined energy or one of its derivatives is NaN or infinite, so that no step is possible; the message lists
-          which, and the triangles.
+        - When a user-defined energy or one of its derivatives is NaN or infinite, so that no step is possible; the
+          message lists which, and the triangles.
 
     Examples
     --------

@@ -124,17 +124,25 @@ def _contents(path: Path) -> bytes:
         raise OSError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+_PRESENTATION = "ui/cli/", "ui/plot/", "ui/report/"
+
+
+def sources() -> list[tuple[str, Path]]:
+    """Return names and paths of the library's source files, without those that only present results."""
+    package = Path(__file__).parents[2]
+    files = sorted([*package.rglob("*.py"), *package.rglob("*.[ch]")])
+    named = [(path.relative_to(package).as_posix(), path) for path in files]
+    return [(name, path) for name, path in named if not name.startswith(_PRESENTATION)]
+
+
 @cache
 def sources_digest() -> str:
-    """Return a digest of the sources, without those that only present results; computed once per process."""
-    package = Path(__file__).parents[2]
+    """Return a digest of `sources`; computed once per process."""
     digest = blake2b(digest_size=16)
-    for path in sorted([*package.rglob("*.py"), *package.rglob("*.[ch]")]):
-        place = path.relative_to(package).as_posix()
-        if not place.startswith(("cli/", "plot/", "report/")):
-            contents = path.read_bytes()
-            digest.update(f"{place}\0{len(contents)}\0".encode())
-            digest.update(contents)
+    for name, path in sources():
+        contents = path.read_bytes()
+        digest.update(f"{name}\0{len(contents)}\0".encode())
+        digest.update(contents)
     return digest.hexdigest()
 
 

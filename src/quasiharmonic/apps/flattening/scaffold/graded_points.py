@@ -46,9 +46,9 @@ class Quadtree:
     ) -> Quadtree:
         """Split until squares at given positions (k, 2) have at most given sizes (k,)."""
         # The depth is limited by the integers; smaller sizes get squares that are too large.
-        lowest_energy = min(_DEEPEST, _BITS - 1 - int(np.ceil(np.log2(max(shape)))))
+        deepest = min(_DEEPEST, _BITS - 1 - int(np.ceil(np.log2(max(shape)))))
         with np.errstate(divide="ignore"):
-            level = np.clip(np.ceil(np.log2(side / sizes)), 0, lowest_energy).astype(np.int64)
+            level = np.clip(np.ceil(np.log2(side / sizes)), 0, deepest).astype(np.int64)
         split: list[IntArray] = []
         below = np.empty(0, dtype=np.int64)
         for depth in range(int(level.max(initial=0)) - 1, -1, -1):
