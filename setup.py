@@ -14,7 +14,7 @@ KERNELS = Path("src/quasiharmonic/util/kernels/c")
 # A product and a sum rounded as one, where the processor can, would make results differ from machine to machine.
 # The rest changes no result: nobody asks for errno or for the processor's flags, so choices need no jumps.
 PRECISE = "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"
-FLAGS = ["/std:c11"] if sys.platform == "win32" else ["-std=c11", "-O3", *PRECISE]
+FLAGS = ["/std:c11"] if sys.platform == "win32" else ["-std=c11", "-O3", "-fvisibility=hidden", *PRECISE]
 # One wheel serves this Python and all later ones, but for those without the global lock.
 STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
 

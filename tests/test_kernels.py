@@ -221,3 +221,11 @@ def test_the_environment_switches_them_off(value, switched):
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"QUASIHARMONIC_PURE": value},
                           capture_output=True, text=True, check=True)  # fmt: skip
     assert (done.stdout.strip() == "True") >= switched
+
+
+@needs_extension
+@pytest.mark.skipif(sys.platform == "win32", reason="symbols are hidden there by default")
+def test_the_extension_exports_its_entry_point_alone():
+    library = ctypes.CDLL(kernels.extension.__file__)
+    assert hasattr(library, "PyInit__compiled")
+    assert not [name for name in ("take", "fit", "done", "sort_edges") if hasattr(library, name)]
