@@ -1,4 +1,4 @@
-"""Maps for problems that the mesh as given does not allow: edges are split until a map exists.
+"""Maps for problems that the given mesh does not allow: edges are split until a map exists.
 
 The package builds on `solver.search` and `solver.construction`. Start reading in `mapping` for `injective_map`, then
 `attempts`.

@@ -1,4 +1,4 @@
-"""The one-shot call: from arrays to a map without inverted triangles, on a finer mesh if that is allowed."""
+"""Map arrays into the plane without inverted triangles in one call, with optional refinement."""
 
 from __future__ import annotations
 
@@ -39,66 +39,66 @@ def injective_map(
     slide: bool | BoundaryCurves = False,
     refine: bool = False,
 ) -> MapResult:
-    """Map a triangle mesh into the plane with no triangle inverted.
+    """Map a triangle mesh into the plane without inverted triangles.
 
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
-        Rest positions of a planar or curved mesh, disk-like or with holes.
+        Rest positions of a planar or curved mesh, a disk with or without holes.
     F : (f, 3) array of int
         Triangles, consistently oriented.
     fixed : (k,) array of int
-        Vertices with given positions: the whole boundary and any pinned interior vertices.
+        Fixed vertices: the whole boundary and any pinned interior vertices.
     target : (k, 2) array
-        Where they go.
+        Target positions of the fixed vertices, in the same order.
     reference : {"equilateral", "rest", "corrected"}, optional
-        Shape of the triangles in which gradients are taken (§9.3), whatever the strategy would choose.
+        Shape of the triangles in which gradients are taken (§9.3). It overrides the strategy's choice.
     strategy : {"speed", "paper"} or sequence of Descent
-        ``"speed"`` finds a map soonest; ``"paper"`` is the paper's own pipeline, si-log first; or stages of one's own.
+        ``"speed"`` finds a map fastest; ``"paper"`` is the pipeline of the paper, with si-log first. A sequence gives
+        the stages directly.
     polish : str or Energy, optional
-        Once injective, lower this distortion energy; see `quasiharmonic.polish` for the names.
+        Distortion energy to lower after an injective map is found; see `quasiharmonic.polish` for the names.
     start : (n, 2) array, optional
-        A map to begin with, for instance that of the same mesh for a target near this one: the search starts at
-        its tensors, and afresh where that leads nowhere.
+        Initial map, for instance the map of the same mesh for a similar target. The search starts from its tensors. If
+        that fails, later stages start from scratch.
     max_iterations : int
-        Iterations to spend at most on finding the map: one linear solve each on the whole mesh. RetrySchedule at
-        repairing a small patch are counted where they succeed; those in vain may together take as long as 16 times so
-        many.
+        Maximum number of iterations of the search; each is one linear solve on the whole mesh. Successful repairs of
+        small patches count as iterations. Failed repairs may take as long as 16 times ``max_iterations`` in total.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every iteration, and with the last one again at least every half second in between:
-        while patches are tried, say, or a diagnosis is made, but not within a single factorisation. It may raise
-        `KeyboardInterrupt`, on a clock of its own for instance, which ends the search as Ctrl-C does.
+        Called with a `Step` at every iteration. During longer work, such as patch repairs or a diagnosis, it is called
+        with the last `Step` again at least every half second, but not within a single factorisation. It may raise
+        `KeyboardInterrupt`, for instance after a time limit, which ends the search as Ctrl-C does.
     record_every : int
-        Keep the map of every ``record_every``-th iteration in the result's ``path``; none of them by default.
+        Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps.
     slide : bool or BoundaryCurves
-        While polishing let boundary vertices glide along their outline, its corners held; see `quasiharmonic.polish`.
-        The boundary of ``target`` is put onto the curves first, if it is off them by a chord.
+        Let boundary vertices slide along their outline during polishing, with fixed corners; see
+        `quasiharmonic.polish`. If the boundary of ``target`` is off the curves by a chord, it is moved onto them first.
     refine : bool
-        Where no map of the mesh as given is found, split inner edges, as few as need be: those that the diagnosis
-        names; more around what stays inverted; or, for a connected surface without handles and a target whose loops
-        are simple, disjoint, nested and wound as the mesh's, pins distinct and strictly inside, as many as a
-        construction with a proof needs. Such a problem ends with a bijective map, with ``PRECISION_LIMIT``,
-        or, where dozens of pins lie elsewhere than in the mesh, with ``TOO_MANY_SPLITS``.
+        If the given mesh has no injective map, split as few interior edges as possible. The edges are those that the
+        diagnosis names, then edges around inverted triangles, then those that a construction with a proof needs. The
+        construction requires a connected surface without handles. The target's loops must be simple, disjoint, nested
+        and wound as the mesh's; pins must be distinct and strictly inside. The result is then a bijective map or has
+        status ``PRECISION_LIMIT``. With dozens of pins far from their mesh positions it may be ``TOO_MANY_SPLITS``.
 
     Returns
     -------
     MapResult
-        With the certified map, or with the best map found and a status that says why it is not injective: of the
-        maps met, the one with the fewest inverted triangles; where the diagnosis proves that none is injective,
-        the one of least area. Failure to find a map is not an exception. Ctrl-C ends the search and returns the
-        best map so far. Where edges were split, ``refined`` has the mesh that it is a map of: old vertices keep their
-        numbers, new ones follow. ``refinement_attempts`` tells what was tried.
+        The certified map. If no injective map was found, the result is the best map, and ``status`` gives the reason.
+        The best map has the fewest inverted triangles; if the diagnosis proves that no injective map exists, it is the
+        map of least area. Failure to find a map does not raise an exception. Ctrl-C ends the search and returns the
+        best map so far. If edges were split, ``refined`` has the mesh of the map: old vertices keep their indices, new
+        ones follow. ``refinement_attempts`` lists the attempts.
 
     Raises
     ------
     ValueError
-        When the input is malformed; see `Problem`.
+        If the input is malformed; see `Problem`.
 
     Examples
     --------
-    A square annulus whose hole is turned by a quarter:
+    Map a square annulus onto itself with its hole turned by 90°:
 
     >>> import numpy as np
     >>> from quasiharmonic import injective_map

@@ -1,13 +1,12 @@
-"""The first stage of many small searches, run as one.
+"""Run the first stage of many small searches in one batch.
 
-A call of NumPy or of a sparse solver takes some microseconds however little there is to do, and one iteration on a few
-hundred triangles is a hundred such calls. So small meshes are laid side by side, none joined to another: their
-Laplacian has one block for each, one analysis, one factorisation and one solve serve all, and VectorAdam does not mind,
-as it looks at each triangle by itself. Every problem walks the way that it would walk alone, to rounding. Whichever is
-solved falls out; what is left of several groups after the first iterations is joined, and whenever half have fallen
-out, the others move up.
+A call of NumPy or of a sparse solver has an overhead of some microseconds, and one iteration on a few hundred triangles
+needs about a hundred calls. Small meshes are therefore combined into one disconnected mesh. Their Laplacian is block
+diagonal, so one analysis, one factorisation and one solve serve all meshes. VectorAdam treats each triangle separately.
+Up to rounding, every problem follows the same path as it would alone. Solved problems leave the batch. After the first
+iterations the unsolved problems of several groups are joined, and a group is compacted when half of it is solved.
 
-What is left when the stage has run is handed on as `ResumedStage`, and each is searched on by itself.
+Problems that are unsolved after the stage are returned as `ResumedStage`; each search then continues separately.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ from quasiharmonic.solver.search.stages import ResumedStage, Stages
 from quasiharmonic.solver.search.strategy import stages_of
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# What has more triangles is solved by itself: NumPy has enough to do at each call.
+# Meshes with more triangles are solved separately: the overhead per NumPy call is then negligible.
 SMALL = 4_000
-# Triangles of what is laid side by side. Twice as many are no sooner solved, triangle for triangle: their arrays leave
-# the processor's cache. And QDLDL is still the first choice for such a system where MKL is not installed.
+# Maximum number of triangles of a batch. Twice as many are not faster per triangle, because the arrays exceed the
+# cache. At this size QDLDL is still the default solver if MKL is not installed.
 GROUP = 28_000
-# Iterations before groups are joined. After two, nine in ten of what is not hard is solved, and the rest of one group
-# would be too little to be worth a call.
+# Iterations before groups are joined. After two, nine in ten easy problems are solved; the rest of one group would be
+# too small for a batch.
 _APART = 2
-# Patterns kept for meshes that come again, as where one mesh is mapped to many targets.
+# Number of patterns kept for reuse, for instance if one mesh is mapped to many targets.
 _PATTERNS = 8
 
 
 class Patterns:
-    """Laplacians of meshes side by side, the last few of them, each analysed once. For one thread at a time.
+    """Cache of the last few Laplacians of batches, each analysed once. Not thread-safe.
 
     Parameters
     ----------
@@ -60,7 +59,7 @@ class Patterns:
         self._kept: dict[tuple[Domain, ...], Laplacian] = {}
 
     def of(self, domains: tuple[Domain, ...], F: IntArray, n: int, fixed: IntArray) -> Laplacian:
-        """That of these domains, whose triangles and fixed vertices are given in their common numbers."""
+        """Return the Laplacian of these domains; triangles and fixed vertices use the indices of the batch."""
         pattern = self._kept.pop(domains, None) or Laplacian(F, n, fixed, self._linear_solver)
         self._kept[domains] = pattern
         if len(self._kept) > _PATTERNS:
@@ -69,21 +68,21 @@ class Patterns:
 
 
 class _Member:
-    """One of the problems, and what `Search` would know of it after the same iterations.
+    """One problem of a batch, and the state that `Search` would have after the same iterations.
 
     Attributes
     ----------
     problem : Problem
     live : bool
-        Whether the stage has anything left to do for it.
+        Whether the stage still runs for this problem.
     seconds : float
-        Its share of what has been spent.
-    tries : Tries
-        When the vertices of its last inverted triangles are placed.
-    found : MapResult, Begun or None
-        What has come of it.
+        Its share of the time spent.
+    tries : RetrySchedule
+        Schedule of relocation: when to move the vertices of the last inverted triangles.
+    found : MapResult, ResumedStage or None
+        Its result so far.
     placed_mu : (f,) complex128 or None
-        The tensors of its best map where that was not descended to, but had vertices placed.
+        Tensors of the best map if that was found by relocation and not by the descent.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -99,7 +98,7 @@ class _Member:
         self.best_xi = self._deepest_xi = np.empty(0, dtype=np.complex128)
 
     def note(self, inverted: int, energy: float, w: ComplexArray, xi: ComplexArray) -> None:
-        """Take note of a map and its tensors."""
+        """Record a map and its tensors."""
         self.history.append(Step(len(self.history), inverted, energy))
         better, deeper = (inverted, energy) < self.best, energy < self._deepest or not self._deepest_map.size
         if better or deeper:
@@ -110,12 +109,12 @@ class _Member:
             self._deepest, self._deepest_map, self._deepest_xi = energy, w, xi
 
     def note_placed(self, w: ComplexArray, mu: ComplexArray, energy: float) -> None:
-        """Take note of a map with vertices placed, none of whose triangles is inverted, at its own tensors."""
+        """Record a map without inverted triangles that relocation found, at its own tensors."""
         self.history.append(Step(len(self.history), 0, energy))
         self.best, self.best_map, self.placed_mu = (0, energy), w, mu
 
     def stage(self, descent: VectorAdam) -> Stage:
-        """What reports say of what was done."""
+        """Entry of this stage in reports."""
         first, last = self.history[0], self.best
         return Stage(
             name=descent.name,
@@ -126,7 +125,7 @@ class _Member:
         )
 
     def hand_on(self, descent: VectorAdam) -> None:
-        """The stage is over, and a search by itself begins."""
+        """End the stage so that a separate search continues."""
         self.live = False
         self.found = ResumedStage(
             descent=descent,
@@ -141,7 +140,7 @@ class _Member:
 
 
 class _Maps(NamedTuple):
-    """Maps of all meshes at some tensors: places, gradient of V₃ in ξ, and for each mesh its flips and its energy."""
+    """Maps of all meshes: positions, gradient of V₃ in ξ, and per mesh the number of inverted triangles and the energy."""
 
     w: ComplexArray
     gradient: ComplexArray
@@ -150,7 +149,7 @@ class _Maps(NamedTuple):
 
 
 class _SideBySide:
-    """Meshes with common numbers for their vertices and triangles, one mesh after another."""
+    """Several meshes combined into one disconnected mesh with common vertex and triangle indices."""
 
     def __init__(self, members: Sequence[_Member], descent: VectorAdam, patterns: Patterns) -> None:
         self.members = members
@@ -166,7 +165,7 @@ class _SideBySide:
         self._boundary = np.concatenate([problem.held for problem in problems])
 
     def evaluate(self, xi: ComplexArray) -> _Maps:
-        """As `Objective.evaluate` and what an `Iterate` computes."""
+        """Compute the maps of ``xi`` and their energies, as `Objective.evaluate` and `Iterate` do."""
         stiffness = stiffness_of(self._mesh, self._parameterisation, xi)
         w = self.laplacian.factor(stiffness).extend(self._boundary)
         if not np.isfinite(w.view(np.float64)).all():
@@ -179,7 +178,7 @@ class _SideBySide:
         return _Maps(w, gradient, inverted.astype(np.int64), energy)
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
-        """Place the vertices of inverted triangles of some of the meshes; those of which none is left take note."""
+        """Relocate the vertices of inverted triangles of some meshes; record and return the members without any left."""
         count = np.diff(self.triangles)
         F = np.concatenate([self._mesh.F[self.triangles_of(k)] for k in some])
         moved, righted = placed_each(F, w, self._fixed, np.repeat(np.arange(len(some)), count[some]))
@@ -196,32 +195,32 @@ class _SideBySide:
         return noting
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
-        """ξ with moduli clipped, in place, to where the rounded tensor is still positive definite."""
+        """Clip the moduli of ``xi`` in place to the range in which the rounded tensor is positive definite."""
         clip_moduli(xi, self._parameterisation.bound)
         return xi
 
     def vertices_of(self, k: int) -> slice:
-        """The vertices of the k-th mesh."""
+        """Vertices of the k-th mesh."""
         return slice(int(self.vertices[k]), int(self.vertices[k + 1]))
 
     def triangles_of(self, k: int) -> slice:
-        """The triangles of the k-th mesh."""
+        """Triangles of the k-th mesh."""
         return slice(int(self.triangles[k]), int(self.triangles[k + 1]))
 
 
 def beginning_alike(problems: Mapping[int, Problem], strategy: str | Stages) -> dict[VectorAdam, list[int]]:
-    """Small problems whose searches begin in the same way, and in one in which they can be run together.
+    """Group small problems whose searches begin with the same stage, if that stage can run in a batch.
 
     Parameters
     ----------
     problems : mapping of int to Problem
     strategy : str or sequence of stages
-        As `quasiharmonic.solve` takes it.
+        See `quasiharmonic.solve`.
 
     Returns
     -------
     dict of VectorAdam to list of int
-        For each beginning the keys of those problems. All others are in none.
+        The keys of the problems for each first stage. Other problems are left out.
     """
     alike: dict[VectorAdam, list[int]] = {}
     for k, problem in problems.items():
@@ -234,7 +233,7 @@ def beginning_alike(problems: Mapping[int, Problem], strategy: str | Stages) -> 
 
 
 def _plain(stage: object) -> TypeGuard[VectorAdam]:
-    """Whether a stage is one that `first_stage` runs."""
+    """Whether `first_stage` can run this stage."""
     if not isinstance(stage, VectorAdam) or type(stage) is not VectorAdam:
         return False
     return stage.functional == "dirichlet" and stage.reference == "equilateral"
@@ -243,26 +242,26 @@ def _plain(stage: object) -> TypeGuard[VectorAdam]:
 def first_stage(
     problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, budget: int, still_wanted: Callable[[], None]
 ) -> list[MapResult | ResumedStage | None]:
-    """Run a stage on many problems together.
+    """Run the first stage of many problems in a batch.
 
     Parameters
     ----------
     problems : sequence of Problem
-        Of any targets that enclose an area, with no kind of reference triangles of their own but equilateral ones.
+        Their targets enclose an area; their reference triangles are unset or equilateral.
     descent : VectorAdam
-        Down V₃, by equilateral triangles.
+        Descent of V₃ with equilateral reference triangles.
     patterns : Patterns
-        Of the thread that calls.
+        Cache of the calling thread.
     budget : int
-        Iterations at most.
+        Maximum number of iterations.
     still_wanted : callable
-        Called at every iteration; what it raises comes out of here.
+        Called at every iteration; an exception that it raises is passed on.
 
     Returns
     -------
     list
-        For each problem its result, or how far the stage has come with it; None where rounding has spoilt something
-        for all of its group: then it is as if nothing had been done.
+        For each problem its result or the state after the stage. None if rounding broke the factorisation of its group;
+        the search must then start from the beginning.
     """
     members = [_Member(problem) for problem in problems]
     last = min(descent.iterations, budget)
@@ -281,15 +280,15 @@ def first_stage(
 
 
 class _Walk:
-    """Some of the problems on their way, side by side.
+    """A batch of problems during the descent.
 
     Parameters
     ----------
     members : sequence of _Member
     xi : (f,) complex128
-        Of the triangles of all of them, one mesh after another.
-    pace : Pace
-        Of the same triangles.
+        Variables of the triangles of all members, one mesh after another.
+    pace : AdamState
+        State of the same triangles.
     descent : VectorAdam
     patterns : Patterns
     """
@@ -300,9 +299,9 @@ class _Walk:
         self.members, self.xi, self.pace, self.descent, self.patterns = members, xi, pace, descent, patterns
 
     def go(self, iterations: range, last: int, still_wanted: Callable[[], None]) -> bool:
-        """Descend until all are solved or these iterations are over; ``last`` is the last of the stage.
+        """Descend until all problems are solved or the iterations are over; ``last`` is the last iteration of the stage.
 
-        Where rounding spoils something, False is returned, and nothing comes of what is not solved yet.
+        Return False if a factorisation fails because of rounding; unsolved problems then have no result.
         """
         try:
             self._go(iterations, last, still_wanted)
@@ -327,7 +326,7 @@ class _Walk:
             due = [k for k in live if inverted[k] and iteration < last and self.members[k].tries.due(inverted[k])]
             if self.descent.placing and due:
                 ready += side.place(due, maps.w)
-            # Nobody knows what an iteration takes for one of them alone: all are charged alike.
+            # The time of one problem within an iteration cannot be measured; divide it equally.
             now = time.perf_counter()
             for k in live:
                 self.members[k].seconds += (now - since) / len(live)
@@ -343,21 +342,21 @@ class _Walk:
                 side = _SideBySide(self.members, self.descent, self.patterns)
 
     def _too_many(self, left: int, iterations: int) -> bool:
-        """Whether those that are left had better move up, for so many iterations that are still to come."""
+        """Whether compacting the batch pays, given the number of live problems and the iterations to come."""
         if _of_one_mesh(self.members):
             return iterations > 0 and 5 * _filled_up(left) <= 3 * len(self.members)
-        # To analyse a pattern takes as long as two iterations.
+        # The analysis of a pattern takes as long as two iterations.
         return iterations > 1 and 2 * left <= len(self.members)
 
 
 def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
-    """What is live of these walks, after as many iterations each, in as few as there may be."""
+    """Join the live problems of batches that have made equally many iterations into as few batches as possible."""
     members = [member for walk in walks for member in walk.members]
     chosen = [k for k, member in enumerate(members) if member.live]
     if not chosen:
         return []
     if _of_one_mesh(members):
-        # A power of two, so that equal meshes are met with in equal numbers, whose pattern is known.
+        # Use a power of two as count, so that batches of one mesh recur in equal sizes and their pattern is cached.
         done = (k for k, member in enumerate(members) if not member.live)
         chosen = sorted([*chosen, *islice(done, _filled_up(len(chosen)) - len(chosen))])
     ends = np.cumsum([len(member.problem.F) for member in members])
@@ -371,17 +370,17 @@ def _joined(walks: Sequence[_Walk]) -> list[_Walk]:
 
 
 def _of_one_mesh(members: Sequence[_Member]) -> bool:
-    """Whether all have one domain."""
+    """Whether all members have the same domain."""
     return len({member.problem.domain for member in members}) == 1
 
 
 def _filled_up(count: int) -> int:
-    """The least power of two that is no less."""
+    """Smallest power of two that is not below ``count``."""
     return 1 << (count - 1).bit_length()
 
 
 def _runs(sizes: Sequence[int]) -> list[tuple[int, int]]:
-    """From where to where things of these sizes, in their order, make up a group each."""
+    """Start and end indices of consecutive groups of at most ``GROUP`` triangles."""
     runs, first, total = list[tuple[int, int]](), 0, 0
     for k, size in enumerate(sizes):
         if k > first and total + size > GROUP:
@@ -392,7 +391,7 @@ def _runs(sizes: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _judge(members: list[_Member], descent: VectorAdam, solver: str) -> None:
-    """Decide exactly on maps without inverted triangles, as far as floating point can tell."""
+    """Certify maps that have no inverted triangles in floating point, and set the results of those that are injective."""
     problems = [member.problem for member in members]
     uv = [member.problem.positions(member.best_map) for member in members]
     verdicts = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])

@@ -1,8 +1,8 @@
-"""A problem with a fraction of the unknowns, whose injective maps become injective maps of the problem itself.
+"""Coarse problems whose injective maps extend to injective maps of the original problem.
 
-The number of iterations does not depend on the mesh's size, but what each of them costs does. So the search is
-made on a coarse mesh, with every fixed vertex in its place, and what it finds is carried to the fine mesh vertex by
-vertex: a fine mesh is neither factored nor descended on at all.
+The number of iterations does not depend on the mesh size, but the cost of each does. The search therefore runs on a
+coarse mesh that keeps all fixed vertices. Its map is then transferred to the fine mesh vertex by vertex, without any
+factorisation or descent on the fine mesh.
 """
 
 from __future__ import annotations
@@ -17,39 +17,39 @@ from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# Vertices of the coarse mesh as a fraction of the mesh's.
+# Vertices of the coarse mesh, as a fraction of the fine mesh's.
 _SHARE = 1 / 8
-# Vertices of the coarse mesh at most,
+# Maximum number of vertices of the coarse mesh,
 _MOST = 1500
-# unless there are so many fixed vertices, all of which stay, that it takes more: so many for each of them suffice to
-# grade the triangles from the boundary to the inside.
+# unless the fixed vertices, all of which are kept, require more. This many vertices per fixed vertex suffice to grade
+# the triangles from the boundary to the interior.
 _PER_FIXED = 3
-# A coarse mesh with this fraction of the vertices or more saves too little to be made.
+# Coarsening to this fraction of the vertices or more saves too little.
 _WORTHWHILE = 0.5
-# Nor is one made of a mesh with fewer vertices than these, which is quickly searched itself.
+# Meshes with fewer vertices are not coarsened, because searching them is fast.
 _LEAST = 1500
-# Coarse triangles that are lower than this share of their longest side are no guide to anything, and their weights in
-# an energy are beyond what doubles tell apart. Their corners are moved by up to this part of the shortest edge there.
+# Coarse triangles whose height is below this fraction of their longest side carry no useful shape, and their weights in
+# an energy exceed double precision. Their corners are moved by up to this fraction of the shortest edge there.
 _LOWEST, _STIRRED = 1e-3, 0.2
 
 
-#: Coarse meshes of domains in use, None where there is none to be had.
+#: Coarse meshes of the domains in use; None if a domain has none.
 _MADE: WeakKeyDictionary[Domain, CoarseMesh | None] = WeakKeyDictionary()
 
 
 class CoarseMesh:
-    """A coarse mesh with the fixed vertices of a fine one, and the way back.
+    """A coarse mesh that keeps the fixed vertices of a fine one, with the prolongation to the fine mesh.
 
     Parameters
     ----------
     fine : Domain
     goal : int
-        Vertices that it is to have, about.
+        Approximate number of vertices.
 
     Attributes
     ----------
     domain : Domain
-        The coarse mesh, with the same vertices held in the same order.
+        The coarse mesh, with the same fixed vertices in the same order.
     """
 
     def __init__(self, fine: Domain, goal: int) -> None:
@@ -65,7 +65,7 @@ class CoarseMesh:
         self.domain = Domain(_not_flat(fine.V[self._vertices], F), F, number[fine.fixed])
 
     def prolong(self, w: ComplexArray) -> ComplexArray:
-        """Carry a map of the coarse mesh to the fine one.
+        """Extend a map of the coarse mesh to the fine mesh.
 
         Parameters
         ----------
@@ -75,7 +75,7 @@ class CoarseMesh:
         Returns
         -------
         (n,) complex128
-            In the same frame, injective where ``w`` is, but for rounding.
+            In the same frame; injective if ``w`` is, except for rounding.
         """
         fine = np.zeros(self._held.size, dtype=np.complex128)
         fine[self._vertices] = w
@@ -83,9 +83,9 @@ class CoarseMesh:
 
 
 def coarse_mesh(problem: Problem) -> CoarseMesh | None:
-    """The coarse mesh for a problem that is large enough, made once for a domain and all its targets.
+    """Return the coarse mesh of a large problem, computed once per domain.
 
-    None where the mesh is small, most of its vertices are fixed, or the caller wants its own triangles looked at.
+    None if the mesh is small, most of its vertices are fixed, or the problem prescribes its own reference triangles.
     """
     if problem.reference not in (None, "equilateral"):
         return None
@@ -98,9 +98,13 @@ def coarse_mesh(problem: Problem) -> CoarseMesh | None:
 
 
 def _not_flat(V: FloatArray, F: IntArray) -> FloatArray:
-    """Positions in space (n, 3), stirred a little at the corners of triangles that have hardly an area there.
+    """Return positions in space, perturbed slightly at the corners of triangles that have almost no area.
 
-    A coarse triangle was never there: its shape is a guide to how large the fine ones were, and no more.
+    The shape of a coarse triangle is only a rough guide to the size of the fine triangles.
+
+    Returns
+    -------
+    (n, 2) or (n, 3) float64
     """
     shapes = rest_shapes(V, F)
     lengths = np.abs(shapes.sides)

@@ -1,14 +1,14 @@
 """Rounds of descent of a quasi-harmonised energy (§11).
 
-    map ──▶ ξ of its own tensors ──▶ VectorAdam, a few steps ──▶ L-BFGS in the units it has learnt ──▶ map
-     ▲                                                                                               │
-     └───────────────────────────────── next round, η as the schedule has it ────────────────────────┤
-                                                                                                     ▼
-                                        the injective map of least energy on the way ◀── last flips righted by V₃
+    map ──▶ ξ of its own tensors ──▶ VectorAdam, a few steps ──▶ L-BFGS in units learnt from it ──▶ map
+     ▲                                                                                              │
+     └───────────────────────────────── next round with the next η ─────────────────────────────────┤
+                                                                                                    ▼
+                              the injective map of least energy found ◀── last inverted triangles untangled by V₃
 
-A large η moves far and leaves a few triangles inverted where the energy wants them so; a smaller one rights them. Each
-round begins at the map's own tensors, at which V₃ vanishes if the map is injective: what V₃ has come to cost is waived,
-and the descent converges to a minimum of E among the injective maps and not to a compromise with V₃.
+A large η moves far and leaves a few triangles inverted where the energy favours that; a smaller η untangles them. Each
+round begins at the map's own tensors, where V₃ vanishes if the map is injective. The descent therefore converges to a
+minimum of E among the injective maps and not to a compromise with V₃.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from quasiharmonic.solver.methods.base import Steps
 from quasiharmonic.solver.search.harmonised import Harmonised
 from quasiharmonic.util.arrays import FloatArray
 
-# Of a round's evaluations, this part goes to VectorAdam; the length of its steps, halved where they leave the energy's
-# domain; and how much of its mean squares a gradient leaves.
+# Fraction of a round's evaluations for VectorAdam; its step length, halved when a step leaves the energy's domain;
+# decay rate of its mean squares.
 _PROBING, _LENGTH, _MEMORY = 0.4, 0.1, 0.9
-# Of the mean stiffness that VectorAdam has learnt, the least that a triangle is given.
+# Smallest stiffness of a triangle, as a fraction of the mean stiffness.
 _SOFTEST = 1e-3
-# Newton steps and local repairs for the last flips.
+# Newton steps, and local repairs, for the last inverted triangles.
 RIGHTING = 40
 
 
 class HarmonicDescent:
-    """The map at hand, the best on the way, and how to get to the next.
+    """The current map, the best map so far, and the rounds that improve them.
 
     Parameters
     ----------
     objective : Objective
-        V₃ of the problem with its fixed vertices where ``uv`` has them, in the tanh parameterisation.
+        V₃ of the problem in the tanh parameterisation, with fixed vertices at their positions in ``uv``.
     energy : callable
-        From η to what a round descends.
+        Function from η to the functional of a round.
     uv : (n, 2) float64
-        The map to begin with.
+        Initial map.
     callback : callable or None
         Called with a `Step` at every map.
 
     Attributes
     ----------
     uv : (n, 2) float64
-        The map of fewest inversions so far, of least distortion among those.
+        The map with the fewest inverted triangles so far, and among those of least distortion.
     best : (int, float)
-        Its inverted triangles, and ``E + κR₁``.
+        Its number of inverted triangles and its ``E + κR₁``.
     history : list of Step
     stages : list of Stage
     """
@@ -82,11 +82,11 @@ class HarmonicDescent:
         self._report(self.best)
 
     def back(self) -> None:
-        """Go back to the best map."""
+        """Return to the best map."""
         self._last = self._objective.of_map(self._problem.frame.inward(self.uv))
 
     def run(self, name: str, eta: float, iterations: int, tolerance: float) -> bool:
-        """One round; whether it came to rest."""
+        """Run one round; return whether it converged."""
         objective = self._objective.descending(self._energy(eta))
         with self._stage(name):
             start = self._restart(objective)
@@ -97,7 +97,7 @@ class HarmonicDescent:
             if not self._squares.any():
                 return True
             if not np.isfinite(self._squares).all():
-                return False  # gradients that leave the numbers' range give no units to go on in
+                                return False  # non-finite gradients give no units for L-BFGS
             stiffness = np.sqrt(self._squares)
             stiffness += _SOFTEST * stiffness.mean()
             self._last = lowest
@@ -111,10 +111,7 @@ class HarmonicDescent:
         return False
 
     def right(self) -> bool:
-        """Right the last inverted triangles by descending V₃ alone, close to where the rounds have ended.
-
-        Whether there are none in the end.
-        """
+        """Untangle the last inverted triangles by descending V₃ alone from the last map; return whether none is left."""
         if self.history[-1].inverted == 0:
             return True
         for method in (Newton(iterations=RIGHTING), LocalRepair(tries=RIGHTING)):
@@ -128,7 +125,7 @@ class HarmonicDescent:
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
-        """Write down what runs; where rounding leaves no Laplacian, it is over."""
+        """Record a stage; end it if the Laplacian is not positive definite."""
         began, done, best = time.perf_counter(), len(self.history), self.best
         try:
             yield
@@ -148,16 +145,16 @@ class HarmonicDescent:
             )
 
     def _restart(self, objective: Objective) -> Iterate:
-        """The map at hand by its own tensors, or as it is where these have no factorisation."""
+        """Evaluate the current map at its own tensors, or at its present ones if those have no factorisation."""
         try:
             return objective.near_map(self._last.w)
         except NotPositiveDefinite:
             return objective.evaluate(self._last.xi)
 
     def _probe(self, objective: Objective, start: Iterate, iterations: int) -> tuple[Iterate, int]:
-        """Learn each triangle's stiffness by VectorAdam, which moves all of them at one pace.
+        """Learn each triangle's stiffness by VectorAdam, which moves all triangles by steps of similar length.
 
-        Returns the lowest iterate and the evaluations left.
+        Return the lowest iterate and the number of evaluations left.
         """
         lowest = here = start
         count = left = int(np.ceil(_PROBING * iterations))
@@ -178,11 +175,11 @@ class HarmonicDescent:
         return lowest, iterations - count
 
     def _visit(self, at: Iterate) -> None:
-        """Take note of a map."""
+        """Record a map and update the best one."""
         self._last = at
         inverted, distortion = at.inverted, self._measure.distortion(at)
         if inverted == 0:
-            # Decided on the coordinates that are handed back, not on the solver's own.
+            # Check the returned coordinates, not those of the solver.
             uv = self._problem.positions(at.w)
             inverted = inverted_triangles(self._problem.F, uv).size
             self._compare((inverted, self._measure.distortion_of_map(at)), uv)

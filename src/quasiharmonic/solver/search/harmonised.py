@@ -1,11 +1,11 @@
-"""Quasi-harmonised energies: any distortion energy, held within the injective maps by V₃ (§11).
+"""Quasi-harmonised energies: any distortion energy, kept within the injective maps by V₃ (§11).
 
 ``Q(ξ) = V₃(ξ)/|Ω| + η (E(w(ξ)) + κ R₁(ξ))`` for the quasi-harmonic map w of the tensors of ξ. The first term is zero
-exactly where that map is injective, so E need not mind inversions; and every injective map is the map of some tensors
-(Theorem 6.4), so nothing is lost by descending over ξ.
+exactly if that map is injective, so E may be finite for inverted triangles. Every injective map is the map of some
+tensors (Theorem 6.4), so the descent over ξ can reach every injective map.
 
-The paper's Q is this times the area |Ω| of the target, which it scales to the surface's: here all three terms are pure
-numbers, η means the same, and no map is scaled.
+The paper's Q is this Q times the target's area |Ω|, and the paper scales the target to the surface's area. In this
+implementation all three terms are dimensionless, η has the same meaning, and no map is scaled.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from quasiharmonic.util.arrays import ComplexArray
 class Harmonised(Functional):
     """``V₃/|Ω| + η (E + κ R₁)``.
 
-    The gradient of E passes through the solution of the Laplacian: with the adjoint ``L λ = ∂E/∂w`` (zero at fixed
-    vertices), a change of the tensors by dA changes E by ``−Re λᴴ dL w``. That is one more solve with the factor at
-    hand.
+    The gradient of E passes through the solution of the Laplacian. With the adjoint ``L λ = ∂E/∂w`` (zero at fixed
+    vertices), a change dA of the tensors changes E by ``−Re λᴴ dL w``. This takes one more solve with the existing
+    factorisation.
 
     Parameters
     ----------
@@ -74,11 +74,11 @@ class Harmonised(Functional):
         return gradient + self.eta * self.conformal * self.regulariser.gradient(at.field)
 
     def distortion(self, at: QuasiHarmonicMap) -> float:
-        """``E + κ R₁``; ``inf`` where E is a barrier and a triangle inverted."""
+        """Return ``E + κ R₁``; ``inf`` if E is a barrier and a triangle is inverted."""
         return self._energy(at) + self.conformal * self.regulariser.value(at.field)
 
     def distortion_of_map(self, at: QuasiHarmonicMap) -> float:
-        """The same with R₁ taken at the map's own tensors: a property of the map alone, ``inf`` if it is inverted."""
+        """Return ``E + κ R₁`` with R₁ at the map's own tensors; depends on the map alone, ``inf`` for inverted triangles."""
         return self._energy(at) + self.conformal * self.regulariser.of_map(at.dw)
 
     def check_numbers(self, at: QuasiHarmonicMap) -> None:
@@ -91,7 +91,7 @@ class Harmonised(Functional):
 
     def _deformation(self, energy: DeformationEnergy, at: QuasiHarmonicMap) -> Deformation:
         """The map's Jacobians, which value and gradient both need."""
-        # As of `Poisson.response`: what is returned is a local, whoever overwrites what is kept.
+        # Return a local variable, because another thread may overwrite the cache; see `Poisson.response`.
         known = self._known
         if known is None or known[0] is not at.w:
             known = self._known = at.w, energy.deform(at.w)

@@ -1,4 +1,7 @@
-"""Injective maps of little distortion, whether or not the energy minds inversions: quasi-harmonisation (§11)."""
+"""Lower any distortion energy within the injective maps by quasi-harmonisation (§11).
+
+The energy may be finite for inverted triangles.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import reports_progress
 
-#: What can be lowered, by name: each makes its energy from the rest mesh.
+#: Energies by name: each entry makes its energy from the rest mesh.
 ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
     "arap": lambda V, F: ARAP(),
     "arap-unsigned": lambda V, F: UnsignedARAP(),
@@ -47,7 +50,7 @@ ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
     "mips": lambda V, F: MIPS(),
     "symmetric-dirichlet": lambda V, F: SymmetricDirichlet(),
 }
-#: η by round. Barriers keep the map injective by themselves; the others need V₃ to have the last word.
+#: η of each round. Barriers keep the map injective by themselves; for other energies V₃ must dominate at the end.
 BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
 ETA = (0.1, 0.1, 0.01, 0.001)
 
@@ -73,8 +76,8 @@ def harmonise(
 ) -> MapResult:
     """Lower any distortion energy within the injective maps, by quasi-harmonisation (§11).
 
-    For energies that are finite for inverted triangles, and for those of which only first derivatives are known.
-    `quasiharmonic.polish` needs barriers with second derivatives, and is faster for these.
+    Use it for energies that are finite for inverted triangles and for energies without second derivatives. For barriers
+    with second derivatives `quasiharmonic.polish` is faster.
 
     Parameters
     ----------
@@ -83,63 +86,63 @@ def harmonise(
     F : (f, 3) array of int
         Triangles.
     uv : (n, 2) array
-        A map to begin with, as `quasiharmonic.injective_map` finds it. It need not be injective unless the energy
-        is a barrier.
+        Initial map, for instance from `quasiharmonic.injective_map`. It must be injective only if the energy is a
+        barrier.
     fixed : (k,) array of int
-        Vertices that stay where they are in ``uv``, to the last bit: the whole boundary and any pins.
+        Fixed vertices, which keep exactly their positions in ``uv``: the whole boundary and any pins.
     energy : str, Energy or None
         E, the mean over the surface's area:
 
-        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)², rigid where it can be, with σ₂ < 0 for inverted triangles;
-        - ``"arap-unsigned"``: the same with σ₂ ≥ 0, as the paper has it: mirroring costs nothing;
-        - ``"area"``: (σ₁σ₂ − 1)², areas and nothing else;
+        - ``"arap"``: (σ₁ − 1)² + (σ₂ − 1)², as rigid as possible, with σ₂ < 0 for inverted triangles;
+        - ``"arap-unsigned"``: the same with σ₂ ≥ 0 as in the paper; inversion has no cost;
+        - ``"area"``: (σ₁σ₂ − 1)², areas only;
         - ``"springs"``: (l − l⁰)² summed over the mesh's edges;
-        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles and nothing else;
+        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles only;
         - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻² − 4, lengths.
 
-        Or any `Energy`. None leaves R₁ alone, which is MIPS in the end and no barrier on the way.
+        Or any `Energy`. None lowers R₁ alone: MIPS for injective maps, but finite for other maps.
     eta : float or sequence of float, optional
-        η in ``V₃/|Ω| + η (E + κ R₁)``, one for each round. By default four rounds, that end at 1 for barriers and at
-        0.001 for other energies. (The paper has one, of 1e-4, for all.)
+        η in ``V₃/|Ω| + η (E + κ R₁)``, one value per round. Default: four rounds that end at 1 for barriers and at
+        0.001 for other energies. (The paper uses 1e-4 throughout.)
     conformal : float
-        κ, the weight of the regulariser R₁ (eq. 35). A little of it keeps triangles from collapsing.
+        κ, the weight of the regulariser R₁ (eq. 35). A small value keeps triangles from collapsing.
     weights : (f,) array, optional
-        How much each triangle's distortion counts in E; not negative, 1 by default. R₁ counts all alike: it keeps the
-        others from collapsing.
+        Weight of each triangle's distortion in E; not negative, default 1. R₁ is not weighted, so it keeps triangles of
+        weight 0 from collapsing.
     scaled : bool
-        Compare lengths and areas after scaling the map to the surface's area. With False they are taken as they are:
-        what part of the mesh has weight can be at rest then whatever room the whole is given.
+        If True, compare lengths and areas after scaling the map to the surface's area. If False, compare them unscaled,
+        so that weighted triangles can keep their size while the others fill the remaining area.
     max_iterations : int
-        Linear solves of each round at most.
+        Maximum number of linear solves per round.
     tolerance : float
-        A round is at rest when ten steps have lowered its objective by less than this fraction. Not negative.
+        A round has converged if ten steps lower its objective by less than this fraction. Not negative.
     reference : {"equilateral", "rest", "corrected"}
-        Triangles in which V₃ and R₁ are taken. R₁ means the surface's angles in those of the rest mesh alone.
+        Reference triangles of V₃ and R₁. R₁ measures the surface's angles only with ``"rest"``.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
-        Called with a `Step` at every map on the way, and with the last one again at least every half second in between,
-        but not within a single factorisation; its ``energy`` is E + κR₁.
+        Called with a `Step` at every map, whose ``energy`` is E + κR₁. It is called with the last `Step` again at least
+        every half second in between, but not within a single factorisation.
 
     Returns
     -------
     MapResult
-        The injective map of least E + κR₁ on the way, ``uv`` included; certified. With status ``POLISHED`` when the
-        last round came to rest, ``STILL_FALLING`` when it did not, ``UNIMPROVED`` when no injective map on the way was
-        better than ``uv``, ``INTERRUPTED`` by Ctrl-C; or, with the map of fewest inversions, where none was injective,
-        ``IMPOSSIBLE`` if the ``diagnosis`` names what forbids one and else ``STALLED``. The history holds E + κR₁ at
-        every map.
+        The certified injective map of least E + κR₁ found, ``uv`` included. The status is ``POLISHED`` if the last
+        round converged and ``STILL_FALLING`` if not. It is ``UNIMPROVED`` if no injective map was better than ``uv``
+        and ``INTERRUPTED`` after Ctrl-C. If no map was injective, the result is the map with the fewest inverted
+        triangles. Its status is ``IMPOSSIBLE`` if the ``diagnosis`` forbids an injective map, and otherwise
+        ``STALLED``. The history holds E + κR₁ of every map.
 
     Raises
     ------
     ValueError
-        When the input is malformed (see `Problem`), a rest triangle has no area, or the energy is a barrier and
-        ``uv`` not injective; the message names the triangles. When an option has no such value. When a user's energy,
-        or its first derivative, is NaN or infinite at the start of a round: the message names which, and the triangles.
+        If the input is malformed (see `Problem`), an option is invalid, or a rest triangle has no area. If the energy
+        is a barrier and ``uv`` is not injective. If a user-defined energy or its first derivative is NaN or infinite
+        at the start of a round. The message names the triangles.
 
     Examples
     --------
-    A disk whose triangles crowd at the middle, of which areas alone are to be kept:
+    Equalise the areas of a disk whose triangles are crowded at the centre:
 
     >>> import numpy as np
     >>> from quasiharmonic import distortion
@@ -188,9 +191,9 @@ def harmonise_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
-    """Harmonise a map of a `Domain` at hand; the rest as `harmonise` has it.
+    """Quasi-harmonise a map of a `Domain`; see `harmonise` for the options.
 
-    The domain's ``fixed`` vertices stay where they are in ``uv``.
+    The domain's ``fixed`` vertices keep their positions in ``uv``.
     """
     began = time.perf_counter()
     chosen = _energy(energy, domain)
@@ -221,7 +224,8 @@ def harmonise_map(
             raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
         deformation = None
         if chosen is not None:
-            # In the frame's unit map and surface compare as they do in the caller's.
+            # The map is in the frame's unit. Scale the surface accordingly so that both compare as in the caller's
+            # units.
             V, asked = (own.V, area) if scaled else (own.frame.lengths(own.V), None)
             deformation = DeformationEnergy(V, own.F, chosen, area=asked, weights=weights)
         objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
@@ -240,8 +244,8 @@ def harmonise_map(
                 done = descent.right() and (descent.best < first or status is Status.POLISHED)
                 if done or values == len(schedule) * schedule[-1:]:
                     break
-                # The schedule's long steps left triangles that cannot be righted, or are still above the map given:
-                # from the start once more, with the last η alone.
+                # The schedule's long steps left inverted triangles that could not be untangled, or the result is worse
+                # than the initial map. Restart from the best map with the last η alone.
                 descent.back()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
@@ -271,7 +275,7 @@ def harmonise_map(
 
 
 def _energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
-    """The energy of a name, made for this mesh."""
+    """Return the named energy for this mesh, or the given energy itself."""
     if energy is None or isinstance(energy, Energy):
         return energy
     if energy not in ENERGIES:

@@ -1,4 +1,4 @@
-"""Many problems in one call: small ones together, and all of them on as many cores as there are."""
+"""Solve many problems in one call: small problems in groups, and groups on all available cores."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from quasiharmonic.util.arrays import check_callback, check_choice, whole_number
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 
-# Groups that are solved together, at most: what is left of them after the first iterations is joined.
+# Maximum size of a batch in groups. The unsolved problems of a batch are joined after the first iterations.
 _GROUPS = 4
-# What is solved together is no more than such a part of all that was before, so that no thread is left with much while
-# the others have nothing to do any more.
+# A batch has at most one ``_PART``-th of the triangles before it (but may always have one group), so that no thread has
+# much left while the others are idle.
 _PART = 8
-# Seconds between two calls of a callback while nothing is finished, and between two looks for an interrupt.
+# Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
 _TICK = 0.2
 
 
@@ -50,51 +50,51 @@ def injective_maps(
     errors: str = "raise",
     callback: Callable[[int], object] | None = None,
 ) -> Iterator[MapResult | ValueError]:
-    """Solve many problems: what `injective_map` does for one, several times as many a second where they are small.
+    """Solve many problems as `injective_map` does, several times as many per second if they are small.
 
     Parameters
     ----------
     problems : iterable of Problem or of (V, F, fixed, target)
-        As `injective_map` takes them; any number, read as they are needed. A mesh that is the same as the one before,
-        with the same vertices fixed, is looked at once.
+        Any number of problems, read as needed; see `injective_map`. If a problem has the same mesh and fixed vertices
+        as the previous one, the mesh is analysed once.
     reference : {"equilateral", "rest", "corrected"}, optional
-        For those that are given as arrays; see `injective_map`. With another than ``"equilateral"`` each problem is
-        solved by itself.
+        Reference triangles of problems given as arrays; see `injective_map`. With a value other than ``"equilateral"``
+        each problem is solved separately.
     strategy, polish, max_iterations, linear_solver
-        As of `injective_map`, for all of them.
+        See `injective_map`; applied to all problems.
     jobs : int, optional
-        Threads to solve with; by default as many as there are cores. No matter to the maps.
+        Number of threads. Default: the number of available cores. It does not affect the maps.
     errors : {"raise", "yield"}
-        What becomes of a problem that is malformed: a ValueError that names its number is raised when it is its turn,
-        after which nothing more is to be had, or it takes the place of the result.
+        How to report a malformed problem. ``"raise"``: raise a ValueError with its number when its result is due and
+        end the iteration. ``"yield"``: yield the ValueError instead of the result.
     callback : callable, optional
-        Called with the number of problems that are done whenever that has grown, and a few times a second besides.
-        It may raise, which ends all.
+        Called with the number of finished problems when that number grows, and also several times per second. If it
+        raises an exception, all work ends.
 
     Yields
     ------
     MapResult
-        In the order of the problems. That no map was found is no error, as of `injective_map`. Its ``seconds`` are a
-        share of what was spent on several at a time.
+        In the order of the problems. A problem without a map is not an error; see `injective_map`. For problems solved
+        in a group, ``seconds`` is a share of the group's time.
 
     Raises
     ------
     ValueError
-        When an option is none that there is; when a problem is malformed, with its number counted from 0.
+        If an option is unknown or invalid, or a problem is malformed; the message has its number, counted from 0.
     ImportError
-        When the linear solver named is not installed.
+        If the named linear solver is not installed.
 
     Notes
     -----
-    Meshes of up to 4,000 triangles are laid side by side, and the first stage of the search is run on some 28,000
-    triangles at a time; what is left of up to four such groups after two iterations goes on together. Each walks
-    the way that it would walk alone: the same call gives the same maps, whatever ``jobs``, and they are those of
-    `injective_map` but for rounding, which may lead a long search elsewhere. Ctrl-C ends all within a fraction of a
-    second, as does closing the iterator.
+    Meshes of up to 4,000 triangles are combined into groups of about 28,000 triangles for the first stage of the
+    search. After two iterations the unsolved problems of up to four groups are joined. Grouping does not change the
+    path of a problem: the same call gives the same maps for any ``jobs``. They equal the maps of `injective_map` except
+    for rounding, which may lead a long search to another map. Ctrl-C and closing the iterator end all work within a
+    fraction of a second.
 
     Examples
     --------
-    A disk onto twenty ellipses:
+    Map a disk onto twenty ellipses:
 
     >>> from quasiharmonic import injective_maps
     >>> from quasiharmonic.surfaces import disk
@@ -121,7 +121,7 @@ def injective_maps(
 
 @dataclass(frozen=True)
 class _Settings:
-    """What all problems have in common."""
+    """Options that apply to all problems."""
 
     reference: Reference | None
     strategy: str | Stages
@@ -133,7 +133,7 @@ class _Settings:
 def _results(
     problems: Iterator[Any], settings: _Settings, jobs: int, raising: bool, callback: Callable[[int], object] | None
 ) -> Iterator[MapResult | ValueError]:
-    """Have groups solved, a few more at a time than there are threads, and hand out what comes of them in order."""
+    """Solve groups in threads and yield their results in order; submit a few more groups than there are threads."""
     stop = threading.Event()
     workers = threading.local()
 
@@ -166,7 +166,7 @@ def _results(
 def _awaited(
     future: Future[list[Any]], done: int, callback: Callable[[int], object] | None
 ) -> list[MapResult | ValueError]:
-    """What comes of a group; meanwhile the callback is called now and then, and Ctrl-C is heard."""
+    """Wait for the results of a group; meanwhile call the callback regularly and allow Ctrl-C."""
     while True:
         try:
             return future.result(timeout=_TICK)
@@ -176,7 +176,7 @@ def _awaited(
 
 
 def _groups(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
-    """Problems in their order, as many together as are to be solved together; and the number of the first."""
+    """Yield the number of the first problem of each group and the problems of the group, in order."""
     first, group, size, before = 0, list[Any](), 0, 0
     for given in problems:
         triangles = _triangles(given)
@@ -192,7 +192,7 @@ def _groups(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
 
 
 def _triangles(given: Any) -> int:
-    """How many triangles a problem has, as far as can be told before it is looked at."""
+    """Number of triangles of a problem that is not yet checked; 0 if it cannot be determined."""
     try:
         return len(given.F if isinstance(given, Problem) else given[1])
     except (TypeError, IndexError, KeyError):
@@ -200,7 +200,7 @@ def _triangles(given: Any) -> int:
 
 
 class _Worker:
-    """A thread that solves groups of problems, and what it keeps from one to the next."""
+    """Solver of groups of problems for one thread, with the caches that the thread reuses."""
 
     def __init__(self, settings: _Settings, stop: threading.Event) -> None:
         self._settings = settings
@@ -209,7 +209,7 @@ class _Worker:
         self._last: Problem | None = None
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
-        """The results of some problems, or what was raised; ``first`` is the number of the first of them."""
+        """Return the result or the exception of each problem; ``first`` is the number of the first problem."""
         ready = self._posed_at_once(group)
         posed = [self._posed(first + k, given, ready.get(k)) for k, given in enumerate(group)]
         begun: dict[int, MapResult | ResumedStage] = {}
@@ -229,7 +229,7 @@ class _Worker:
         ]
 
     def _posed_at_once(self, group: Sequence[Any]) -> dict[int, Problem]:
-        """Those given as arrays that have a small mesh each, unless something is the matter with one of them."""
+        """Set up problems with small meshes given as arrays in one batch; return {} if one of them is invalid."""
         if self._settings.reference is not None:
             return {}
         fresh = dict[int, Any]()
@@ -250,7 +250,7 @@ class _Worker:
         return {} if posed is None else dict(zip(fresh, posed, strict=True))
 
     def _posed(self, number: int, given: Any, ready: Problem | None) -> Problem | Exception:
-        """A problem, on the domain of the one before if that is the same; ``ready`` if it is posed already."""
+        """Set up a problem, on the previous problem's domain if it is the same, or use ``ready`` if it is given."""
         self._still_wanted()
         if isinstance(given, Problem):
             return given
@@ -267,7 +267,7 @@ class _Worker:
         return self._last
 
     def _finished(self, number: int, problem: Problem, begun: MapResult | ResumedStage | None) -> MapResult | Exception:
-        """The result of one problem, whatever has been done for it so far."""
+        """Complete the search for one problem from the result or stage in ``begun``."""
         settings = self._settings
         try:
             if isinstance(begun, MapResult):
@@ -298,20 +298,20 @@ class _Worker:
         return result if begun is None else replace(result, seconds=result.seconds + begun.stage.seconds)
 
     def _still_wanted(self, _: Step | None = None) -> None:
-        """Break off where nobody waits any more."""
+        """Raise KeyboardInterrupt if the caller no longer waits for results."""
         if self._stop.is_set():
             raise KeyboardInterrupt
 
 
 def _same(array: np.ndarray[Any, Any], given: Any) -> bool:
-    """Whether what is given is an array of the same shape and numbers."""
+    """Whether ``given`` is an array of the same shape and values."""
     if given is array:
         return True
     return isinstance(given, np.ndarray) and given.shape == array.shape and np.array_equal(array, given)
 
 
 def _numbered(number: int, error: Exception) -> Exception:
-    """An error that says of which problem it is."""
+    """Add the number of the problem to an error."""
     if isinstance(error, ValueError):
         numbered = ValueError(f"problem {number}: {error}")
         numbered.__cause__ = error
@@ -321,7 +321,7 @@ def _numbered(number: int, error: Exception) -> Exception:
 
 
 def _cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores available to this process."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:

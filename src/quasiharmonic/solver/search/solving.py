@@ -1,7 +1,7 @@
-"""From a problem to a map without inverted triangles: the strategy (§9.2).
+"""Solve one problem: search for a map without inverted triangles (§9.2).
 
-The search stops at the first map whose every triangle is strictly positive, decided exactly on the coordinates that are
-handed back.
+The search stops at the first map in which every triangle is strictly positive. Exact arithmetic verifies this on the
+returned coordinates.
 """
 
 from __future__ import annotations
@@ -50,26 +50,26 @@ def solve(
     record_every: int = 0,
     slide: bool | BoundaryCurves = False,
 ) -> MapResult:
-    """Solve a problem at hand.
+    """Search for an injective map of a `Problem`.
 
     Parameters
     ----------
     problem : Problem
-        It has the kind of reference triangles too, and is not changed but for what it keeps to be solved again sooner.
+        It also names the reference triangles. The call changes only its caches, which make later solves faster.
     strategy, polish, start, max_iterations, linear_solver, callback, record_every, slide
-        As of `injective_map`.
+        See `injective_map`.
 
     Returns
     -------
     MapResult
-        As of `injective_map`.
+        See `injective_map`.
 
     Raises
     ------
     ValueError
-        When an option is none that there is, or ``start`` has another shape than (n, 2) or a place that is not finite.
+        If an option is unknown or invalid, or ``start`` does not have shape (n, 2) or contains a non-finite position.
     ImportError
-        When the linear solver named is not installed.
+        If the named linear solver is not installed.
     """
     began = time.perf_counter()
     whole_number("max_iterations", max_iterations, least=1)
@@ -114,30 +114,31 @@ def quasi_harmonic_map(
     reference: Reference = "equilateral",
     linear_solver: str = "auto",
 ) -> FloatArray:
-    """The quasi-harmonic map of a tensor field, or Tutte's embedding where no field is given (equation 12).
+    """Compute the quasi-harmonic map of a tensor field, or Tutte's embedding without a field (equation 12).
 
     Parameters
     ----------
     problem : Problem
     mu : (f,) complex128, optional
-        Beltrami coefficients of the tensors, below 1 in modulus; zero by default.
+        Beltrami coefficients of the tensors, with modulus below 1. Default: zero.
     reference : {"equilateral", "rest", "corrected"}
-        The triangles in whose frames they are expressed, unless the problem itself names others.
+            Reference triangles in whose frames the coefficients are expressed. A reference set in ``problem`` takes
+            precedence.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
     Returns
     -------
     (n, 2) float64
-        Positions, the fixed vertices exactly at their target. Injective only where the target is convex
-        or μ is right.
+        Positions; fixed vertices are exactly at their target positions. The map is injective if the target is convex or
+        ``mu`` is the field of an injective map; otherwise it may not be.
 
     Raises
     ------
     ValueError
-        When μ has another shape or is not below 1 in modulus; the message names the triangles.
+        If ``mu`` has the wrong shape or a modulus of 1 or more; the message names the triangles.
     quasiharmonic.linsolve.NotPositiveDefinite
-        When rounding leaves no positive definite Laplacian.
+        If the Laplacian is not positive definite after rounding.
     """
     check_choice("reference", reference, get_args(Reference))
     coefficients = beltrami_coefficients(mu, len(problem.F))
@@ -147,6 +148,6 @@ def quasi_harmonic_map(
 
 
 def _first_map(problem: Problem, start: ArrayLike) -> ComplexArray:
-    """The caller's first map, checked, as complex numbers in a frame of its own: only its tensors count."""
+    """Check the initial map and return it as complex numbers in its own frame, because only its tensors are used."""
     uv = map_array("start", start, problem.n)
     return Frame(uv).inward(uv)

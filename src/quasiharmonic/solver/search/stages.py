@@ -1,6 +1,6 @@
-"""The search: stages run one after another until one finds a map without inverted triangles (§9.2).
+"""Run stages one after another until one finds a map without inverted triangles (§9.2).
 
-Where none does, the search ends with the reason, if one is known, and then with the map of least area.
+If no stage finds one, the search reports the reason if a diagnosis proves it, and then returns the map of least area.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 if TYPE_CHECKING:
     from quasiharmonic.problem.diagnosis import Diagnosis
 
-# Iterations that tries at patches may amount to in vain, in all stages together, as a multiple of the search's.
+# Maximum cost of failed patch repairs in all stages together, in units of the search's iteration budget.
 _IN_VAIN = 16
-# The share of inverted triangles above which they count as many.
+# Fraction of inverted triangles above which a stage `WhereMany` runs.
 MANY_INVERTED = 0.02
-# What rights the last few triangles; and what follows the first stage on a coarse mesh.
+# Stages that untangle the last few triangles, and stages that follow the first stage on a coarse mesh.
 LOCAL_REPAIRS = LineShift(resume=True), LocalRepair(tries=15, resume=True)
 _COARSE = *LOCAL_REPAIRS, Untangling(resume=True), *LOCAL_REPAIRS
-# Newton steps towards the map of least area where there is no injective one: what follows moves nothing one would see.
+# Newton steps towards the map of least area if no injective map exists; later steps cause no visible change.
 _TO_LEAST_AREA = 30
 
 
 @dataclass(frozen=True)
 class CoarseToFine(SearchStage):
-    """A stage that searches on a coarse mesh, if this one is large, and carries the map that it finds to this one.
+    """Stage that searches on a coarse mesh and transfers the map to the fine mesh; skipped if the mesh is small.
 
     Attributes
     ----------
     first : Descent
-        What the search on the coarse mesh begins with; local repair and untangling follow.
+        First stage on the coarse mesh; local repair and untangling follow.
     """
 
     first: Descent
@@ -57,7 +57,7 @@ class CoarseToFine(SearchStage):
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return f"coarse-to-fine, {self.first.name}"
 
     @property
@@ -66,13 +66,13 @@ class CoarseToFine(SearchStage):
         return self.first
 
     def run(self, search: StageRunner, before: Status) -> Status:
-        """As of `SearchStage`."""
+        """See `SearchStage`."""
         return search.attempt_on_coarse(self, before)
 
 
 @dataclass(frozen=True)
 class TentativeStage(SearchStage):
-    """A stage whose iterations are discarded where it finds no map (§9.2): what follows goes on from before it.
+    """Stage whose iterations are discarded if it finds no map (§9.2); later stages continue from the state before it.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class TentativeStage(SearchStage):
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return self.tried.name
 
     @property
@@ -92,13 +92,13 @@ class TentativeStage(SearchStage):
         return self.tried
 
     def run(self, search: StageRunner, before: Status) -> Status:
-        """As of `SearchStage`."""
+        """See `SearchStage`."""
         return search.attempt_tentatively(self.tried, before)
 
 
 @dataclass(frozen=True)
 class WhereMany(SearchStage):
-    """A stage that is run only where so many triangles are inverted that local repair would take longer than it does.
+    """Stage that runs only if so many triangles are inverted that local repair would be slower.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class WhereMany(SearchStage):
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return self.tried.name
 
     @property
@@ -118,26 +118,26 @@ class WhereMany(SearchStage):
         return self.tried
 
     def run(self, search: StageRunner, before: Status) -> Status:
-        """As of `SearchStage`."""
+        """See `SearchStage`."""
         return search.attempt_where_many(self.tried, before)
 
 
 @dataclass(frozen=True, eq=False)
 class ResumedStage(SearchStage):
-    """A stage that has been run elsewhere and has found no map, as a search is to go on from it.
+    """Stage that already ran elsewhere without finding a map; the search continues from its state.
 
     Attributes
     ----------
     descent : FunctionalDescent
-        What was run.
+        The stage that ran.
     history : list of Step
         Its iterations, the start included.
     best, best_map, best_xi
-        The map of the fewest inverted triangles, as `Search` compares them, and its tensors.
+        The map with the fewest inverted triangles, as compared by `Search`, and its tensors.
     deepest_map, deepest_xi : (n,), (f,) complex128
-        The map of the lowest V₃, and its tensors.
+        The map of lowest V₃ and its tensors.
     stage : Stage
-        What reports say of it.
+        Its entry in reports.
     """
 
     descent: FunctionalDescent
@@ -151,7 +151,7 @@ class ResumedStage(SearchStage):
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return self.descent.name
 
     @property
@@ -160,12 +160,12 @@ class ResumedStage(SearchStage):
         return self.descent
 
     def run(self, search: StageRunner, before: Status) -> Status:
-        """As of `SearchStage`."""
+        """See `SearchStage`."""
         return search.take_over(self)
 
 
 class _State(NamedTuple):
-    """What a search knows of the best map, and the map of the lowest V₃; see `Search`."""
+    """The best map of a search and the map of lowest V₃; see `Search`."""
 
     best: tuple[int, float]
     best_map: ComplexArray
@@ -174,37 +174,37 @@ class _State(NamedTuple):
     lowest_energy: Iterate | None
 
 
-#: Whatever a strategy is made of.
+#: Stages of a strategy.
 Stages: TypeAlias = Sequence[SearchStage]
 
 
 class Search:
-    """Runs stages one after another, keeps the best map and writes down what happened.
+    """Run stages one after another, keep the best map and record the history.
 
     Parameters
     ----------
     problem : Problem
-        On a domain that is nobody else's while the search runs.
+        Its domain must not be used elsewhere while the search runs.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
     callback : callable, optional
         Called with a `Step` at every iteration.
     budget : int
-        Iterations at most.
+        Maximum number of iterations.
     record_every : int
-        Keep every so many-th map in ``path``; none for 0.
+        Keep every ``record_every``-th map in ``path``; 0 keeps no maps.
     first : (n,) complex128, optional
-        A map to begin with, of any size and anywhere.
+        Initial map, of any size and position.
 
     Attributes
     ----------
     best_map : (n,) complex128
-        The map of fewest inverted triangles so far, and of these the one of lowest V₃, in the problem's frame; the one
-        of lowest V₃ where a diagnosis says that none is injective.
+        The map with the fewest inverted triangles so far, and among those the one of lowest V₃, in the problem's frame.
+        If a diagnosis forbids an injective map: the map of lowest V₃.
     best_field, best_reference : TensorField or None, str
-        Its tensors and the triangles in whose frames they are expressed.
+        Its tensors, and the reference triangles in whose frames they are expressed.
     history, stages, path, diagnosis, linear_solver
-        As `MapResult` has them.
+        See `MapResult`.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class Search:
         self.problem = problem
         self._first = first
         self.linear_solver = self._asked = linear_solver
-        # Where rounding defeats one backend's factorisation, another's order of elimination may do.
+        # If a factorisation fails because of rounding, another backend with another elimination order may succeed.
         self._spare: tuple[str, ...] | None = None if linear_solver == "auto" else ()
         self.callback = callback
         self.budget = budget
@@ -229,7 +229,7 @@ class Search:
         self.history: list[Step] = []
         self.stages: list[Stage] = []
         self.diagnosis: Diagnosis | None = None
-        # Should nothing at all be computed, every free vertex lies at the middle of the target.
+        # Initial value: every free vertex at the centre of the target.
         self.best_map = np.zeros(problem.n, dtype=np.complex128)
         self.best_field: TensorField | None = None
         self.best_reference: Reference = "equilateral"
@@ -239,14 +239,14 @@ class Search:
         self._rounded = self._tried = False
 
     def run(self, stages: Stages) -> Status:
-        """Run stages until one finds an injective map; why the search ended."""
+        """Run stages until one finds an injective map; return the status at the end of the search."""
         try:
             return self._run(stages)
         except KeyboardInterrupt:
             return Status.INTERRUPTED
 
     def _run(self, stages: Stages) -> Status:
-        """Stage after stage, as long as there is hope."""
+        """Run the stages in order until a map is found, the budget is spent or a diagnosis forbids a map."""
         status = Status.OUT_OF_ITERATIONS
         on_the_mesh = [stage.begins_with for stage in stages if not stage.coarse]
         fallback = on_the_mesh[0] if on_the_mesh else stages[0].begins_with
@@ -255,18 +255,18 @@ class Search:
             self._examine()
             return Status.IMPOSSIBLE
         if self._first is not None:
-            # From a map at hand the first stage is tried before all, and no coarse mesh.
+            # With an initial map, run the first stage before all others and skip stages on a coarse mesh.
             status = self._descend_by_any(fallback, status)
             stages = on_the_mesh or [fallback]
         for stage in stages:
             if status is Status.INJECTIVE or self._left <= 0 or self._in_vain <= 0:
                 break
-            # Later stages take long, and are in vain where no injective map exists.
+            # Later stages are slow, and useless if no injective map exists.
             if self._tried and not stage.quick and self._examine().forbids_injective:
                 break
             status = stage.run(self, status)
         if self.best_field is None and self._left > 0:
-            # Every stage was for a coarse mesh, and there was none or its search came to nothing.
+            # All stages were for a coarse mesh, which does not exist or gave no map.
             status = self._descend_by_any(fallback, status)
         if status is Status.INJECTIVE:
             return status
@@ -283,7 +283,7 @@ class Search:
         return self._descend_by_any(stage, before)
 
     def attempt_tentatively(self, stage: Descent, before: Status) -> Status:
-        """Run a stage on the mesh itself, and forget the lowest V₃ that it came to if it finds no map."""
+        """Run a stage on the mesh itself; if it finds no map, restore the previous map of lowest V₃."""
         lowest_energy = self.lowest_energy
         status = self.attempt(stage, before)
         if status is not Status.INJECTIVE:
@@ -291,11 +291,11 @@ class Search:
         return status
 
     def attempt_where_many(self, stage: Descent, before: Status) -> Status:
-        """Run a stage on the mesh itself, if many of its triangles are inverted in the best map."""
+        """Run a stage on the mesh itself if many triangles of the best map are inverted."""
         return self.attempt(stage, before) if self.best[0] > MANY_INVERTED * len(self.problem.F) else before
 
     def take_over(self, begun: ResumedStage) -> Status:
-        """Go on from a stage that was run elsewhere, as `attempt` does from its own."""
+        """Continue from a stage that ran elsewhere, as after `attempt`."""
         objective = begun.descent.objective(self.problem, self._asked)
         self.linear_solver = objective.laplacian.solver.name
         for step in begun.history:
@@ -309,19 +309,19 @@ class Search:
         return Status.OUT_OF_ITERATIONS
 
     def _descend_by_any(self, stage: Descent, before: Status) -> Status:
-        """Run one stage, by another linear solver where one has failed; how it ended, or else the search so far."""
+        """Run a stage, with another linear solver if one fails; return its status or that of the search so far."""
         status = self._descend(stage)
         while status is Status.UNSOLVABLE and self._spare and self._left > 0:
             self._asked = self._spare[0]
             status = self._descend(replace(stage, resume=True))
-        # That vertices got nowhere does not mean that tensors had settled.
+        # A stalled vertex descent does not mean that the tensor search before it converged.
         if status is not Status.INJECTIVE and stage.moves_vertices and before is Status.UNSOLVABLE:
             return before
         return status
 
     def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
-        """Search on a coarse mesh, if there is one to be had, and carry its map to this one."""
-        # A recording shows maps of this mesh only, so no coarse one is searched.
+        """Search on a coarse mesh if one exists, and transfer its map to the fine mesh."""
+        # ``path`` contains only maps of this mesh, so skip the coarse mesh if maps are recorded.
         coarse = None if self.record_every else coarse_mesh(self.problem)
         if coarse is None:
             return before
@@ -354,16 +354,17 @@ class Search:
         return Status.INJECTIVE if self.best[0] == 0 else before
 
     def _take(self, w: ComplexArray, inverted: int) -> None:
-        """Take on a map from elsewhere, at its own tensors."""
+        """Replace the best map by ``w`` with its own tensors."""
         mesh = self.problem.domain.mesh("equilateral")
         dw = mesh.derivatives(w)
         field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))
         self._state = _State((inverted, 0.0 if inverted == 0 else np.inf), w, field, mesh.kind, self.lowest_energy)
 
     def _repair_carried(self, before_it: _State) -> None:
-        """Right the last inverted triangles of a map from a coarse mesh; where that fails, it is put aside.
+        """Untangle the last inverted triangles of a map from a coarse mesh; if that fails, set the map aside.
 
-        Other stages then begin anew, and not in front of a wall that the coarse mesh may have put up.
+        Later stages then start from the previous state, because the transferred map may contain obstacles from the
+        coarse mesh.
         """
         for stage in LOCAL_REPAIRS:
             if self._left > 0 and 0 < self.best[0] <= MOST_FLIPS:
@@ -374,7 +375,7 @@ class Search:
 
     @property
     def _state(self) -> _State:
-        """What is known of the best map."""
+        """The best map and the map of lowest V₃."""
         return _State(self.best, self.best_map, self.best_field, self.best_reference, self.lowest_energy)
 
     @_state.setter
@@ -382,14 +383,14 @@ class Search:
         self.best, self.best_map, self.best_field, self.best_reference, self.lowest_energy = state
 
     def _note(self, step: Step) -> None:
-        """Write a step down, whatever its number was where it was made."""
+        """Append a step to the history with the next number, and call the callback."""
         step = Step(len(self.history), step.inverted, step.energy)
         self.history.append(step)
         if self.callback is not None:
             self.callback(step)
 
     def _examine(self) -> Diagnosis:
-        """Whether anything forbids a map; found out once."""
+        """Return the diagnosis of the problem; computed once."""
         from quasiharmonic.problem.diagnosis import diagnose
 
         if self.diagnosis is None:
@@ -397,7 +398,7 @@ class Search:
         return self.diagnosis
 
     def _towards_least_area(self) -> None:
-        """Where no map is injective, go to the one of least area: the target's area and V₃ make it up (eq. 42)."""
+        """Move to the map of least area if none is injective: V₃ is total unsigned area minus target area (eq. 42)."""
         if self._left > 0:
             self._descend(Newton(iterations=_TO_LEAST_AREA, resume=True))
         if self.lowest_energy is not None:
@@ -406,11 +407,11 @@ class Search:
 
     @property
     def _left(self) -> int:
-        """Iterations left; the first evaluation of all is the start and costs none."""
+        """Iterations left; the very first evaluation, the start, is not counted."""
         return self.budget + 1 - len(self.history)
 
     def _descend(self, stage: Descent) -> Status:
-        """Run one stage."""
+        """Run one stage and record it."""
         before, done, began = None, max(len(self.history), 1), time.perf_counter()
         status = Status.INTERRUPTED
         try:
@@ -423,7 +424,7 @@ class Search:
                 self._spare = self._spare[self._spare.index(self.linear_solver) + 1 :]
             given = None if self.history else self._first
             start = stage.start(objective, SearchState(given, self.best_map, self.lowest_energy))
-            # The first map of all is what the first stage begins with.
+            # For the very first stage, compare with its own initial map.
             before = (start.inverted, start.energy) if self.best_field is None else self.best
             status = self._follow(stage, objective, start)
         except NotPositiveDefinite:
@@ -442,7 +443,7 @@ class Search:
         return status
 
     def _follow(self, stage: Descent, objective: Objective, start: Iterate) -> Status:
-        """Look at every map of a stage until one is injective or nothing moves any more; why it ended."""
+        """Visit every map of a stage until one is injective, progress stops or the budget is spent; return the status."""
         patience = Patience(stage.patience)
         steps = Steps(stage.iterates(objective, start))
         last: ComplexArray | None = None
@@ -463,10 +464,10 @@ class Search:
         return Status.STALLED if steps.at_rest else Status.OUT_OF_ITERATIONS
 
     def _visit(self, here: Iterate, *, tensors: bool) -> Step:
-        """Take note of an iterate."""
+        """Record an iterate and update the best map."""
         inverted = here.inverted
         if inverted == 0:
-            # Not on the solver's own coordinates.
+            # Check the returned coordinates, not those of the solver.
             inverted = self._not_positive(here.w)
             self._rounded |= inverted > 0
         step = Step(len(self.history), inverted, here.energy)
@@ -481,7 +482,7 @@ class Search:
         return step
 
     def _not_positive(self, w: ComplexArray) -> int:
-        """How many triangles are not, decided exactly on the coordinates that are handed back."""
+        """Number of triangles that are not positive, determined exactly on the returned coordinates."""
         sign, _ = triangle_signs(self.problem.F, self.problem.positions(w))
         return int(np.count_nonzero(sign <= 0))
 
@@ -489,15 +490,18 @@ class Search:
 def search_coarse(
     problem: Problem, first: Descent, linear_solver: str, budget: int, callback: Callable[[Step], object]
 ) -> tuple[Status, FloatArray, int, str]:
-    """Solve a coarse problem, and lower the distortion of its map a little.
+    """Solve a coarse problem and lower the distortion of its map slightly.
 
-    Why it ended, the map, its inverted triangles, the backend.
+    Returns
+    -------
+    tuple of Status, (n, 2) float64, int, str
+        The status, the map, its number of inverted triangles and the linear solver used.
     """
     search = Search(problem, linear_solver, callback, budget)
     status = search.run([first, *_COARSE])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
-        # Fine vertices crowd where coarse triangles are thin: a few steps against that pay many times over.
+        # Fine vertices crowd in thin coarse triangles. A few polishing steps avoid much later work.
         polish = polish_map(problem.domain, uv, energy="mips", max_iterations=10, linear_solver=linear_solver)
         uv = polish.uv
     return status, uv, search.best[0], search.linear_solver

@@ -1,4 +1,4 @@
-"""What is tried, in which order: what gets through soonest and most often, and the pipeline of the paper."""
+"""Lists of stages: the default strategy, which is fast and reliable, and the pipeline of the paper."""
 
 from __future__ import annotations
 
@@ -22,23 +22,26 @@ from quasiharmonic.solver.methods.base import SearchStage
 from quasiharmonic.solver.search.stages import CoarseToFine, Stages, TentativeStage, WhereMany
 from quasiharmonic.util.arrays import kind_of
 
-# Vertices from which on a coarse-to-fine start pays: the coarse mesh, made, solved and refined again, takes less time
-# than ten iterations on the mesh.
+# Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then faster
+# than ten iterations on the fine mesh.
 _LARGE = 6000
-# Up to so many triangles, or so many for each edge of the boundary, the composite takes longer than what it saves.
+# Up to this number of triangles, or of triangles per boundary edge, the composite costs more time than it saves.
 _SMALL, _SLIM = 1000, 4
-# Turns of alternation and Newton's method in the paper's pipeline.
+# Repetitions of alternation and Newton's method in the paper's pipeline.
 _TURNS = 10
 
 
 def speed(problem: Problem) -> Stages:
-    """The stages that find a map soonest, the first of which usually suffices.
+    """Return the stages of the default strategy, which finds a map fastest; the first stage usually suffices.
 
-    Boundaries alone want tanh, pins want si-log: the spike that a pinned point draws needs distortion that
-    grows slowly towards it, and tanh never gets there. One loop without pins is near to a solution at once by way of
-    a disk. What is left then are a few triangles in tight places, which moving vertices rights sooner than moving
-    tensors does; or else the map is far from any solution in parts, and Newton's method brings it nearer. All of this
-    is tried on a coarse mesh first if the mesh is large, and soon if it is not.
+    The order of stages follows from these observations:
+
+    - Without pins tanh is best. With pins si-log is best: the spike at a pinned vertex needs distortion that grows
+      slowly towards it, which tanh does not reach.
+    - With one boundary loop and no pins, the composite through a disk starts close to a solution.
+    - After the first stage a few triangles in narrow regions may be inverted; moving vertices untangles them faster
+      than changing tensors. Otherwise parts of the map are far from a solution, and Newton's method is used.
+    - On a large mesh a coarse mesh is searched first; on a small mesh it is searched after the first repairs.
 
     Parameters
     ----------
@@ -47,7 +50,7 @@ def speed(problem: Problem) -> Stages:
     Returns
     -------
     list of Descent or CoarseToFine
-        In the order in which they are run.
+        Stages in the order in which they run.
     """
     domain = problem.domain
     pinned, triangles = bool(domain.pins.size), len(problem.F)
@@ -58,24 +61,24 @@ def speed(problem: Problem) -> Stages:
 
 @cache
 def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
-    """The stages with pins or not, for one loop without pins or not, the composite first or not, of a large mesh."""
+    """Stages for a mesh with pins or not, with one loop and no pins or not, composite first or not, large or not."""
     other: Stages = ()
     if pinned:
         first: Descent = VectorAdam(parameterisation="si-log", iterations=400, placing=True)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
         first, newton = VectorAdam(iterations=100, placing=True), Newton(iterations=300, resume=True)
-    # Most tries at local repair succeed in the first few, and a failing one costs as much as many Newton steps.
+    # Most successful local repairs succeed within the first tries, and a failed try costs as much as many Newton steps.
     repair: Stages = (LineShift(resume=True), LocalRepair(tries=15, resume=True))
     if alone:
-        # From one of the two starts or the other.
+        # Two different starts: if one fails, the other may succeed.
         composite = Composite(iterations=100, placing=True)
         first, second = (composite, first) if composed else (first, composite)
         other = (second, *repair)
     coarse = CoarseToFine(first)
     soon: Stages = (first, *repair, coarse)
     if large:
-        # Newton's steps right by the thousand what repair takes patch by patch.
+        # Newton steps untangle thousands of triangles at once, local repair only one patch at a time.
         soon = (coarse, first, *((WhereMany(newton),) if alone else ()), *repair)
     return (
         *soon,
@@ -92,12 +95,12 @@ def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
 
 
 def paper(_: Problem) -> Stages:
-    """The pipeline of the paper's evaluation (§9.2, §10.1), and nothing else.
+    """Return the stages of the paper's evaluation (§9.2, §10.1).
 
-    si-log for at most 1000 iterations; then tanh from the start again; then for the last few triangles the
-    alternation and Newton's method in turn, the alternation's iterations discarded where it fails. All on the mesh
-    itself, and on the surface's own triangles, angles below π/6 corrected (§F.1). How many iterations tanh and each
-    turn have the paper does not say; these make up 2000. Its steps are VectorAdam's own here.
+    The stages are si-log for at most 1000 iterations, then tanh from ξ = 0. Alternation and Newton's method then take
+    turns for the last few triangles, and failed alternations are discarded. All stages run on the mesh itself, with the
+    surface's triangles as reference and angles below π/6 corrected (§F.1). The paper does not give the iterations of
+    tanh and of each turn; those used here add up to 2000. The steps are the defaults of `VectorAdam`.
 
     Returns
     -------
@@ -118,12 +121,12 @@ STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "paper": p
 
 
 def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
-    """The stages that a strategy's name, or the user's own list, stands for.
+    """Return the stages of a named strategy, or the given list of stages.
 
     Raises
     ------
     ValueError
-        When there is no such strategy.
+        If the strategy is unknown, or the list is empty or contains other objects.
     """
     if isinstance(strategy, str):
         if strategy not in STRATEGIES:
@@ -139,7 +142,7 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
 
 
 def soonest(stages: Stages) -> Stages:
-    """The first stages of a strategy: up to the first descent on the mesh itself, and what is quick right after it."""
+    """Return the first stages of a strategy: up to the first descent on the mesh itself, and the quick stages after it."""
     before = list(takewhile(lambda stage: stage.coarse, stages))
     first = stages[len(before) : len(before) + 1]
     rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, WhereMany)]
@@ -147,5 +150,5 @@ def soonest(stages: Stages) -> Stages:
 
 
 def without_restarts(stages: Stages) -> Stages:
-    """A strategy without the stages that start again at random, whose failing tries take many times an iteration."""
+    """Return a strategy without random restarts, whose failed tries cost many iterations each."""
     return [stage for stage in stages if not isinstance(stage, RandomRestarts)] or stages
