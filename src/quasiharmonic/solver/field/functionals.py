@@ -1,4 +1,4 @@
-"""Functionals of the tensor field by which injective maps are found (§7.3).
+"""Functionals of the tensor field that lead to injective maps (§7.3).
 
 ============  =================================================  ======================
 name          value, summed over u and v                         solves beyond (u, v)
@@ -10,19 +10,19 @@ poisson       V₄ = ½ gᴴ L† g − area                              1, wit
 edge-poisson  V₄ in Crouzeix–Raviart elements                    1, of three times the size
 ============  =================================================  ======================
 
-Here ``L = Gᵀ A G``, ``w = u + i v`` is the quasi-harmonic map, and ``g = g_u + i g_v = −i D w`` the
-Neumann data that an injective map onto the target must have (eq. 17). ``V₂ = V₃ + V₄``.
+Here ``L = Gᵀ A G``, ``w = u + i v`` is the quasi-harmonic map, and ``g = g_u + i g_v = −i D w`` are the Neumann data of
+an injective map onto the target (eq. 17). ``V₂ = V₃ + V₄``.
 
-Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh, from which the
-gradient in the Beltrami coefficient μ and then that in ξ follow (`quasiharmonic.solver.field.tensor`).
+Every derivative by A is a combination of ``½ d(xᴴ L y)/dA`` for two maps x, y on the mesh. From it follow the gradients
+in the Beltrami coefficient μ and in ξ (`quasiharmonic.solver.field.tensor`).
 
-V₁, V₂ and V₃ are never negative, and zero at the tensors of injective maps and there only (Theorem 6.4).
+V₁, V₂ and V₃ are non-negative, and zero exactly at the tensors of injective maps (Theorem 6.4).
 
-V₄ is zero at the tensors of injective maps, and elsewhere too. It sees the target through ``C b`` only: it is blind to
-interior pins, and to a boundary loop's position relative to the others. Nor is it bounded below by zero, as its
-continuous counterpart is: linear elements raise a Dirichlet energy and lower its dual, so at a rough tensor field V₄
-may be negative, and on the way there it passes through zero at maps with inverted triangles. In Crouzeix–Raviart
-elements it is bounded, for there it is V₃ again, but for pins and for where loops lie (`EdgePoisson`).
+V₄ is zero at the tensors of injective maps, and at other tensors too. It depends on the target only through ``C b``, so
+it ignores interior pins and the relative position of boundary loops. Unlike its continuous counterpart, V₄ is not
+bounded below by zero: linear elements raise a Dirichlet energy and lower its dual. V₄ may be negative at a rough tensor
+field, so a descent may pass through zero at maps with inverted triangles. In Crouzeix–Raviart elements V₄ is
+non-negative, because it equals V₃ except for pins and loop positions (`EdgePoisson`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class Functional(ABC):
     """
 
     name: str
-    #: Whether the value is never negative, and zero for injective maps with pins and loops in their places only.
+    #: Whether the value is non-negative, and zero only for injective maps with pins and loops at their target
+    #: positions.
     sees_positions = True
 
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
@@ -60,7 +61,7 @@ class Functional(ABC):
 
     @abstractmethod
     def value(self, at: QuasiHarmonicMap) -> float:
-        """V at a tensor field and its map.
+        """Return V at a tensor field and its map.
 
         Parameters
         ----------
@@ -69,12 +70,12 @@ class Functional(ABC):
         Returns
         -------
         float
-            In the units of area of the problem's frame; that of V₁ depends on the mesh.
+            In units of area of the problem's frame; the unit of V₁ depends on the mesh.
         """
 
     @abstractmethod
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """Gradient of V by ξ there, of map and tensors together.
+        """Return the gradient of V in ξ; the map depends on ξ through its tensors.
 
         Parameters
         ----------
@@ -88,7 +89,7 @@ class Functional(ABC):
 
 
 class QuasiHarmonicMap(Protocol):
-    """What a functional looks at.
+    """Quantities of a map that a functional uses.
 
     Attributes
     ----------
@@ -120,9 +121,9 @@ class QuasiHarmonicMap(Protocol):
 
 
 class Dirichlet(Functional):
-    """V₃, the weighted Dirichlet energy (eq. 27): the default.
+    """V₃, the weighted Dirichlet energy (eq. 27); the default.
 
-    Written as the energy of the Beltrami residual it has no cancellation and is its own adjoint:
+    It is computed as the energy of the Beltrami residual, which avoids cancellation and is self-adjoint:
 
         V₃ = Σ 2m |q − μp|² / (1 − |μ|²),     dV₃/dμ = −4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²
     """
@@ -139,7 +140,7 @@ class Dirichlet(Functional):
 class Neumann(Functional):
     """V₁, the plain norm of the Neumann residual (eq. 24, 25).
 
-    Its residual includes the pins, where an injective map's flux is zero.
+    The residual includes the pins, where the flux of an injective map is zero.
     """
 
     name = "neumann"
@@ -157,8 +158,8 @@ class Neumann(Functional):
 class Poisson(Functional):
     """V₄, the Poisson functional (eq. 29, 44), dual to V₃.
 
-    ``L†`` is applied by solving with one vertex held: L is singular only in the constants, and the
-    Neumann data sum to zero.
+    ``L†`` is applied by a solve with one fixed vertex: the kernel of L contains only constants, and the Neumann data
+    sum to zero.
     """
 
     name = "poisson"
@@ -170,8 +171,8 @@ class Poisson(Functional):
         self._known: tuple[TensorField, ComplexArray] | None = None
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """``L† g`` up to a constant: the map that the target's Neumann data alone would bring about."""
-        # Another thread may overwrite what is kept between any two lines: what is returned is a local.
+        """Return ``L† g`` up to a constant, the map with the target's Neumann data; (n,) complex128."""
+        # Return a local variable, because another thread may overwrite the cache at any time.
         known = self._known
         if known is None or known[0] is not at.field:
             if self._one_held is None:
@@ -190,13 +191,13 @@ class Poisson(Functional):
 
 
 class EdgePoisson(Functional):
-    """V₄ in Crouzeix–Raviart elements: linear on each triangle, continuous at the middles of edges.
+    """V₄ in Crouzeix–Raviart elements: linear on each triangle, continuous at the midpoints of edges.
 
-    Their discrete rotated gradients are orthogonal to those of linear elements, and together both are all vector
-    fields that are constant on triangles, on a disk (Arnold and Falk 1989). So the flux of the solution is the rotated
-    gradient of a linear element with the target's boundary, and since ``det 𝒜 = 1`` both have the same energy. The
-    least of the one being the least of the other, on a disk this is V₃ at the map without pins; with holes V₃ where
-    each inner loop may be carried anywhere as a whole. Hence it is never negative.
+    On a disk, their discrete rotated gradients and the gradients of linear elements are orthogonal complements in the
+    piecewise constant vector fields (Arnold and Falk 1989). The flux of the solution is therefore the rotated gradient
+    of a linear element with the target's boundary. Because ``det 𝒜 = 1``, both have the same energy. The minima agree
+    too. On a disk this functional is V₃ of the map without pins; with holes it is V₃ minimised over translations of
+    each inner loop. Hence it is non-negative.
     """
 
     name = "edge-poisson"
@@ -207,11 +208,11 @@ class EdgePoisson(Functional):
         F, n = problem.F, problem.n
         opposite = edge_keys(F[:, (1, 2, 0)], F[:, (2, 0, 1)], n)
         keys, number = np.unique(opposite, return_inverse=True)
-        #: Edge opposite each corner, (f, 3).
+        #: Edge opposite to each corner, (f, 3).
         self._edges = number.reshape(-1, 3)
         self._tail, self._head = problem.domain.edges.boundary.T
         self._rim = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
-        # The same triangles with corners of their own.
+        # The same triangles with separate corners.
         self._apart = copy(mesh)
         self._apart.F = np.arange(F.size).reshape(-1, 3)
         self._apart.n = F.size
@@ -219,15 +220,15 @@ class EdgePoisson(Functional):
         self._known: tuple[TensorField, ComplexArray] | None = None
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """``L† g`` at the middles of edges, up to a constant; (e,) complex128, edges ascending by their ends."""
-        # As of `Poisson.response`.
+        """Return ``L† g`` at the midpoints of edges, up to a constant; (e,) complex128, edges sorted by their ends."""
+        # See `Poisson.response`.
         known = self._known
         if known is None or known[0] is not at.field:
             size = int(self._edges.max()) + 1
             if self._one_held is None:
                 solver = at.operator.pattern.solver.name
                 self._one_held = Laplacian(self._edges, size, self._rim[:1], solver)
-            # The element of an edge has -2 times the gradient of the opposite corner's hat function.
+            # The basis function of an edge has −2 times the gradient of the opposite corner's hat function.
             held = self._one_held.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
             load = np.zeros(size, dtype=np.complex128)
             load[self._rim] = self._neumann_target(at.w)
@@ -245,14 +246,14 @@ class EdgePoisson(Functional):
         return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
 
     def _neumann_target(self, w: ComplexArray) -> ComplexArray:
-        """Neumann data that the target asks for, by boundary edge; (k,) complex128."""
+        """Return the target's Neumann data per boundary edge; (k,) complex128."""
         return -1j * (w[self._head] - w[self._tail])
 
 
 class Sobolev(Poisson):
     """V₂ = V₃ + V₄, the Neumann residual in the norm of L† (eq. 26).
 
-    That is the energy of the difference of the maps that the Dirichlet and the Neumann data bring about.
+    It is the energy of the difference between the maps with the Dirichlet and with the Neumann data.
     """
 
     name = "sobolev"
@@ -270,35 +271,37 @@ FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev
 
 
 def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
-    """V₃ of any map, its A-Dirichlet energy less its signed area (eq. 27).
+    """Return V₃ of any map, its A-Dirichlet energy minus its signed area (eq. 27).
 
     Parameters
     ----------
     mesh : ReferenceMesh
     field : TensorField
     dw : Derivatives
-        Of the map, as `ReferenceMesh.derivatives` has them.
+        Derivatives of the map; see `ReferenceMesh.derivatives`.
 
     Returns
     -------
     float
-        ``Σ 2m |q − μp|² / (1 − |μ|²)``, in the target's units of area; never negative.
+        ``Σ 2m |q − μp|² / (1 − |μ|²)``, in the target's units of area; non-negative.
     """
     return beltrami_gradient(mesh, field, dw)[0]
 
 
 def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[float, ComplexArray]:
-    """V₃ of any map and its gradient in μ with the map held; at the quasi-harmonic map that is all of it.
+    """Return V₃ of any map and its partial gradient in μ for the fixed map.
+
+    At the quasi-harmonic map of the tensors this is the total gradient.
 
     Parameters
     ----------
     mesh, field, dw
-        As of `beltrami_energy`.
+        See `beltrami_energy`.
 
     Returns
     -------
     energy : float
-        ``Σ 2m |q − μp|² / (1 − |μ|²)``: the map's A-Dirichlet energy less its signed area.
+        ``Σ 2m |q − μp|² / (1 − |μ|²)``, the map's A-Dirichlet energy minus its signed area.
     gradient : (f,) complex128
         ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
     """
@@ -309,7 +312,7 @@ def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) 
 def beltrami_terms(
     m: FloatArray, field: TensorField, p: ComplexArray, q: ComplexArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """As `beltrami_gradient`, with half of the energy of each triangle, (f,) float64, in place of their sum."""
+    """Return half of each triangle's energy, (f,) float64, and the gradient of `beltrami_gradient`."""
     residual = q - field.mu * p
     weight = m / field.defect
     density = residual.real**2 + residual.imag**2
@@ -325,9 +328,9 @@ def beltrami_terms(
 
 
 def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatArray, ComplexArray]:
-    """Derivative of ``Re xᴴ L y`` by the tensor ``c·I − [[Re w, Im w], [Im w, −Re w]]`` of each triangle.
+    """Return the derivative of ``Re xᴴ L y`` by each triangle's tensor ``c·I − [[Re w, Im w], [Im w, −Re w]]``.
 
-    Equal to ``sp(Gx)ᵀ G y`` summed over both coordinates, in other entries.
+    It equals ``sp(Gx)ᵀ G y`` summed over both coordinates, expressed in c and w.
 
     Returns
     -------
@@ -341,18 +344,18 @@ def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatA
 
 
 def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
-    """Neumann data that the target asks for, ``R (g_u + i g_v)``: ``g_u = C b_v``, ``g_v = −C b_u`` (Theorem 6.4).
+    """Return the target's Neumann data ``R (g_u + i g_v)`` with ``g_u = C b_v``, ``g_v = −C b_u`` (Theorem 6.4).
 
     Parameters
     ----------
     problem : Problem
     w : (n,) complex128
-        A map; only its values at the boundary count.
+        A map; only its boundary values are used.
 
     Returns
     -------
     (n,) complex128
-        Zero but at the boundary.
+        Zero except at the boundary.
     """
     g = np.zeros(problem.n, dtype=np.complex128)
     for loop in problem.domain.loops:
@@ -362,20 +365,20 @@ def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
 
 
 def neumann_residual(problem: Problem, operator: FactoredLaplacian, w: ComplexArray) -> ComplexArray:
-    """What the Neumann data of a map lack, ``L w − R g`` (eq. 24).
+    """Return the Neumann residual of a map, ``L w − R g`` (eq. 24).
 
     Parameters
     ----------
     problem : Problem
     operator : FactoredLaplacian
-        Of the tensors in question.
+        The Laplacian of the tensors.
     w : (n,) complex128
         Their quasi-harmonic map.
 
     Returns
     -------
     (n,) complex128
-        Zero but at the fixed vertices.
+        Zero except at the fixed vertices.
     """
     # A boundary vertex is fixed, so both terms are zero at free vertices.
     return operator.flux(w) - neumann_target(problem, w)

@@ -30,14 +30,14 @@ class Objective:
     parameterisation : str
         A name of `quasiharmonic.solver.field.tensor.PARAMETERISATIONS`.
     reference : {"equilateral", "rest", "corrected"}
-        Shape of the triangles, unless the problem itself names one.
+        Reference triangles. A reference set in ``problem`` takes precedence.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
 
     Attributes
     ----------
     problem, mesh, laplacian, parameterisation, functional
-        What it is made of; none of them changes.
+        The components of the objective; constant.
     """
 
     def __init__(
@@ -55,22 +55,26 @@ class Objective:
         self.functional: Functional = FUNCTIONALS[functional](problem, self.mesh)
 
     def descending(self, functional: Functional) -> Objective:
-        """The same with another functional, made for this problem and this mesh."""
+        """Return a copy with another functional, which must belong to this problem and mesh."""
         other = copy(self)
         other.functional = functional
         return other
 
     def evaluate(self, xi: ComplexArray) -> Iterate:
-        """The map of ``xi`` and all that follows from it.
+        """Compute the map of ``xi``.
 
         Parameters
         ----------
         xi : (f,) complex128
 
+        Returns
+        -------
+        Iterate
+
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When rounding leaves no positive definite Laplacian.
+            If the Laplacian is not positive definite after rounding.
         """
         field = self.parameterisation.field(xi)
         operator = self.operator(field)
@@ -80,39 +84,38 @@ class Objective:
         return Iterate(self, field, w, operator)
 
     def operator(self, field: TensorField) -> FactoredLaplacian:
-        """The Laplacian of a tensor field, factored."""
+        """Return the factored Laplacian of a tensor field."""
         return self.laplacian.factor(stiffness_of(self.mesh, field.parameterisation, field.xi))
 
     def own_tensor(self, w: ComplexArray) -> ComplexArray:
-        """The μ of each triangle's own image, at which V₃ is least with the map held (eq. 39); (f,) complex128."""
+        """Return the μ of each triangle's own image, which minimises V₃ for the fixed map (eq. 39); (f,) complex128."""
         dw = self.mesh.derivatives(w)
         return own_tensor(dw.p, dw.q)
 
     def of_map(self, w: ComplexArray) -> Iterate:
-        """A map at its own tensors: where it is injective, it is their quasi-harmonic map.
+        """Return a map at its own tensors; if the map is injective, it is their quasi-harmonic map.
 
-        In the tanh parameterisation, which reaches them all.
+        The tensors use the tanh parameterisation, which can represent all of them.
         """
         return Iterate(self, TANH.field(TANH.invert(self.own_tensor(w))), w)
 
     def near_map(self, w: ComplexArray) -> Iterate:
-        """The quasi-harmonic map of a map's own tensors, as far as this parameterisation reaches them.
+        """Return the quasi-harmonic map of a map's own tensors, clipped to the range of this parameterisation.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When rounding leaves no positive definite Laplacian.
+            If the Laplacian is not positive definite after rounding.
         """
         return self.evaluate(self.bounded(self.parameterisation.invert(self.own_tensor(w))))
 
     def step(self, start: Iterate, step: ComplexArray) -> Iterate:
-        """Evaluate at ``ξ + step``, the tensors kept within the numbers' range and the step shortened when
-        even so no factorisation exists.
+        """Evaluate at ``ξ + step`` with clipped tensors; halve the step while no factorisation exists.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When steps down to a thousandth fail.
+            If steps down to a thousandth of the given step fail.
         """
         for _ in range(10):
             try:
@@ -122,13 +125,13 @@ class Objective:
         return self.evaluate(self.bounded(start.xi + step))
 
     def bounded(self, xi: ComplexArray) -> ComplexArray:
-        """``xi`` itself, moduli clipped in place to where the rounded tensor is still positive definite."""
+        """Clip the moduli of ``xi`` in place so that the rounded tensors are positive definite, and return ``xi``."""
         clip_moduli(xi, self.parameterisation.bound)
         return xi
 
 
 class Iterate:
-    """A map, the tensors it belongs to, and what the objective is there.
+    """A map, its tensors, and the objective's value and gradient there.
 
     Parameters
     ----------
@@ -137,7 +140,7 @@ class Iterate:
     w : (n,) complex128
         The quasi-harmonic map in the problem's frame.
     operator : FactoredLaplacian, optional
-        Of ``field``; factored when it is asked for where it is not at hand.
+        The factored Laplacian of ``field``; factored on demand if not given.
     """
 
     def __init__(
@@ -146,12 +149,13 @@ class Iterate:
         self.objective = objective
         self.field = field
         self.w = w
-        # The pattern keeps the last operator. Most iterates never need theirs again, and it is as large as they are.
+        # A weak reference: the pattern keeps the last operator. Most iterates do not need theirs again, and it is
+        # large.
         self._operator = None if operator is None else ref(operator)
 
     @property
     def operator(self) -> FactoredLaplacian:
-        """The Laplacian of these tensors."""
+        """The factored Laplacian of these tensors."""
         operator = None if self._operator is None else self._operator()
         if operator is None:
             operator = self.objective.operator(self.field)
@@ -160,17 +164,17 @@ class Iterate:
 
     @property
     def xi(self) -> ComplexArray:
-        """The variable (f,) complex128."""
+        """The variable ξ; (f,) complex128."""
         return self.field.xi
 
     @cached_property
     def dw(self) -> Derivatives:
-        """Derivatives of the map and the images' signed areas."""
+        """Derivatives of the map and signed areas of the image triangles."""
         return self.objective.mesh.derivatives(self.w)
 
     @cached_property
     def _sweep(self) -> _Sweep:
-        """All that the descent of V₃ asks for, in one pass over the triangles."""
+        """All quantities that the descent of V₃ needs, computed in one pass over the triangles."""
         everything = np.array([0, self.xi.size])
         sums, gradient = sweep(self.objective.mesh, self.field.parameterisation, self.xi, self.w, everything)
         inverted, energy, area, covered = sums[0].tolist()
@@ -178,12 +182,12 @@ class Iterate:
 
     @property
     def inverted(self) -> int:
-        """Number of triangles whose image's area is not positive, in floating point."""
+        """Number of triangles whose image does not have positive area, in floating point."""
         return self._sweep.inverted
 
     @property
     def dirichlet(self) -> float:
-        """V₃, whatever the objective's functional."""
+        """V₃, independent of the objective's functional."""
         return self._sweep.dirichlet
 
     @property
@@ -193,7 +197,7 @@ class Iterate:
 
     @cached_property
     def energy(self) -> float:
-        """V₃ over the map's signed area (over the sum of unsigned areas where that is not positive)."""
+        """V₃ divided by the map's signed area, or by the sum of unsigned areas if that is not positive."""
         area = self._sweep.area
         return self.dirichlet / area if area > 0 else np.inf
 
@@ -204,7 +208,7 @@ class Iterate:
 
     @cached_property
     def gradient(self) -> ComplexArray:
-        """Its gradient in ξ, ``∂/∂Re ξ + i ∂/∂Im ξ``; (f,) complex128."""
+        """The objective's gradient in ξ, ``∂/∂Re ξ + i ∂/∂Im ξ``; (f,) complex128."""
         return self.objective.functional.gradient(self)
 
 

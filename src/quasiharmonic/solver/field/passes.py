@@ -1,10 +1,10 @@
-"""What every evaluation asks of all triangles, in one pass over them before the solve and one after it.
+"""Computations of every evaluation on all triangles: one pass before the solve and one after it.
 
     ξ ──eq. 33──▶ 𝒜 ──▶ edge stiffness        before
     ξ, w ──▶ areas, V₃, dV₃/dξ                after
 
-For 1,000 triangles an evaluation's time is the number of its steps on arrays, and for 10,000 it is how often they pass
-through memory; so what is many short steps in NumPy is compiled.
+For 1,000 triangles the number of array operations determines the time of an evaluation. For 10,000 triangles the
+number of passes through memory does. The passes are therefore compiled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from quasiharmonic.util.kernels import compiled
 
 
 def stiffness_of(mesh: ReferenceMesh, parameterisation: Parameterisation, xi: ComplexArray) -> FloatArray:
-    """Edge stiffness of the tensors of some ξ, as `ReferenceMesh.edge_stiffness` has it.
+    """Compute the edge stiffness of the tensors of ξ; see `ReferenceMesh.edge_stiffness`.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def stiffness_of(mesh: ReferenceMesh, parameterisation: Parameterisation, xi: Co
 def sweep(
     mesh: ReferenceMesh, parameterisation: Parameterisation, xi: ComplexArray, w: ComplexArray, starts: IntArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """All that the descent of V₃ asks for, of one mesh or of several side by side.
+    """Compute the quantities that the descent of V₃ needs, for one mesh or several meshes in a batch.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ def sweep(
     w : (n,) complex128
         Their quasi-harmonic map.
     starts : (k + 1,) int64
-        Where the triangles of each mesh begin, and where the last one's end; none is without triangles.
+        Index of the first triangle of each mesh, and the total number of triangles. Every mesh has triangles.
 
     Returns
     -------
     sums : (k, 4) float64
-        Of each mesh the number of triangles whose image's area is not positive, in floating point, V₃, the map's
+        Per mesh: the number of triangles whose image does not have positive area in floating point, V₃, the map's
         signed area, and the sum of unsigned areas.
     gradient : (f,) complex128
         The gradient of V₃ in ξ.
@@ -67,19 +67,19 @@ def sweep(
 
 
 def own_sweep(mesh: ReferenceMesh, w: ComplexArray, starts: IntArray) -> tuple[FloatArray, ComplexArray]:
-    """V₃ of a map, or of several side by side, at its own tensors as far as tanh reaches them.
+    """Compute V₃ of one or several maps at their own tensors, clipped to the range of tanh.
 
     Parameters
     ----------
     mesh : ReferenceMesh
     w : (n,) complex128
     starts : (k + 1,) int64
-        As of `sweep`.
+        See `sweep`.
 
     Returns
     -------
     sums : (k, 2) float64
-        Of each mesh V₃ and the map's signed area.
+        Per mesh: V₃ and the map's signed area.
     mu : (f,) complex128
         The Beltrami coefficients of these tensors.
     """
@@ -90,7 +90,7 @@ def own_sweep(mesh: ReferenceMesh, w: ComplexArray, starts: IntArray) -> tuple[F
 
 @compiled
 def fill_stiffness(xi: ComplexArray, number: int, by_entry: FloatArray, stiffness: FloatArray) -> None:
-    """Fill in edge stiffness (3, f); by_entry: how each edge's depends on each entry of the tensor (9, f)."""
+    """Fill in the edge stiffness (3, f); ``by_entry`` (9, f) has its derivatives by the tensor's entries."""
     for part in blocks(xi.size):
         entries = parameterisation_of(number).field(xi[part]).entries()
         np.einsum("eaf,af->ef", by_entry[:, part].reshape(3, 3, -1), entries, out=stiffness[:, part])
@@ -108,7 +108,7 @@ def dirichlet_sweep(
     gradient: ComplexArray,
     sums: FloatArray,
 ) -> None:
-    """Fill in the gradient and the sums of `sweep`; half_gamma: of the last two corners (2, f)."""
+    """Fill in the gradient and the sums of `sweep`; ``half_gamma`` (2, f) belongs to the last two corners."""
     f = xi.size
     density, area = np.empty(f), np.empty(f)
     for part in blocks(f):
@@ -117,7 +117,7 @@ def dirichlet_sweep(
         field = parameterisation_of(number).field(xi[part])
         density[part], in_mu = beltrami_terms(m[part], field, p, q)
         gradient[part] = field.pull(in_mu)
-    # Areas that are not numbers are not positive either.
+    # A NaN area does not count as positive.
     for column, values in enumerate((~(area > 0), 2.0 * density, area, np.abs(area))):
         sums[:, column] = np.add.reduceat(values, starts[:-1], dtype=np.float64)
 
@@ -132,7 +132,7 @@ def at_own_tensors(
     mu: ComplexArray,
     sums: FloatArray,
 ) -> None:
-    """Fill in what `own_sweep` returns; half_gamma: of the last two corners (2, f)."""
+    """Fill in the results of `own_sweep`; ``half_gamma`` (2, f) belongs to the last two corners."""
     f = mu.size
     density, area = np.empty(f), np.empty(f)
     for part in blocks(f):
@@ -146,7 +146,7 @@ def at_own_tensors(
 
 @compiled
 def clip_moduli(xi: ComplexArray, bound: float) -> None:
-    """Clip moduli in place."""
+    """Clip the moduli of ``xi`` to ``bound`` in place."""
     for part in blocks(xi.size):
         block = xi[part]
         square = block.real**2 + block.imag**2

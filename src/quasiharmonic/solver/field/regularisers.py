@@ -1,4 +1,4 @@
-"""Regularisers: functions of the tensor field alone, descended along with an injectivity functional (§11.1.4)."""
+"""Regularisers: functions of the tensor field that are added to an injectivity functional (§11.1.4)."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ class Conformal:
 
         R₁(ξ) = Σ sⱼ ℛ(μⱼ),   ℛ(μ) = (1 − |μ|)/(1 + |μ|) + (1 + |μ|)/(1 − |μ|) − 2 = 4 |μ|²/(1 − |μ|²)
 
-    which is ``4 sinh²|ξ|`` for tanh. Where V₃ vanishes a triangle's σ₁/σ₂ is ``(1 + |μ|)/(1 − |μ|)``, so this is MIPS
-    there, measured in the reference triangles: those of the rest mesh, if the surface's angles are meant. Elsewhere,
-    and unlike MIPS itself, it is finite and smooth whatever the map does.
+    For tanh this is ``4 sinh²|ξ|``. If V₃ vanishes, a triangle's σ₁/σ₂ is ``(1 + |μ|)/(1 − |μ|)``, so R₁ equals MIPS,
+    measured in the reference triangles. For the surface's angles, use those of the rest mesh. Unlike MIPS, R₁ is finite
+    and smooth for every map.
 
     Parameters
     ----------
     share : (f,) float64
-        Factors sⱼ; for the mean over the surface, areas over the surface's area.
+        Weights sⱼ; for the mean over the surface, each triangle's share of the surface's area.
     """
 
     def __init__(self, share: FloatArray) -> None:
         self.share = share
 
     def value(self, field: TensorField) -> float:
-        """R₁ of a tensor field.
+        """Return R₁ of a tensor field.
 
         Parameters
         ----------
@@ -39,18 +39,18 @@ class Conformal:
         Returns
         -------
         float
-            The mean over the rest area, without unit.
+            The mean over the rest area, dimensionless.
         """
         square = field.mu.real**2 + field.mu.imag**2
         return 4.0 * float(np.sum(self.share * square / field.defect))
 
     def of_map(self, dw: Derivatives) -> float:
-        """R₁ at the own tensors of a map, where V₃ vanishes: its MIPS energy.
+        """Return R₁ at a map's own tensors, where V₃ vanishes: the MIPS energy of the map.
 
         Parameters
         ----------
         dw : Derivatives
-            Of the map.
+            Derivatives of the map.
 
         Returns
         -------
@@ -63,7 +63,7 @@ class Conformal:
         return 4.0 * float(np.sum(self.share * q * q / ((p - q) * (p + q))))
 
     def gradient(self, field: TensorField) -> ComplexArray:
-        """Gradient of R₁ by ξ.
+        """Return the gradient of R₁ in ξ.
 
         Parameters
         ----------

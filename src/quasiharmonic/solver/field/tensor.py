@@ -1,9 +1,9 @@
-"""One complex number a triangle to an elliptic tensor of unit determinant, and back down (§8).
+"""Tensor fields: from one complex number per triangle to an elliptic tensor of determinant one, with derivatives (§8).
 
     ξ ──r──▶ μ = r(|ξ|) ξ/|ξ|  ──eq. 33──▶  𝒜 = c·I − [[Re w, Im w], [Im w, −Re w]]
 
-with ``c = (1 + |μ|²)/(1 − |μ|²)`` and ``w = 2μ/(1 − |μ|²)``. Any ξ gives a positive definite tensor, so
-the search over ξ has no constraints.
+with ``c = (1 + |μ|²)/(1 − |μ|²)`` and ``w = 2μ/(1 − |μ|²)``. Every ξ gives a positive definite tensor, so the search
+over ξ is unconstrained.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, named
 
-# Stands in for a divisor of zero, where the dividend vanishes too, so that the quotient is not NaN.
+# Replaces a divisor of zero whose dividend is zero too, to avoid NaN.
 _TINY = 1e-300
 
 
 @dataclass(frozen=True)
 class Parameterisation:
-    """The sigmoid ``r`` that carries ξ to the Beltrami coefficient μ (§8.2).
+    """The sigmoid ``r`` that maps ξ to the Beltrami coefficient μ (§8.2).
 
     Attributes
     ----------
     name : str
-        How a user calls it.
+        Name in the user interface.
     number : int
-        How kernels do: its place in `PARAMETERISATIONS`.
+        Number in the kernels: its index in `PARAMETERISATIONS`.
     bound : float
         Largest ``|ξ|`` at which the tensor, rounded to doubles, is still safely positive definite.
     radial : callable
-        ``ρ ↦ (r/ρ, 1 − r², r')`` elementwise, each in its limit at ρ = 0.
+        ``ρ ↦ (r/ρ, 1 − r², r')`` elementwise, with limits at ρ = 0.
     inverse : callable
         ``r ↦ ρ`` elementwise.
     bend : callable
@@ -49,7 +49,7 @@ class Parameterisation:
     bend: Callable[[FloatArray], FloatArray]
 
     def field(self, xi: ComplexArray) -> TensorField:
-        """The tensor field of some ξ.
+        """Return the tensor field of ξ.
 
         Parameters
         ----------
@@ -62,7 +62,7 @@ class Parameterisation:
         return TensorField(xi, self)
 
     def invert(self, mu: ComplexArray) -> ComplexArray:
-        """The ξ of Beltrami coefficients.
+        """Return the ξ of Beltrami coefficients.
 
         Parameters
         ----------
@@ -81,21 +81,21 @@ class Parameterisation:
 
 @dataclass(frozen=True)
 class TensorField:
-    """𝒜 on every triangle, with what is needed to differentiate it, each computed when first asked for.
+    """The tensor 𝒜 of every triangle, and the quantities for its derivatives, computed on demand.
 
     Attributes
     ----------
     xi, mu : (f,) complex128
         The variable and the Beltrami coefficient.
     rho, ratio, defect, slope : (f,) float64
-        ``|ξ|``, ``r/ρ``, ``1 − |μ|²`` (accurate where ``|μ|`` rounds to 1) and ``r'``.
+        ``|ξ|``, ``r/ρ``, ``1 − |μ|²`` (accurate even if ``|μ|`` rounds to 1) and ``r'``.
     """
 
     xi: ComplexArray
     parameterisation: Parameterisation
 
     def __getitem__(self, part: slice) -> TensorField:
-        """The field on some of the triangles."""
+        """Return the field on a range of triangles."""
         return TensorField(self.xi[part], self.parameterisation)
 
     @cached_property
@@ -127,7 +127,7 @@ class TensorField:
         return self.ratio * self.xi
 
     def entries(self) -> FloatArray:
-        """The tensors themselves (eq. 33), without the area factor.
+        """Return the tensors (eq. 33), without the area factor.
 
         Returns
         -------
@@ -144,7 +144,7 @@ class TensorField:
         return a
 
     def pull_twist(self, by_c: FloatArray, by_w: ComplexArray) -> ComplexArray:
-        """Gradient in μ from the derivatives by c and w: the transpose of d(c, w)/dμ.
+        """Return the gradient in μ from the derivatives by c and w: apply the transpose of d(c, w)/dμ.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ class TensorField:
         return double * (by_w + double * inner * self.mu)
 
     def pull(self, grad: ComplexArray) -> ComplexArray:
-        """Gradient in ξ from the gradient in μ: the transpose of dμ/dξ, which is symmetric.
+        """Return the gradient in ξ from the gradient in μ: apply the transpose of dμ/dξ, which is symmetric.
 
         Parameters
         ----------
@@ -175,7 +175,7 @@ class TensorField:
         (f,) complex128
             ``∂/∂Re ξ + i ∂/∂Im ξ``.
         """
-        # ρ² that vanishes needs no care but in the division: the term it divides vanishes with it.
+        # If ρ² is zero, only the division needs protection: the dividend is zero too.
         radial = (self.slope - self.ratio) / np.maximum(self._square, _TINY)
         radial *= (self.xi.conj() * grad).real
         out: ComplexArray = self.ratio * grad
@@ -184,12 +184,12 @@ class TensorField:
 
 
 def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
-    """What a caller hands over as Beltrami coefficients of ``f`` tensors, checked; zeros where nothing is.
+    """Check the Beltrami coefficients of ``f`` tensors and return them as complex128; zeros for None.
 
     Raises
     ------
     ValueError
-        When it has another shape, holds no numbers, or is not below 1 in modulus; names the first triangles.
+        If the shape is wrong, the values are not numbers, or a modulus is not below 1; names the first triangles.
     """
     coefficients = np.zeros(f) if mu is None else np.asarray(mu)
     if coefficients.shape != (f,) or coefficients.dtype.kind not in "iufc":
@@ -201,10 +201,10 @@ def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
 
 
 def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:
-    """The μ that makes V₃ least with the map held (eq. 39).
+    """Return the μ that minimises V₃ for a fixed map (eq. 39).
 
-    The energy ``2m |q − μp|² / (1 − |μ|²)`` of a triangle is least at its own Beltrami coefficient ``μ = q/p`` where it
-    is positive, and at ``conj(p/q)`` where it is inverted; the least values are 0 and twice the inverted area.
+    The energy ``2m |q − μp|² / (1 − |μ|²)`` of a triangle is least at its own Beltrami coefficient ``μ = q/p`` if it is
+    positive, and at ``conj(p/q)`` if it is inverted. The minima are 0 and twice the inverted area.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:
     Returns
     -------
     (f,) complex128
-        Of modulus 1 where a triangle has no area, and 0 where its sides have no length, or none to divide by.
+        Modulus 1 for degenerate triangles; 0 if the image is a point, or too small to divide by.
     """
     inverted = np.abs(q) > np.abs(p)
     small, large = np.where(inverted, p.conj(), q), np.where(inverted, q.conj(), p)
@@ -248,19 +248,19 @@ def _bend_si_log(rho: FloatArray) -> FloatArray:
 
 
 def _invert_si_log(r: FloatArray) -> FloatArray:
-    # The largest r below 1 would ask for a ρ of e^(2⁵³).
+    # The largest double r below 1 would give ρ = e^(2⁵³).
     with np.errstate(over="ignore"):
         return np.expm1(r / (1.0 - r))
 
 
-# The eigenvalues of 𝒜 are e^{±2ρ} for tanh, and its entries are rounded at e^{2ρ} · 1e-16: beyond ρ = 9 the
-# smaller eigenvalue drowns. si-log comes nowhere near: its bound, which keeps |ξ|² finite, stands for
-# |μ| = 0.997, and what needs more distortion than that needs tanh.
+# For tanh the eigenvalues of 𝒜 are e^{±2ρ}, and its entries have rounding errors of e^{2ρ} · 1e-16. Beyond ρ = 9 the
+# smaller eigenvalue is lost. For si-log the bound keeps |ξ|² finite and corresponds to |μ| = 0.997; maps with more
+# distortion need tanh.
 TANH = Parameterisation("tanh", 0, 8.8, _tanh, np.arctanh, _bend_tanh)
 SI_LOG = Parameterisation("si-log", 1, 1e150, _si_log, _invert_si_log, _bend_si_log)
 PARAMETERISATIONS = {p.name: p for p in (TANH, SI_LOG)}
 
 
 def parameterisation_of(number: int) -> Parameterisation:
-    """The parameterisation of this number."""
+    """Return the parameterisation with this number."""
     return (TANH, SI_LOG)[number]

@@ -140,7 +140,7 @@ class _Member:
 
 
 class _Maps(NamedTuple):
-    """Maps of all meshes: positions, gradient of V₃ in ξ, and per mesh the number of inverted triangles and the energy."""
+    """Maps of all meshes: positions, gradient of V₃ in ξ, and per mesh the inverted triangles and the energy."""
 
     w: ComplexArray
     gradient: ComplexArray
@@ -178,7 +178,7 @@ class _SideBySide:
         return _Maps(w, gradient, inverted.astype(np.int64), energy)
 
     def place(self, some: Sequence[int], w: ComplexArray) -> list[_Member]:
-        """Relocate the vertices of inverted triangles of some meshes; record and return the members without any left."""
+        """Relocate vertices of inverted triangles of some meshes; return the members without any left."""
         count = np.diff(self.triangles)
         F = np.concatenate([self._mesh.F[self.triangles_of(k)] for k in some])
         moved, righted = placed_each(F, w, self._fixed, np.repeat(np.arange(len(some)), count[some]))
@@ -299,7 +299,7 @@ class _Walk:
         self.members, self.xi, self.pace, self.descent, self.patterns = members, xi, pace, descent, patterns
 
     def go(self, iterations: range, last: int, still_wanted: Callable[[], None]) -> bool:
-        """Descend until all problems are solved or the iterations are over; ``last`` is the last iteration of the stage.
+        """Descend until all problems are solved or the iterations are over; ``last`` is the last one of the stage.
 
         Return False if a factorisation fails because of rounding; unsolved problems then have no result.
         """
@@ -342,7 +342,7 @@ class _Walk:
                 side = _SideBySide(self.members, self.descent, self.patterns)
 
     def _too_many(self, left: int, iterations: int) -> bool:
-        """Whether compacting the batch pays, given the number of live problems and the iterations to come."""
+        """Whether compacting the batch pays, given the live problems and the iterations to come."""
         if _of_one_mesh(self.members):
             return iterations > 0 and 5 * _filled_up(left) <= 3 * len(self.members)
         # The analysis of a pattern takes as long as two iterations.
@@ -391,7 +391,7 @@ def _runs(sizes: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _judge(members: list[_Member], descent: VectorAdam, solver: str) -> None:
-    """Certify maps that have no inverted triangles in floating point, and set the results of those that are injective."""
+    """Certify maps without inverted triangles in floating point, and set the results of the injective ones."""
     problems = [member.problem for member in members]
     uv = [member.problem.positions(member.best_map) for member in members]
     verdicts = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])

@@ -97,7 +97,7 @@ class HarmonicDescent:
             if not self._squares.any():
                 return True
             if not np.isfinite(self._squares).all():
-                                return False  # non-finite gradients give no units for L-BFGS
+                return False  # non-finite gradients give no units for L-BFGS
             stiffness = np.sqrt(self._squares)
             stiffness += _SOFTEST * stiffness.mean()
             self._last = lowest
@@ -111,7 +111,7 @@ class HarmonicDescent:
         return False
 
     def right(self) -> bool:
-        """Untangle the last inverted triangles by descending V₃ alone from the last map; return whether none is left."""
+        """Untangle the last inverted triangles by descending V₃ alone; return whether none is left."""
         if self.history[-1].inverted == 0:
             return True
         for method in (Newton(iterations=RIGHTING), LocalRepair(tries=RIGHTING)):

@@ -78,7 +78,10 @@ class Harmonised(Functional):
         return self._energy(at) + self.conformal * self.regulariser.value(at.field)
 
     def distortion_of_map(self, at: QuasiHarmonicMap) -> float:
-        """Return ``E + κ R₁`` with R₁ at the map's own tensors; depends on the map alone, ``inf`` for inverted triangles."""
+        """Return ``E + κ R₁`` with R₁ at the map's own tensors; depends on the map alone.
+
+        ``inf`` if a triangle is inverted.
+        """
         return self._energy(at) + self.conformal * self.regulariser.of_map(at.dw)
 
     def check_numbers(self, at: QuasiHarmonicMap) -> None:

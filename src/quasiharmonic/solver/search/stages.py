@@ -398,7 +398,7 @@ class Search:
         return self.diagnosis
 
     def _towards_least_area(self) -> None:
-        """Move to the map of least area if none is injective: V₃ is total unsigned area minus target area (eq. 42)."""
+        """Move to the map of least area, which is the target's area plus V₃ (eq. 42)."""
         if self._left > 0:
             self._descend(Newton(iterations=_TO_LEAST_AREA, resume=True))
         if self.lowest_energy is not None:
@@ -443,7 +443,7 @@ class Search:
         return status
 
     def _follow(self, stage: Descent, objective: Objective, start: Iterate) -> Status:
-        """Visit every map of a stage until one is injective, progress stops or the budget is spent; return the status."""
+        """Visit every map of a stage until one is injective, progress stops or the budget ends; return the status."""
         patience = Patience(stage.patience)
         steps = Steps(stage.iterates(objective, start))
         last: ComplexArray | None = None
@@ -482,7 +482,7 @@ class Search:
         return step
 
     def _not_positive(self, w: ComplexArray) -> int:
-        """Number of triangles that are not positive, determined exactly on the returned coordinates."""
+        """Number of triangles that are not positive, computed exactly on the returned coordinates."""
         sign, _ = triangle_signs(self.problem.F, self.problem.positions(w))
         return int(np.count_nonzero(sign <= 0))
 

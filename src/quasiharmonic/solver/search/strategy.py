@@ -142,7 +142,7 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
 
 
 def soonest(stages: Stages) -> Stages:
-    """Return the first stages of a strategy: up to the first descent on the mesh itself, and the quick stages after it."""
+    """Return the first stages of a strategy: up to the first on the mesh itself, and the quick ones after it."""
     before = list(takewhile(lambda stage: stage.coarse, stages))
     first = stages[len(before) : len(before) + 1]
     rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, WhereMany)]
